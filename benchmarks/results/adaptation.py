@@ -122,8 +122,7 @@ def move_camera(run: Runner, section: Section) -> None:
     ]
     section.remarks.append(
         f"A table is one image with the true poses of what stands there; {TABLES} were seen through the camera where "
-        "it 
-        "is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "
+        "it is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "
         "tuned perception looks from where the camera was moved to, and is not meant for where it was before."
     )
 
