@@ -266,23 +266,40 @@ def run_robot(robot: str, seconds: float, load: Load, folder: Path | None = None
     """
     cameras = {"camera": True} if folder is not None else {}
     config = configuration(robot, id=f"bench-{os.getpid()}", clock="realtime", **cameras)
-    with ExitStack() as stack:
-        simulation = stack.enter_context(closing(make_robot(config)))
+    with closing(make_robot(config)) as simulation:
         task = make_task(robot, config.fps, seconds)
         brain, open_images = RandomBrain(RandomConfig(scale=0.05)), None
         if folder is not None:
             brain, open_images = NetworkBrain(), make_recorder(simulation, task, config, folder).begin_episode
             simulation.start_rendering()
-        loop = EpisodeLoop(simulation, task, brain)
-        stack.enter_context(load())
-        with watch(simulation.link.block) as states:  # type: ignore[attr-defined]
-            episode = next(loop.run([EpisodeSpec(0, SEED)], open_images=open_images))
-        if episode.writer is not None:
-            episode.writer.discard()
-        grants = simulation.grants  # type: ignore[attr-defined]
-    refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in grants if not grant["granted"])
+        with load():
+            return drive(simulation, task, brain, seconds, open_images)
+
+
+def drive(
+    simulation: Any, task: Any, brain: Any, seconds: float, open_images: Callable[[], Any] | None = None
+) -> Ticks:
+    """Return the ticks of an episode of a live robot.
+
+    Args:
+        simulation: the robot.
+        task: what it is to do.
+        brain: what drives it.
+        seconds: length of the episode [s].
+        open_images: makes what takes the episode's images; nothing does if None.
+
+    Raises:
+        NotMeasuredError: states were lost, or the episode ended early.
+    """
+    loop = EpisodeLoop(simulation, task, brain)
+    with watch(simulation.link.block) as states:
+        episode = next(loop.run([EpisodeSpec(0, SEED)], open_images=open_images))
+    if episode.writer is not None:
+        episode.writer.discard()
+    refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in simulation.grants if not grant["granted"])
     if len(states) < 2 or episode.outcome.event.cause not in ("timeout", "success"):
-        raise NotMeasuredError(f"the episode of {robot} ended with {episode.outcome.event.cause}, {len(states)} ticks")
+        cause, robot = episode.outcome.event.cause, simulation.config.type
+        raise NotMeasuredError(f"the episode of {robot} ended with {cause}, {len(states)} ticks")
     # The loop's warm-up, before the episode, was a segment of its own.
     due, started, ended, executed, _ = np.array([state for state in states if state[-1] == states[-1][-1]], np.int64).T
     if np.any(np.diff(executed) != 1):
@@ -290,7 +307,7 @@ def run_robot(robot: str, seconds: float, load: Load, folder: Path | None = None
     # A state says when the tick before it ended.
     times = np.stack((due[:-1], started[:-1], ended[1:]), axis=1)
     times = times[times[:, 0] - times[:1, 0] < seconds * 1e9]  # not what follows while a late brain ends its frame
-    return Ticks(times, 10**9 // RATES[robot], refused)
+    return Ticks(times, 10**9 // simulation.config.control_hz, refused)
 
 
 @contextmanager

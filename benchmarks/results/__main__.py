@@ -8,7 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from benchmarks.results.adaptation import fine_tune
+from benchmarks.results.adaptation import fine_tune, move_camera
 from benchmarks.results.aggregation import aggregate
 from benchmarks.results.camera_drive import camera_drive
 from benchmarks.results.learning import avoid, reach
@@ -35,6 +35,7 @@ MEASURES = (
     ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
     ("pixels", "Pick, from pixels: the same end to end", pixels),
     ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
+    ("move_camera", "Fine-tune: 20 tables before a camera that was moved", move_camera),
     ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
     ("speed", "Speed", speed),
 )

@@ -37,6 +37,7 @@ def speed(run: Runner, section: Section) -> None:
     for measure in (
         benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-epoch")),
         benchmark("images", images_rows, short=("--episodes=4", "--steps=20", "--turns=1")),
+        benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=2")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
         benchmark("evaluate", evaluate_rows, short=("--episodes=4", "--n_envs=4", "--turns=1")),
     ):
@@ -89,6 +90,32 @@ def images_rows(results: Mapping[str, Any]) -> list[Row]:
         ratio = results["rendering"]["ratio"]
         what = "two cameras of 96 x 96: images a second, over MuJoCo's own renderer"
         rows.append(Row(what, times(ratio, 2), "at least 0.8 x", ratio["median"] >= 0.8))
+    return rows
+
+
+def sight_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.sight`."""
+    quiet = {row["core"]: row for row in results["rows"] if "ratios" not in row}
+    rows = []
+    for row in (one for one in results["rows"] if "ratios" in one):
+        alone, over = quiet[row["core"]], row["ratios"]
+        what = f"UR5 at 500 Hz beside {row['brain']} at 25 Hz, cerebellum on {row['core']}"
+        share = f"{row['late_share']:.2%}, beside noop {alone['late_share']:.2%}"
+        rows += [
+            Row(
+                f"{what}: lateness of ticks p99, over that beside noop",
+                f"{over['wake_p99']:.2f} x ({row['wake_p99']:.0f} us)",
+                f"at most {results['goals']['wake_p99']:g} x",
+                over["wake_p99"] <= results["goals"]["wake_p99"],
+            ),
+            Row(f"{what}: ticks later than 0.1 ms", f"{share}; missed {row['missed']}, beside noop {alone['missed']}"),
+            Row(
+                f"{what}: frames/s",
+                f"{row['frames_per_s']:.2f}, beside noop {alone['frames_per_s']:.2f}; {row['cpu_ms']:.1f} CPU ms each",
+                f"at least {results['goals']['frames_per_s']:.0%} of 25",
+                row["frames_per_s"] >= results["goals"]["frames_per_s"] * 25,
+            ),
+        ]
     return rows
 
 

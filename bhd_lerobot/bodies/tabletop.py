@@ -37,17 +37,19 @@ it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; 
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where a fixed camera stands, and what it sees: a pinhole without distortion, upright.
+    """Where a fixed camera stands, and what it sees: a pinhole without distortion.
 
     Attributes:
         position: of its centre in the base frame [m].
         target: a point in the middle of its image, in the base frame [m].
         fovy: vertical field of view [deg].
+        roll: by which it is turned clockwise about its line of sight; upright at 0 [rad].
     """
 
     position: tuple[float, float, float]
     target: tuple[float, float, float]
     fovy: float
+    roll: float = 0.0
 
 
 SCENE_CAMERA = CameraView((1.22, -0.62, 0.78), (0.37, 0.02, 0.15), 48.0)

@@ -9,6 +9,7 @@ import numpy as np
 from bhd_lerobot.bodies.tabletop import Variation, check_camera_error
 from bhd_lerobot.errors import ConfigError
 
+_FIXED = ("camera_error_m", "camera_shift_m", "camera_turn_rad")  # the same in every episode
 MAX_LATENCY_S = 0.05  # [s] what a `LatePlant` can delay by, at the control rate
 
 
@@ -34,6 +35,9 @@ class RandomisationConfig:
         latency_min_s: and at least this late; with `latency_s` as large, always [s].
         camera_error_m: added to the positions that the task reports, the same in every episode: x, y, z in the base
             frame, each at most 0.2 [m]. As if the camera that sees target and objects were not where it is taken to be.
+        camera_shift_m: added to the scene camera's position, the same in every episode: x, y, z in the base frame [m].
+        camera_turn_rad: by what the scene camera is turned, the same in every episode: a rotation vector in its own
+            frame, x right, y up, z backwards [rad].
     """
 
     enabled: bool = False
@@ -51,16 +55,23 @@ class RandomisationConfig:
     latency_s: float = 0.01
     latency_min_s: float = 0.0
     camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    camera_shift_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    camera_turn_rad: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
         check_camera_error("randomisation.camera_error_m", self.camera_error_m)
-        if any(self.camera_error_m) and not self.enabled:
-            raise ConfigError(
-                f"randomisation.camera_error_m is {list(self.camera_error_m)}, but randomisation.enabled is false, so "
-                "that nothing would be off; set --task.randomisation.enabled=true."
-            )
+        for name, unit in (("camera_shift_m", "m"), ("camera_turn_rad", "rad")):
+            values = getattr(self, name)
+            if len(values) != 3 or not all(map(math.isfinite, values)):
+                raise ConfigError(f"randomisation.{name} is {list(values)}; it must be three finite numbers [{unit}].")
+        for name in _FIXED:
+            if any(getattr(self, name)) and not self.enabled:
+                raise ConfigError(
+                    f"randomisation.{name} is {list(getattr(self, name))}, but randomisation.enabled is false, so "
+                    "that nothing would be off; set --task.randomisation.enabled=true."
+                )
         for name, value in asdict(self).items():
-            if name not in ("enabled", "camera_error_m") and not 0 <= value < math.inf:
+            if name not in ("enabled", *_FIXED) and not 0 <= value < math.inf:
                 raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
         if self.latency_s > MAX_LATENCY_S:
             raise ConfigError(f"randomisation.latency_s is {self.latency_s}; it must be at most {MAX_LATENCY_S}.")
@@ -119,8 +130,8 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
     return Variation(
         light=float(uniform(1 - config.light, 1 + config.light)),
         light_direction=_floats(uniform(-1, 1, 2) * config.light_direction),
-        camera_shift=_floats(uniform(-1, 1, 3) * config.camera_m),
-        camera_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
+        camera_shift=_floats(uniform(-1, 1, 3) * config.camera_m + config.camera_shift_m),
+        camera_turn=_floats(uniform(-1, 1, 3) * config.camera_rad + config.camera_turn_rad),
         wrist_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
         sensor_noise=float(uniform(0, config.sensor_noise_rad)),
         latency_s=float(uniform(config.latency_min_s, config.latency_s)),

@@ -82,6 +82,8 @@ class BhdTrainConfig(TrainPipelineConfig):
         fine_tune_parameters: which of the policy's parameters are trained, by name or pattern; the others stay as they
             are. `["*.bias"]` changes so little that a few episodes suffice for a shift (E. Ben Zaken et al., "BitFit",
             2022).
+        fine_tune_camera: with `fine_tune` of a policy that knows where its camera stands, find out from the dataset
+            where it stands now, and begin with that.
         threads: threads of a training process on the CPU; PyTorch's own number if nothing. The last bits of a loss
             depend on it.
     """
@@ -91,6 +93,7 @@ class BhdTrainConfig(TrainPipelineConfig):
     fine_tune: str | None = None
     fine_tune_statistics: str = "checkpoint"
     fine_tune_parameters: list[str] = field(default_factory=lambda: ["*"])
+    fine_tune_camera: bool = False
     threads: int | None = None
 
     def _resolve_pretrained_from_cli(self) -> None:
@@ -117,6 +120,8 @@ class BhdTrainConfig(TrainPipelineConfig):
         self.loader_config()
         if self.fine_tune_statistics not in STATISTICS:
             raise ConfigError(unknown_name("fine_tune_statistics", self.fine_tune_statistics, STATISTICS))
+        if self.fine_tune_camera and not (self.fine_tune or self.resume):
+            raise ConfigError("fine_tune_camera is true, but no checkpoint is given; set --fine_tune.")
         if self.policy is None:
             raise ConfigError(
                 f"No policy is given; set --policy.type, one of {', '.join(policy_types())}, or --fine_tune."

@@ -1,7 +1,8 @@
 """What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from lerobot.utils.constants import ACTION
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.random_utils import set_seed
 
+from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
@@ -177,6 +179,35 @@ def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
 
 
 _NAMED = 20  # parameters that a message names
+
+
+def fit_camera(policy: Any, loader: Loader, prepare: Callable[[Batch], Batch], *, processes: int) -> str:
+    """Let a policy find out where its camera stands; return what it found, in words. The loader stays where it is.
+
+    Args:
+        policy: the policy.
+        loader: of what is learned from.
+        prepare: makes the policy's input of a batch.
+        processes: that train together.
+
+    Raises:
+        ConfigError: the policy knows no place of a camera, or too little was seen.
+    """
+    if not hasattr(policy, "fit_camera"):
+        raise ConfigError(
+            f"fine_tune_camera is true, but a {policy.config.type!r} does not know where its camera stands; a "
+            "'bhd_perception' does. Leave it out."
+        )
+    if processes > 1:
+        raise ConfigError(f"fine_tune_camera is for one process; {processes} would each find something else.")
+    state = loader.state_dict()
+    found = policy.fit_camera([prepare(batch) for batch in islice(loader, _BATCHES)])
+    loader.load_state_dict(state)
+    policy.train()
+    return str(found)
+
+
+_BATCHES = 64  # from which the camera's place is found, at the most
 
 
 def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:

@@ -29,6 +29,7 @@ from bhd_lerobot.training.setup import (
     build_policy,
     build_processors,
     check_contract,
+    fit_camera,
     make_accelerator,
     refuse_unsupported,
     select_parameters,
@@ -138,6 +139,9 @@ def _run(
         camera_keys=camera_keys,
     )
     parts.optimizer, parts.scheduler = learner.optimizer, learner.scheduler
+    if config.fine_tune_camera and not config.resume:
+        found = fit_camera(parts.policy, data.train, learner.prepare, processes=accelerator.num_processes)
+        console.print(escape(found), soft_wrap=True, highlight=False)
     environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None
     hooks = Hooks(
         held_out=None if data.held_out is None else data.held_out.__iter__,

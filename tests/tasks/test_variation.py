@@ -29,7 +29,7 @@ from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw
 from tests.cases import each_case
 
 ON = RandomisationConfig(enabled=True)
-FIXED = ("enabled", "camera_error_m")
+FIXED = ("enabled", "camera_error_m", "camera_shift_m", "camera_turn_rad")
 RANGES = [field.name for field in dataclasses.fields(RandomisationConfig) if field.name not in FIXED]
 
 
@@ -201,6 +201,32 @@ def test_what_no_calibration_is_off_by_is_refused_for_the_task_and_for_the_rules
         message = rf"^{name}.camera_error_m is {re.escape(str(list(error)))}; it must be three numbers, .* -0.2 and 0.2"
         with pytest.raises(ConfigError, match=message):
             make(camera_error_m=list(error))
+
+
+def test_a_moved_camera_is_moved_in_every_episode_and_changes_nothing_else_that_is_drawn() -> None:
+    shift, turn = (0.02, -0.01, 0.02), (0.05, 0.06, -0.04)
+    moved = dataclasses.replace(ON, camera_shift_m=list(shift), camera_turn_rad=list(turn))
+    for seed in range(10):
+        before, after = (PickTask(PickConfig(randomisation=one), 1, 25).sample(seed) for one in (ON, moved))
+        assert np.subtract(after.variation.camera_shift, before.variation.camera_shift) == pytest.approx(shift)
+        assert np.subtract(after.variation.camera_turn, before.variation.camera_turn) == pytest.approx(turn)
+        same = {"camera_shift": before.variation.camera_shift, "camera_turn": before.variation.camera_turn}
+        assert dataclasses.replace(after, variation=dataclasses.replace(after.variation, **same)) == before
+        assert scene_from_json(scene_to_json(after)) == after
+
+
+@each_case(
+    "values",
+    [
+        ({"camera_shift_m": [0.0, 0.0]}, r"camera_shift_m is \[0.0, 0.0\]; it must be three finite numbers \[m\]"),
+        ({"camera_turn_rad": [0.0, math.nan, 0.0]}, r"camera_turn_rad is \[0.0, nan, 0.0\]; .* numbers \[rad\]"),
+        ({"camera_turn_rad": [0.1, 0.0, 0.0], "enabled": False}, r"camera_turn_rad is .* --task.randomisation.enabled"),
+    ],
+)
+def test_a_move_that_is_none_or_would_not_be_honoured_is_refused(values: tuple[dict, str]) -> None:
+    options, message = values
+    with pytest.raises(ConfigError, match=message):
+        RandomisationConfig(**{"enabled": True, **options})
 
 
 def test_a_camera_error_that_would_not_be_honoured_is_refused() -> None:

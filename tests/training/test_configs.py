@@ -13,6 +13,7 @@ from bhd_lerobot.registry import make_robot
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout import configuration
+from bhd_lerobot.tasks.pick import ENVIRONMENT
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import command, parse_aggregation, read_stages
 from tests.training.support import MLP, make_dataset, options, run_train
@@ -25,21 +26,24 @@ CONFIGS = sorted(one for one in FOLDER.glob("*.yaml") if one.name.startswith(KIN
 def described(name: str) -> dict[str, dict]:
     """Return the features of the robot's datasets."""
     config = TurtleBot3Config(beams=36, odometry="cnn" in name) if "turtlebot3" in name else UR5Config(tool_pose=True)
+    environment = ["goal_x", "goal_y"]
+    if "servo" in name:
+        config, environment = UR5Config(tool_pose=True, action_space="tool"), list(ENVIRONMENT)
     robot = make_robot(config)
     state, action = list(robot.observation_names), list(robot.action_names)
-    vectors = {"observation.state": state, "observation.environment_state": ["goal_x", "goal_y"], "action": action}
+    vectors = {"observation.state": state, "observation.environment_state": environment, "action": action}
     if "avoid" in name:
         del vectors["observation.environment_state"]
     features = {key: {"dtype": "float32", "shape": (len(one),), "names": one} for key, one in vectors.items()}
-    if "camera" in name or "smolvla" in name or "cnn" in name:
-        names = ["height", "width", "channels"]
+    if any(one in name for one in ("camera", "pixels", "smolvla", "cnn")):
+        names, shape = ["height", "width", "channels"], (120, 160, 3) if "pixels" in name else (240, 320, 3)
         for camera in ("front",) if "turtlebot3" in name else ("scene", "wrist"):
-            features[f"observation.images.{camera}"] = {"dtype": "video", "shape": (240, 320, 3), "names": names}
+            features[f"observation.images.{camera}"] = {"dtype": "video", "shape": shape, "names": names}
     return features
 
 
 def test_there_are_configurations() -> None:
-    assert len(CONFIGS) == 10
+    assert len(CONFIGS) == 13
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -56,7 +60,7 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
         return  # building it loads a model from the Hub
     meta = SimpleNamespace(features=described(path.stem), stats={}, fps=25)
     policy = make_policy(config.policy, ds_meta=meta)
-    if "cameras" in path.stem:
+    if "cameras" in path.stem or "pixels" in path.stem:
         assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
 

@@ -176,6 +176,13 @@ def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, 
     assert all(torch.equal(values, again_new[name]) for name, values in new.items())
 
 
+def test_a_camera_is_found_only_for_a_policy_that_has_one(data: Path, trained: Path, tmp_path: Path) -> None:
+    arguments = options(data, tmp_path / "run", {}, fine_tune=trained, fine_tune_camera="true")
+    refused(arguments, ConfigError, r"'bhd_mlp' does not know where its camera stands; a 'bhd_perception' does")
+    arguments = options(data, tmp_path / "run", MLP, fine_tune_camera="true")
+    refused(arguments, ConfigError, r"no checkpoint is given; set --fine_tune")
+
+
 def test_a_checkpoint_that_is_not_there(data: Path, tmp_path: Path) -> None:
     arguments = options(data, tmp_path / "run", {}, fine_tune=tmp_path / "none")
     refused(arguments, ConfigError, r"no policy at .*none.*does not exist")

@@ -28,8 +28,10 @@ class Projection:
         ahead = np.subtract(view.target, view.position)
         self._ahead = ahead / np.linalg.norm(ahead)
         right = np.array([ahead[1], -ahead[0], 0.0])
-        self._right = right / np.linalg.norm(right)
-        self._up = np.cross(self._right, self._ahead)
+        right /= np.linalg.norm(right)
+        up = np.cross(right, self._ahead)
+        self._right = math.cos(view.roll) * right - math.sin(view.roll) * up
+        self._up = math.sin(view.roll) * right + math.cos(view.roll) * up
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return column and row [px] of points in front of the camera, shape (…, 2).

@@ -30,6 +30,7 @@ class PerceptionConfig(PreTrainedConfig):
         camera_position: where that camera stands unless it is moved, x, y, z in the base frame [m].
         camera_target: a point in the middle of its image, likewise.
         camera_fovy: its vertical field of view [deg].
+        camera_roll: by which it is turned clockwise about its line of sight [rad].
         area: where objects stand, in the base frame: smallest x, smallest y, largest x, largest y [m].
         object_height: the tallest object [m].
         margin: by how much the camera may be moved, as a share of the image's width that is looked at around the area.
@@ -49,6 +50,7 @@ class PerceptionConfig(PreTrainedConfig):
     camera_position: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.position))
     camera_target: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.target))
     camera_fovy: float = SCENE_CAMERA.fovy
+    camera_roll: float = SCENE_CAMERA.roll
     area: list[float] = field(default_factory=lambda: [0.35, -0.30, 0.65, 0.30])
     object_height: float = 0.13
     margin: float = 0.06
@@ -116,11 +118,15 @@ class PerceptionConfig(PreTrainedConfig):
         return int(width), int(height)
 
     @property
+    def view(self) -> CameraView:
+        """Where the camera stands unless it is moved."""
+        position, target = (tuple(values) for values in (self.camera_position, self.camera_target))
+        return CameraView(position, target, self.camera_fovy, self.camera_roll)  # type: ignore[arg-type]
+
+    @property
     def projection(self) -> Projection:
         """The camera where it is not moved, with the size of its images."""
-        position, target = (tuple(values) for values in (self.camera_position, self.camera_target))
-        view = CameraView(position, target, self.camera_fovy)  # type: ignore[arg-type]
-        return Projection(view, *self.image_size)
+        return Projection(self.view, *self.image_size)
 
     @property
     def region(self) -> Region:

@@ -6,7 +6,7 @@ adds may depend on the whole image, in which edges of the table and the arm's fo
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,10 @@ from torch.nn import functional
 
 from bhd_lerobot.bodies.tabletop import COLOURS
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.perception.camera import Region
 from bhd_lerobot.policies.perception.configuration_perception import STRIDE, PerceptionConfig
 from bhd_lerobot.policies.perception.labels import Labels
+from bhd_lerobot.policies.perception.refit import fit_view, matched
 
 _PLANE = 0.04  # [m] height of the plane that cells are projected to: about the middle of objects
 _SPREAD = 1.5  # [cells] standard deviation of the bump in the map of presence that an object's centre is to leave
@@ -30,6 +32,8 @@ _LOG_ERROR = (-4.0, 3.0)
 _DISTINCT = 0.025  # [m] what is found nearer to something surer is that
 _TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
 _RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
+_FITS = 6  # rounds: what is seen depends a little on where the camera is taken to be
+_LEAST_SEEN = 12  # objects; each gives two numbers, and six are to be found from what may in part be wrong
 _OUTPUTS = {
     "presence": 1,
     "shift": 3,
@@ -88,17 +92,24 @@ class PerceptionPolicy(PreTrainedPolicy):
     def __init__(self, config: PerceptionConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        self._region = left, top, right, bottom = config.region
-        rows, columns = (bottom - top) // STRIDE, (right - left) // STRIDE
-        self.network = _Network(config, self._region)
-        row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
-        pixels = np.stack([left + STRIDE * (column + 0.5), top + STRIDE * (row + 0.5)], axis=-1)
-        plane = config.projection.on_plane(pixels, _PLANE)
-        self.register_buffer("_plane", torch.tensor(plane, dtype=torch.float32), persistent=False)
-        self.register_buffer("_pixels", torch.tensor(pixels, dtype=torch.float32), persistent=False)
+        self.network = _Network(config)
+        self._aim()
         # What stated errors are multiplied by; not a number until errors on held-out images are known.
         self.register_buffer("factor", torch.tensor(math.nan))
         self._ratios: list[Tensor] = []
+
+    def _aim(self) -> None:
+        """Find out what follows from where the camera stands: the region, its cells, and what they show."""
+        config, device = self.config, next(self.network.parameters()).device
+        left, top, right, bottom = region = config.region
+        self.network.aim(region)
+        row, column = np.meshgrid(
+            np.arange((bottom - top) // STRIDE), np.arange((right - left) // STRIDE), indexing="ij"
+        )
+        pixels = np.stack([left + STRIDE * (column + 0.5), top + STRIDE * (row + 0.5)], axis=-1)
+        plane = config.projection.on_plane(pixels, _PLANE)
+        for name, values in (("_plane", plane), ("_pixels", pixels)):
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float32, device=device), persistent=False)
 
     def get_optim_params(self) -> list[dict[str, Any]]:
         """Return the parameters in two groups: weights, and biases and scales, which do not decay."""
@@ -203,6 +214,45 @@ class PerceptionPolicy(PreTrainedPolicy):
             # The quantile that also a further error stays below with this probability.
             share = min(1.0, _TAIL * (1 + 1 / max(1, len(ratios))))
             self.factor.copy_(torch.quantile(ratios, share) / _RADIUS)
+
+    @torch.no_grad()
+    def fit_camera(self, batches: Sequence[dict[str, Tensor]]) -> str:
+        """Find where the camera stands now, and look from there: what a network says of an image need not change much.
+
+        Args:
+            batches: images and true poses, as `forward` takes them.
+
+        Returns:
+            what was found, in words.
+
+        Raises:
+            ConfigError: too little of what is there was seen.
+        """
+        self.eval()
+        config, before = self.config, self.config.view
+        for _ in range(_FITS):
+            pairs = []
+            for batch in batches:
+                found = self._found(self.look(self.checked(batch))[1], factor=1.0)
+                pairs.append(matched(found, Labels.of(batch[OBS_ENV_STATE]), config.projection))
+            places, pixels = (np.concatenate(part) for part in zip(*pairs, strict=True))
+            if len(places) < _LEAST_SEEN:
+                raise ConfigError(
+                    f"Of the objects on these tables {len(places)} were seen; to find where the camera stands, "
+                    f"{_LEAST_SEEN} are needed. Record more tables, or train without --fine_tune_camera."
+                )
+            view = fit_view(before, config.image_size, places, pixels)
+            config.camera_position, config.camera_target = list(view.position), list(view.target)
+            config.camera_roll = view.roll
+            self._aim()
+        shift = 1000 * math.dist(before.position, view.position)
+        lines = [np.subtract(one.target, one.position) for one in (before, view)]
+        cosine = np.dot(*lines) / math.prod(float(np.linalg.norm(line)) for line in lines)
+        turn, roll = math.degrees(math.acos(min(1.0, cosine))), math.degrees(view.roll - before.roll)
+        return (
+            f"The camera {config.camera!r} was moved by {shift:.0f} mm, turned by {turn:.1f} deg and rolled by "
+            f"{roll:.1f} deg, by {len(places)} objects that were seen."
+        )
 
     # --- seeing ------------------------------------------------------------------------------------------------------
 
@@ -323,11 +373,12 @@ def _distinct(found: Detections) -> Detections:
 class _Network(nn.Module):
     """From an image to features of the cells of a region, shape (batch, channels, h, w), and from those to answers."""
 
-    def __init__(self, config: PerceptionConfig, region: tuple[int, int, int, int]) -> None:
+    _region: Region
+    _place: Tensor
+
+    def __init__(self, config: PerceptionConfig) -> None:
         super().__init__()
         fine, coarse, context = config.channels, config.hidden, config.context
-        self._region = left, top, right, bottom = region
-        rows, columns = (bottom - top) // STRIDE, (right - left) // STRIDE
         self.stem = nn.Sequential(_convolution(3, 16, 5, stride=2), _convolution(16, fine, 3, stride=2))
         self.down = _convolution(fine + 2, coarse, 3, stride=2)
         self.middle = nn.Sequential(_Residual(coarse, 1), _Residual(coarse, 2))
@@ -347,9 +398,14 @@ class _Network(nn.Module):
         self.to_coarse, self.to_fine = nn.Linear(context, 2 * coarse), nn.Linear(context, 2 * fine)
         outputs = sum(_OUTPUTS.values())
         self.answer = nn.Sequential(nn.Conv2d(fine, 64, 1), nn.ReLU(inplace=True), nn.Conv2d(64, outputs, 1))
-        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
-        self.register_buffer("_place", torch.stack([x, y])[None], persistent=False)
-        self._place: Tensor
+
+    def aim(self, region: Region) -> None:
+        """Look at a region of the images."""
+        self._region = left, top, right, bottom = region
+        rows, columns = ((size // STRIDE) for size in (bottom - top, right - left))
+        y, x = (torch.linspace(-1, 1, count, device=self.up.weight.device) for count in (rows, columns))
+        place = torch.stack(torch.meshgrid(x, y, indexing="xy"))[None]
+        self.register_buffer("_place", place, persistent=False)
 
     def forward(self, image: Tensor) -> Tensor:
         left, top, right, bottom = self._region

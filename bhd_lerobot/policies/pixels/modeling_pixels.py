@@ -30,7 +30,10 @@ from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 _PADDING = "action_is_pad"
 _TARGET = OBJECT_FIELDS.index("target")
 _VALUES = 16  # numbers that each further place of the image gives
-_SAME = ("camera", "camera_position", "camera_target", "camera_fovy", "area", "object_height", "margin", "image_size")
+_SAME = (
+    *("camera", "camera_position", "camera_target", "camera_fovy", "camera_roll"),
+    *("area", "object_height", "margin", "image_size"),
+)
 _SHAPE = ("channels", "hidden", "context")
 _SHARPNESS = 4  # attention is to fall off from an object's centre as this power of how near a cell is
 _THUMBNAIL = 8  # every so many pixels of an image, by which it is known again

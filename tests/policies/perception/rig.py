@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from bhd_lerobot.bodies.tabletop import SCENE_CAMERA
+from bhd_lerobot.bodies.tabletop import SCENE_CAMERA, CameraView
 from bhd_lerobot.policies.manipulation.grasp import read_objects
 from bhd_lerobot.policies.perception.camera import Projection
 from bhd_lerobot.policies.perception.configuration_perception import LABELS, PerceptionConfig
@@ -50,9 +50,9 @@ def states(count: int, **options: Any) -> np.ndarray:
     return task.environment_state(truth)
 
 
-def painted(values: np.ndarray) -> Tensor:
+def painted(values: np.ndarray, view: CameraView = SCENE_CAMERA) -> Tensor:
     """Return images with a spot of the object's colour where it is, shape (count, 3, height, width)."""
-    projection = Projection(SCENE_CAMERA, WIDTH, HEIGHT)
+    projection = Projection(view, WIDTH, HEIGHT)
     images = np.full((len(values), HEIGHT, WIDTH, 3), 0.6, np.float32)
     row, column = np.mgrid[:HEIGHT, :WIDTH]
     for image, table in zip(images, values, strict=True):

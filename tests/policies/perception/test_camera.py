@@ -1,5 +1,7 @@
 """Where the fixed camera sees what: the same as the renderer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,6 +23,17 @@ PROJECTION = Projection(SCENE_CAMERA, WIDTH, HEIGHT)
 def test_the_pixel_of_a_point_shows_that_point(point: tuple[float, float, float]) -> None:
     pixel = PROJECTION.pixels(np.array(point))
     assert PROJECTION.on_plane(pixel, point[2]) == pytest.approx(np.array(point), abs=1e-9)
+
+
+def test_a_roll_turns_the_image_about_its_middle_and_nothing_else() -> None:
+    rolled = Projection(replace(SCENE_CAMERA, roll=0.3), WIDTH, HEIGHT)
+    points = np.random.default_rng(0).uniform((0.35, -0.3, 0.0), (0.65, 0.3, 0.13), (20, 3))
+    middle = np.array([WIDTH, HEIGHT]) / 2
+    upright, turned = (one.pixels(points) - middle for one in (PROJECTION, rolled))
+    # The camera turns clockwise, so what it sees turns the other way; rows count downwards.
+    cos, sin = np.cos(0.3), np.sin(0.3)
+    assert turned == pytest.approx(upright @ np.array([[cos, -sin], [sin, cos]]), abs=1e-9)
+    assert rolled.on_plane(rolled.pixels(points[0]), points[0, 2]) == pytest.approx(points[0], abs=1e-9)
 
 
 def test_the_region_holds_the_box_and_its_sides_are_multiples() -> None:

@@ -1,5 +1,6 @@
 """`bhd_perception`: it learns, knows how much it errs, and refuses what it was not made for."""
 
+import copy
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,10 +14,11 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from bhd_lerobot.bodies.tabletop import COLOURS
+from bhd_lerobot.bodies.tabletop import COLOURS, SCENE_CAMERA, CameraView
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.manipulation.grasp import read_objects
 from bhd_lerobot.policies.manipulation.skills import scene_object
+from bhd_lerobot.policies.perception.camera import Projection
 from bhd_lerobot.policies.perception.configuration_perception import LABELS, PerceptionConfig
 from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
@@ -237,3 +239,44 @@ def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> No
     assert policy.forward(samples)[1]["colour"] > 0
     half = PerceptionPolicy(config(recolour=0.5)).train()._varied(samples[IMAGE].repeat(8, 1, 1, 1))[1]
     assert 0.3 < half.float().mean() < 0.7
+
+
+# --- a camera that was moved ------------------------------------------------------------------------------------------
+
+MOVED = CameraView((1.24, -0.63, 0.80), (0.42, -0.03, 0.12), SCENE_CAMERA.fovy, 0.04)
+
+
+def errors(policy: PerceptionPolicy, samples: dict[str, torch.Tensor]) -> float:
+    """Return the mean error of what is said near objects [mm]."""
+    policy.eval()
+    with torch.no_grad():
+        return policy.forward(samples)[1]["error_mm"]
+
+
+def test_tables_before_a_moved_camera_bring_back_what_the_move_cost(trained: PerceptionPolicy) -> None:
+    policy, values = copy.deepcopy(trained), states(540, max_objects=2)[500:]
+    labels = torch.from_numpy(values).float()
+    moved = painted(values, MOVED)
+    held_out = {IMAGE: moved[20:], OBS_ENV_STATE: labels[20:]}
+    original = errors(policy, {IMAGE: painted(values[20:]), OBS_ENV_STATE: labels[20:]})
+    lost = errors(policy, held_out)
+    said = policy.fit_camera([{IMAGE: moved[:20], OBS_ENV_STATE: labels[:20]}])
+    found = errors(policy, held_out)
+    assert lost > 2 * original
+    assert (lost - found) / (lost - original) > 0.8
+    assert "was moved by" in said
+    places = np.random.default_rng(0).uniform((0.35, -0.3, 0.02), (0.65, 0.3, 0.1), (50, 3))
+    apart = policy.config.projection.pixels(places) - Projection(MOVED, WIDTH, HEIGHT).pixels(places)
+    assert math.sqrt((apart**2).sum(axis=1).mean()) < 2.0
+    # What is saved says so, and what is made of it looks from there.
+    again = PerceptionPolicy(policy.config)
+    assert torch.equal(again._plane, policy._plane)
+    assert again.network._region == policy.network._region
+
+
+def test_too_few_objects_are_no_reason_to_move_a_camera(trained: PerceptionPolicy) -> None:
+    policy, values = copy.deepcopy(trained), states(1, max_objects=1)
+    before = policy.config.view
+    with pytest.raises(ConfigError, match=r"were seen; .* 12 are needed. Record more tables"):
+        policy.fit_camera([{IMAGE: painted(values), OBS_ENV_STATE: torch.from_numpy(values).float()}])
+    assert policy.config.view == before

@@ -1,0 +1,48 @@
+"""The arithmetic of `benchmarks.sight`, and that what it runs untrained finds as much as can be there."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from benchmarks.results.speed import sight_rows
+from benchmarks.sight import BESIDE, GOALS, HEIGHT, NOOP, PERCEPTION, SAME, WIDTH, rows, untrained_perception
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
+
+
+def block(brain: str, number: int, wake: float, *, core: str = SAME, rate: float = 25.0) -> dict[str, Any]:
+    times = {"wake_p50": wake / 2, "wake_p99": wake, "wake_max": 3 * wake, "tick_p99": 100.0}
+    brains = {"frames_per_s": rate, "cpu_ms": 9.0, "inference_p50": 8.0, "inference_p99": 9.0, "objects": None}
+    counts = {"ticks": 5000, "late": 5, "missed": 1, "late_share": 1e-3}
+    return {"round": number, "core": core, "brain": brain, **times, **brains, **counts}
+
+
+def test_a_ratio_is_taken_within_a_round_and_on_the_same_core() -> None:
+    blocks = [block(NOOP, 0, 10.0), block(PERCEPTION, 0, 12.0), block(NOOP, 1, 100.0), block(PERCEPTION, 1, 140.0)]
+    blocks += [block(NOOP, 0, 1.0, core=BESIDE), block(PERCEPTION, 0, 3.0, core=BESIDE)]
+    table = {(row["core"], row["brain"]): row for row in rows(blocks)}
+    assert table[SAME, PERCEPTION]["ratios"]["wake_p99"] == pytest.approx(1.3)
+    assert table[SAME, PERCEPTION]["met"]
+    assert (table[SAME, PERCEPTION]["ticks"], table[SAME, PERCEPTION]["missed"]) == (10_000, 2)
+    assert table[BESIDE, PERCEPTION]["ratios"]["wake_p99"] == pytest.approx(3.0)
+    assert not table[BESIDE, PERCEPTION]["met"]
+    assert "ratios" not in table[SAME, NOOP]
+
+
+def test_what_is_too_slow_misses_its_goal_and_the_page_says_so() -> None:
+    table = rows([block(NOOP, 0, 10.0), block(PERCEPTION, 0, 10.0, rate=20.0)])
+    assert not table[1]["met"]
+    shown = sight_rows({"rows": table, "goals": GOALS})
+    assert [row.met for row in shown] == [True, None, False]
+    assert "20.00, beside noop 25.00" in shown[2].value
+
+
+def test_the_untrained_perception_finds_as_many_objects_as_there_can_be(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    image = torch.rand(1, 3, HEIGHT // 8, WIDTH // 8).repeat_interleave(8, 2).repeat_interleave(8, 3)
+    perceiver = Perceiver(PerceptionOptions(str(untrained_perception(tmp_path, image))))
+    pixels = (255 * image[0].permute(1, 2, 0)).round().to(torch.uint8).numpy()
+    found = perceiver.look({"scene": pixels[None]}, 0)
+    assert MAX_OBJECTS - 1 <= len(found) <= MAX_OBJECTS  # two at one place are one
