@@ -27,12 +27,12 @@ Array = NDArray[np.float64]
 
 _TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 _GRIPPER = "gripper.pos"
-_DOWN, _LEVEL, _AROUND = 0.005, 0.012, 0.02
-"""[m] The tool's axis this near to the object's goes down; this near it stays as high as it is; this near, the fingers
-close if they are low enough."""
-_TURNED, _TURNED_AROUND = 0.06, 0.3  # [rad] turned from the grasp by less than this it goes down; and closes
+_DOWN, _LEVEL, _AROUND = 0.008, 0.02, 0.025
+"""[m] The tool's axis this near to the object's goes all the way down; this near not at all, and in between a part of it;
+this near the fingers close if they are low enough."""
+_TURNED, _TURNED_AROUND = 0.15, 0.3  # [rad] turned from the grasp by less than this it goes down; and closes
 _GAIN = 0.5  # share of the way to the target that one frame asks for: what follows with a delay does not overshoot
-_REACHED = 0.008  # [m] above the height of the grasp, at which the fingers close
+_REACHED = 0.015  # [m] above the height of the grasp, at which the fingers close
 _OVER = 0.035  # [m] above an object's top the fingers, which reach 14 mm farther than the tool, pass over it
 _BRAKE = 0.05  # [m] above that height it slows down
 _HELD = (-0.012, 0.004)  # [m] by which the opening differs from the object that is between the closed fingers
@@ -240,7 +240,9 @@ class PickServoBrain(_ServoBrain):
             if height < low + _REACHED and turn < _TURNED_AROUND:
                 return pointing_down(x, y, low, yaw), slow, closed
         if opening > grasp.opening - _OPEN and turn < _TURNED and apart < _LEVEL:
-            down = low if apart < _DOWN else max(low, min(height, over))
+            # A part of the way: at a threshold, one who follows this law less exactly would wait for ever.
+            share = min(1.0, max(0.0, apart - _DOWN) / (_LEVEL - _DOWN))
+            down = low + share * (over - low)
             return pointing_down(x, y, down, grasp.yaw), fast if height > over + _BRAKE else slow, grasp.opening
         if height < TRAVEL - _CLEAR:  # up first, turned as it is: something may stand beside it
             return pointing_down(float(tool[0]), float(tool[1]), TRAVEL, yaw), slow, grasp.opening
