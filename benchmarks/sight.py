@@ -193,7 +193,8 @@ def block(name: str, cores: tuple[int, int], seconds: float, checkpoints: dict[s
         camera=True,
         camera_width=WIDTH,
         camera_height=HEIGHT,
-        realtime=RealtimeConfig(affinity=[cores[1]]),
+        # On a core that is busy what reads the states may fall behind by as much as the episode is long.
+        realtime=RealtimeConfig(affinity=[cores[1]], buffer_s=seconds + 10.0),
     )
     with closing(make_robot(config)) as robot, pinned(cores[0]):
         task = make_task("ur5", config.fps, seconds)
