@@ -8,4 +8,5 @@ __all__ = [
     "modeling_perception",
     "perceiver",
     "processor_perception",
+    "refit",
 ]
