@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 _TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 _GRIPPER = "gripper.pos"
 _DOWN, _LEVEL, _AROUND = 0.008, 0.02, 0.025
-"""[m] The tool's axis this near to the object's goes all the way down; this near not at all, and in between a part of it;
-this near the fingers close if they are low enough."""
+"""[m] The tool's axis this near to the object's goes all the way down; this near not at all, and in between a part of
+it; this near the fingers close if they are low enough."""
 _TURNED, _TURNED_AROUND = 0.15, 0.3  # [rad] turned from the grasp by less than this it goes down; and closes
 _GAIN = 0.5  # share of the way to the target that one frame asks for: what follows with a delay does not overshoot
 _REACHED = 0.015  # [m] above the height of the grasp, at which the fingers close
