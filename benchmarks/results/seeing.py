@@ -121,11 +121,11 @@ def pixels(run: Runner, section: Section) -> None:
     section.rows += [success_row(results, name) for name in ("deaf", "blind")]
     section.rows.append(Row("time from nothing to the first seed", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"`bhd_pixels` after {last} rounds of aggregation, {len(SEEDS)} seeds of recordings and trainings: an episode's "
-        "first image of 160 x 120 pixels, the instruction as bytes and the robot's state in, tool poses out. True poses "
-        "taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black images. "
-        "LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from the rule's episodes, from "
-        "every frame; they have no input for words, and can do no better than to pick any one of the objects."
+        f"`bhd_pixels` after {last} rounds of aggregation, {len(SEEDS)} seeds of recordings and trainings: from an "
+        "episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's state to tool poses. True "
+        "poses taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black "
+        "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from the rule's episodes, "
+        "from every frame; they have no input for words, and can do no better than to pick any one of the objects."
     )
 
 
