@@ -124,8 +124,8 @@ def pixels(run: Runner, section: Section) -> None:
         f"`bhd_pixels` after {last} rounds of aggregation, {len(SEEDS)} seeds of recordings and trainings: from an "
         "episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's state to tool poses. True "
         "poses taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black "
-        "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from the rule's episodes, "
-        "from every frame; they have no input for words, and can do no better than to pick any one of the objects."
+        "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from every frame of the "
+        "rule's episodes; they have no input for words, and can do no better than to pick any one of the objects."
     )
 
 

@@ -14,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, TOOL, object_columns
-from bhd_lerobot.policies.mlp.residual_mlp import position_columns
+from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")
@@ -102,7 +102,7 @@ def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]
 
 
 def check_residual(config: Any, width: int) -> None:
-    """Refuse `residual` where no action is a position that is observed.
+    """Refuse `residual` where it is not known which columns it means.
 
     Args:
         config: with `residual`, `residual_columns` and `action_feature`.
@@ -111,13 +111,12 @@ def check_residual(config: Any, width: int) -> None:
     Raises:
         ConfigError: it cannot be honoured.
     """
-    if not config.residual:
-        return
     columns, actions = config.residual_columns, int(config.action_feature.shape[0])
-    if len(columns) != actions or max(columns, default=-1) < 0 or max(columns) >= width:
+    if config.residual and (len(columns) != actions or max(columns, default=-1) >= width):
         raise ConfigError(
-            f"policy.residual is true, and policy.residual_columns is {columns}: no action is known to be a position "
-            f"(….pos) that {OBS_STATE} has, too. Leave it false; for tool poses record with --robot.tool_pose=true."
+            f"policy.residual is {config.residual}, and policy.residual_columns is {columns}; it must have a column of "
+            f"{OBS_STATE}, below {width}, or -1, for each of the {actions} actions. Make the policy with the metadata "
+            "of its dataset."
         )
 
 
@@ -159,10 +158,10 @@ class MlpConfig(PreTrainedConfig):
             on twice its yaw, which a network learns badly from a quaternion.
         state_quaternions: columns of `observation.state` at which quaternions begin; found by their names.
         environment_quaternions: likewise of `observation.environment_state`.
-        residual: predict by how much an action differs from where the robot is, for actions that are positions which
-            are also observed, such as joint positions and tool poses.
-        residual_columns: of each action the column of `observation.state` that has its name, -1 for none; found by
-            their names.
+        residual: actions, by name or pattern, of which it predicts by how much they differ from what is observed under
+            the same name: where a robot is to go next is near where it is. Not for what is opened and closed at once,
+            such as a gripper: a small error in each frame would add up.
+        residual_columns: of each action the column of `observation.state`, -1 for none; found by their names.
         sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the
             nearest to it. Their order in the observation is then of no account. Where the robot observes its tool pose,
             it also sees where what is meant is from there.
@@ -199,7 +198,7 @@ class MlpConfig(PreTrainedConfig):
     yaw_harmonics: int = 0
     state_quaternions: list[int] = field(default_factory=list)
     environment_quaternions: list[int] = field(default_factory=list)
-    residual: bool = False
+    residual: list[str] = field(default_factory=list)
     residual_columns: list[int] = field(default_factory=list)
     sort_objects: bool = False
     objects: list[int] = field(default_factory=list)
@@ -333,7 +332,7 @@ class MlpConfig(PreTrainedConfig):
         if self.ignore and not self.ignored_columns:
             self.ignored_columns = matching_columns(self.ignore, names)
         if self.residual and not self.residual_columns:
-            self.residual_columns = position_columns(_names(features, ACTION), names)
+            self.residual_columns = residual_columns(self.residual, _names(features, ACTION), names)
         if self.sort_objects and not self.objects:
             start, count, size, fields = object_columns(_names(features, OBS_ENV_STATE))
             self.objects = [start, count, size, *fields] if count else []

@@ -10,7 +10,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import check_residual, matching_columns
 from bhd_lerobot.policies.mlp.objects_mlp import TOOL
-from bhd_lerobot.policies.mlp.residual_mlp import position_columns
+from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 
 FIRST = -100_000
@@ -38,8 +38,8 @@ class PixelsConfig(PerceptionConfig):
         hidden_dims: widths of the layers that predict actions.
         ignore: numbers of `observation.state` that it does not look at, by name or pattern, as in ``bhd_mlp``.
         ignored_columns: their columns; found by their names.
-        residual: predict by how much an action differs from where the robot is, as in ``bhd_mlp``.
-        residual_columns: of each action the column of `observation.state` that has its name; found by their names.
+        residual: actions of which it predicts by how much they differ from what is observed, as in ``bhd_mlp``.
+        residual_columns: of each action the column of `observation.state`, -1 for none; found by their names.
         tool_columns: of the tool pose in `observation.state`, if it is observed: then actions also depend on where what
             is named is from there; found by their names.
         min_std: least standard deviation that a number of the state or an action is divided by, in its own unit.
@@ -58,7 +58,7 @@ class PixelsConfig(PerceptionConfig):
     hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
     ignored_columns: list[int] = field(default_factory=list)
-    residual: bool = False
+    residual: list[str] = field(default_factory=list)
     residual_columns: list[int] = field(default_factory=list)
     tool_columns: list[int] = field(default_factory=list)
     min_std: float = 1e-3
@@ -121,7 +121,7 @@ class PixelsConfig(PerceptionConfig):
         if self.ignore and not self.ignored_columns:
             self.ignored_columns = matching_columns(self.ignore, names)
         if self.residual and not self.residual_columns:
-            self.residual_columns = position_columns(actions, names)
+            self.residual_columns = residual_columns(self.residual, actions, names)
         if not self.tool_columns and set(TOOL) <= set(names):
             self.tool_columns = [names.index(name) for name in TOOL]
 

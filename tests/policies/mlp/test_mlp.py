@@ -24,7 +24,7 @@ from bhd_lerobot.policies.mlp.objects_mlp import (
     relative_features,
     relative_size,
 )
-from bhd_lerobot.policies.mlp.residual_mlp import position_columns
+from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
 from bhd_lerobot.tasks.pick import ENVIRONMENT
@@ -518,7 +518,7 @@ STATS = {
 
 
 def test_a_residual_policy_that_says_nothing_stays_where_it_is() -> None:
-    made = config(residual=True, residual_columns=[3, -1])
+    made = config(residual=["*"], residual_columns=[3, -1])
     policy = MlpPolicy(made, dataset_stats=STATS)
     for parameter in policy.net.parameters():
         nn.init.zeros_(parameter)
@@ -534,10 +534,14 @@ def test_a_residual_policy_that_says_nothing_stays_where_it_is() -> None:
     assert torch.equal(again.predict_action_chunk(values), policy.predict_action_chunk(values))
 
 
-def test_positions_are_found_by_their_names_and_speeds_are_none() -> None:
-    assert position_columns(["a.pos", "b.pos", "c.vel"], ["c.vel", "b.pos", "x.pos"]) == [-1, 1, -1]
-    with pytest.raises(ConfigError, match=r"--robot\.tool_pose=true"):
-        MlpPolicy(config(residual=True, residual_columns=[-1, -1]))
+def test_actions_are_found_among_the_observations_by_their_names() -> None:
+    actions, observed = ["a.pos", "b.pos", "grip.pos"], ["c.vel", "b.pos", "grip.pos", "a.pos"]
+    assert residual_columns(["?.pos"], actions, observed) == [3, 1, -1]
+    assert residual_columns([], actions, observed) == [-1, -1, -1]
+    with pytest.raises(ConfigError, match=r"'x\*' matches no action .* a\.pos, b\.pos, grip\.pos"):
+        residual_columns(["x*"], actions, observed)
+    with pytest.raises(ConfigError, match="residual_columns"):
+        MlpPolicy(config(residual=["a.pos"], residual_columns=[1]))
 
 
 def test_where_what_is_meant_is_from_the_tool_does_not_depend_on_where_both_are() -> None:
