@@ -195,7 +195,7 @@ def test_cameras_are_recorded(tmp_path):
         ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
         (
             {"brain__type": "gap_follower"},
-            "Brains for it: blanked, dagger, language, learned, noop, pick, random, reach",
+            "Brains for it: blanked, dagger, language, learned, noop, pick, pick_servo, random, reach, reach_servo",
         ),
         ({"brain__type": "reach"}, "target_x"),
         ({"task__max_objects": 6}, "max_objects is 6"),

@@ -85,13 +85,22 @@ def pointing_down(x: float, y: float, z: float, yaw: float) -> Pose:
     return Pose((x, y, z), (values[3], values[4], values[5], values[6]))
 
 
-def plan_grasp(target: SeenObject, others: Sequence[SeenObject], max_opening: float) -> Grasp | None:
+def plan_grasp(
+    target: SeenObject,
+    others: Sequence[SeenObject],
+    max_opening: float,
+    *,
+    near: float | None = None,
+    enough: float = _ENOUGH,
+) -> Grasp | None:
     """Return the grasp with the most room for the fingers, and of those the one with the least turn of the wrist.
 
     Args:
         target: the object.
         others: what else stands on the table.
         max_opening: the gripper's largest opening [m].
+        near: direction of the line through the fingers from which the turn is counted [rad]; that at home if None.
+        enough: more room than this beside the fingers is of no use [m].
 
     Returns:
         The grasp, or None if the object does not fit between the fingers.
@@ -111,11 +120,11 @@ def plan_grasp(target: SeenObject, others: Sequence[SeenObject], max_opening: fl
             for fx, fy in fingers
             for o in others
         ]
-        grasps.append(Grasp(x, y, z, yaw, opening, width, min(gaps, default=_ENOUGH)))
+        grasps.append(Grasp(x, y, z, yaw, opening, width, min(gaps, default=enough)))
     if not grasps:
         return None
-    neutral = neutral_yaw(x, y)
-    best = max(grasps, key=lambda grasp: (min(grasp.room, _ENOUGH), -_turn(grasp.yaw, neutral)))
+    neutral = neutral_yaw(x, y) if near is None else near
+    best = max(grasps, key=lambda grasp: (min(grasp.room, enough), -_turn(grasp.yaw, neutral)))
     # Fingers are alike: of the two ways to stand on that line, the one with the smaller turn of the wrist.
     away = (best.yaw - neutral + math.pi / 2) % math.pi - math.pi / 2
     return replace(best, yaw=neutral + away)

@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 
 _TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 _GRIPPER = "gripper.pos"
-_DOWN, _LEVEL, _AROUND = 0.008, 0.02, 0.025
-"""[m] The tool's axis this near to the object's goes all the way down; this near not at all, and in between a part of
-it; this near the fingers close if they are low enough."""
-_TURNED, _TURNED_AROUND = 0.15, 0.3  # [rad] turned from the grasp by less than this it goes down; and closes
+_DOWN = (0.008, 0.02)  # [m] from the object to the tool's axis: so near it goes all the way down, and so far not at all
+_TURNED = (0.15, 0.4)  # [rad] from the grasp, likewise
+_AROUND, _TURNED_AROUND = 0.025, 0.4  # [m], [rad] within which the fingers close, if they are low enough
+_ROOM = 0.008  # [m] beside the fingers is enough
 _GAIN = 0.5  # share of the way to the target that one frame asks for: what follows with a delay does not overshoot
 _REACHED = 0.015  # [m] above the height of the grasp, at which the fingers close
 _OVER = 0.035  # [m] above an object's top the fingers, which reach 14 mm farther than the tool, pass over it
@@ -220,7 +220,8 @@ class PickServoBrain(_ServoBrain):
         grasp = None
         if target is not None:
             others = [item for item in objects if item.index != target.index]
-            grasp = plan_grasp(target, others, MAX_OPENING)
+            # From how the tool is turned now, so that a choice between two ways gets clearer while it turns.
+            grasp = plan_grasp(target, others, MAX_OPENING, near=_finger_line(tool), enough=_ROOM)
         if target is None or grasp is None:
             return None
         x, y = grasp.x - float(self._error[0]), grasp.y - float(self._error[1])
@@ -239,14 +240,23 @@ class PickServoBrain(_ServoBrain):
                 return pose, slow, closed
             if height < low + _REACHED and turn < _TURNED_AROUND:
                 return pointing_down(x, y, low, yaw), slow, closed
-        if opening > grasp.opening - _OPEN and turn < _TURNED and apart < _LEVEL:
+        if opening > grasp.opening - _OPEN and turn < _TURNED[1] and apart < _DOWN[1]:
             # A part of the way: at a threshold, one who follows this law less exactly would wait for ever.
-            share = min(1.0, max(0.0, apart - _DOWN) / (_LEVEL - _DOWN))
+            share = max(_part(apart, _DOWN), _part(turn, _TURNED))
             down = low + share * (over - low)
-            return pointing_down(x, y, down, grasp.yaw), fast if height > over + _BRAKE else slow, grasp.opening
+            return (
+                pointing_down(x, y, down, grasp.yaw),
+                fast if height > over + _BRAKE and not share else slow,
+                grasp.opening,
+            )
         if height < TRAVEL - _CLEAR:  # up first, turned as it is: something may stand beside it
             return pointing_down(float(tool[0]), float(tool[1]), TRAVEL, yaw), slow, grasp.opening
         return pointing_down(x, y, TRAVEL + _ABOVE, grasp.yaw), fast, grasp.opening
+
+
+def _part(value: float, between: tuple[float, float]) -> float:
+    """Return 0 below the first of two bounds, 1 above the second, and a part in between."""
+    return min(1.0, max(0.0, (value - between[0]) / (between[1] - between[0])))
 
 
 def _finger_line(tool: Array) -> float:

@@ -29,4 +29,4 @@ def test_points_are_shown_where_they_were_seen_though_some_were_taken_for_others
     pixels = Projection(true, *SIZE).pixels(places)
     pixels[:4] += rng.uniform(-30, 30, (4, 2))
     found = Projection(fit_view(SCENE_CAMERA, SIZE, places, pixels), *SIZE)
-    assert np.abs(found.pixels(places[4:]) - pixels[4:]).max() < 1.0
+    assert np.abs(found.pixels(places[4:]) - pixels[4:]).max() < 2.0  # of 30 px that the false ones are off

@@ -75,7 +75,7 @@ def test_it_can_learn_from_what_was_ignored(case: str) -> None:
     wide = seeing_more(policy(**CASES[case]), ignored=True)
     rows = batch(wide)
     wide.train()
-    wide._chunk(rows).square().sum().backward()
+    wide._chunk(wide.features(rows), rows).square().sum().backward()
     gradient = wide.net[0].weight.grad
     unused = (wide.net[0].weight == 0).all(dim=0)
     assert int(unused.sum()) == len(IGNORED) * wide.config.n_obs_steps
@@ -94,7 +94,7 @@ def test_it_can_see_what_was_before_and_does_the_same_at_first(case: str) -> Non
         wide.predict_action_chunk(every), narrow.predict_action_chunk(last), rtol=1e-5, atol=1e-6
     )
     wide.train()
-    wide._chunk(every).square().sum().backward()
+    wide._chunk(wide.features(every), every).square().sum().backward()
     first = wide.net[0].weight if wide.scan_encoder is None else wide.scan_encoder.layers[0].weight
     unused = (first == 0).all(dim=0)
     assert unused.any()
