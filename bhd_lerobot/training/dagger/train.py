@@ -135,6 +135,7 @@ class _Rounds:
             f"  bhd-eval --config_path={evaluation} --brains.policy.type=learned "
             f"--brains.policy.path={quoted(policy)}",
             soft_wrap=True,
+            markup=False,
             highlight=False,
         )
 
@@ -225,7 +226,7 @@ class _Rounds:
             raise _StoppedError(status)
 
     def _say(self, number: int, what: str) -> None:
-        self._console.print(f"round {number}: {what}", style="bold", soft_wrap=True, highlight=False)
+        self._console.print(f"round {number}: {what}", style="bold", soft_wrap=True, markup=False, highlight=False)
 
     # --- results -----------------------------------------------------------------------------------------------------
 
