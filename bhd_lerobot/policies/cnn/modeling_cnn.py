@@ -26,7 +26,7 @@ class CnnPolicy(MlpPolicy):
 
     Args:
         config: its shape and its features.
-        kwargs: what LeRobot passes to every policy; nothing of it is needed.
+        kwargs: what LeRobot passes to every policy, as in ``bhd_mlp``.
     """
 
     config_class = CnnConfig
@@ -34,7 +34,7 @@ class CnnPolicy(MlpPolicy):
     config: CnnConfig
 
     def __init__(self, config: CnnConfig, **kwargs: Any) -> None:
-        super().__init__(config)
+        super().__init__(config, **kwargs)
         self._kept_keys = [*self._keys, OBS_ODOMETRY, config.image_key]
         width, height = config.image_size
         layers: list[nn.Module] = []

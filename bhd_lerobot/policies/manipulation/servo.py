@@ -217,18 +217,18 @@ class PickServoBrain(_ServoBrain):
             objects: what the task tells.
         """
         target = next((item for item in objects if item.target), None)
-        grasp = None
+        grasp, yaw = None, _finger_line(tool)
         if target is not None:
             others = [item for item in objects if item.index != target.index]
             # From how the tool is turned now, so that a choice between two ways gets clearer while it turns.
-            grasp = plan_grasp(target, others, MAX_OPENING, near=_finger_line(tool), enough=_ROOM)
+            grasp = plan_grasp(target, others, MAX_OPENING, near=yaw, enough=_ROOM)
         if target is None or grasp is None:
             return None
         x, y = grasp.x - float(self._error[0]), grasp.y - float(self._error[1])
         # Where the object stands, or hangs: its bottom is not always on the table.
         bottom = max(0.0, target.position[2] - float(self._error[2]) - target.size[2] / 2)
         low, over = bottom + grasp.z, bottom + target.size[2] + _OVER
-        apart, height, yaw = math.hypot(tool[0] - x, tool[1] - y), float(tool[2]), _finger_line(tool)
+        apart, height = math.hypot(tool[0] - x, tool[1] - y), float(tool[2])
         turn = abs(math.remainder(yaw - grasp.yaw, math.pi))
         fast, slow = self.config.lead_m, self.config.down_m
         if apart < _AROUND and abs(height - low) < _AROUND:
@@ -244,11 +244,8 @@ class PickServoBrain(_ServoBrain):
             # A part of the way: at a threshold, one who follows this law less exactly would wait for ever.
             share = max(_part(apart, _DOWN), _part(turn, _TURNED))
             down = low + share * (over - low)
-            return (
-                pointing_down(x, y, down, grasp.yaw),
-                fast if height > over + _BRAKE and not share else slow,
-                grasp.opening,
-            )
+            lead = fast if height > over + _BRAKE and not share else slow
+            return pointing_down(x, y, down, grasp.yaw), lead, grasp.opening
         if height < TRAVEL - _CLEAR:  # up first, turned as it is: something may stand beside it
             return pointing_down(float(tool[0]), float(tool[1]), TRAVEL, yaw), slow, grasp.opening
         return pointing_down(x, y, TRAVEL + _ABOVE, grasp.yaw), fast, grasp.opening

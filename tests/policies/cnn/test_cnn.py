@@ -219,3 +219,14 @@ def test_it_refuses_a_batch(break_it: Any, message: str) -> None:
     break_it(ready)
     with pytest.raises(ConfigError, match=message):
         CnnPolicy(made).predict_action_chunk(ready)
+
+
+def test_it_knows_the_statistics_as_a_perceptron_does() -> None:
+    stats = {
+        OBS_STATE: {"mean": torch.zeros(len(NAMES)), "std": torch.full((len(NAMES),), 2.0)},
+        ACTION: {"mean": torch.zeros(2), "std": torch.ones(2)},
+    }
+    policy = CnnPolicy(config(residual=["*.vel"], residual_columns=[0, 1]), dataset_stats=stats)
+    assert policy.residual is not None
+    state = torch.randn(5, len(NAMES))
+    assert torch.equal(policy.residual(state)[:, 0], 2 * state[:, :2])
