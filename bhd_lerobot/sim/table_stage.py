@@ -88,7 +88,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[20, 20, 0.1],
+        size=[20, 20, 2],  # in squares of 2 m: see sim/scene.py
         pos=[0, 0, FLOOR],
         material="floor",
         contype=0,
