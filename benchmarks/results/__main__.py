@@ -1,6 +1,7 @@
 """`make results`: everything that is claimed about learning, made again, into `docs/reference/results.md`.
 
-It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew.
+It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew. With `--only`, the
+other sections of the page stay as they are.
 """
 
 import argparse
@@ -40,18 +41,21 @@ MEASURES = (
     ("speed", "Speed", speed),
 )
 
+_FOLDER, _PAGE = "outputs/results", "docs/reference/results.md"
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the results; return 0, 1 if a goal was missed, or 2 if a command failed."""
     names = [name for name, _, _ in MEASURES]
     parser = argparse.ArgumentParser(prog="make results", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=names, default=names, help="sections to make")
-    parser.add_argument("--folder", type=Path, default=Path("outputs/results"), help="where everything goes")
-    parser.add_argument("--page", type=Path, default=Path("docs/reference/results.md"))
-    parser.add_argument("--short", action="store_true", help="a short run, to try the commands")
+    parser.add_argument("--folder", type=Path, help=f"where everything goes: {_FOLDER}, {_FOLDER}_short")
+    parser.add_argument("--page", type=Path, help=f"what is written: {_PAGE}, or results.md in the folder of --short")
+    parser.add_argument("--short", action="store_true", help="a short run, which shows in which direction numbers go")
     parser.add_argument("--fresh", action="store_true", help="begin anew")
     options = parser.parse_args(arguments)
-    folder = REPOSITORY / options.folder
+    folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
+    page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
     if options.fresh and folder.exists():
         shutil.rmtree(folder)
     sections = []
@@ -67,9 +71,12 @@ def main(arguments: list[str] | None = None) -> int:
         section.commands = run.commands
         sections.append(section)
         # After each section: what takes hours may be stopped.
-        write_page(REPOSITORY / options.page, sections, is_short=options.short)
+        write_page(page, sections, [title for _, title, _ in MEASURES], is_short=options.short)
     missed = [f"{section.name}: {row.what}" for section in sections for row in section.rows if row.met is False]
-    print(f"Written: {options.page}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
+    print(
+        f"Written: {page.relative_to(REPOSITORY) if page.is_relative_to(REPOSITORY) else page}."
+        + (f" Missed: {'; '.join(missed)}." if missed else "")
+    )
     return 1 if missed else 0
 
 

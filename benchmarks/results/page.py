@@ -12,26 +12,44 @@ import torch
 from benchmarks.results.section import Section
 
 _PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
+_HEAD = (
+    "# Results",
+    "",
+    "Written by `make results`, which runs the commands below each table; nothing here was typed by hand. Rates",
+    "are with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness, over the",
+    "same held-out episodes for all brains of a table. Times of training include the start of the program. Each",
+    "section says when and where it was made.",
+)
+_SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 
 
-def write_page(path: Path, sections: Sequence[Section], *, is_short: bool) -> None:
-    """Write the sections as a page of Markdown."""
-    lines = [
-        "# Results",
-        "",
-        "Written by `make results`, which runs the commands below each table; nothing here was typed by hand. Rates",
-        "are with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness, over the",
-        "same held-out episodes for all brains of a table. Times of training include the start of the program.",
-        "",
-        f"Made on {datetime.now():%Y-%m-%d}, on {_machine()}.",
-        f"Versions: {', '.join(f'{name} {version(name)}' for name in _PACKAGES)}.",
-        "",
-    ]
-    if is_short:
-        lines += ["**A short run, to try the commands: these numbers are not to be quoted.**", ""]
+def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *, is_short: bool) -> None:
+    """Write the sections as a page of Markdown; those of the page that were not made now stay as they are.
+
+    Args:
+        path: the page.
+        sections: what was made now.
+        titles: of all sections that there are, in their order; others that the page has are dropped.
+        is_short: made by a short run, whose page says so.
+    """
+    texts = {} if not path.exists() else _kept(path.read_text(encoding="utf-8"))
     for section in sections:
-        lines += section.markdown()
-    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+        first, *rest = section.markdown()
+        texts[section.title] = "\n".join([first, "", _made(), *rest])
+    lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
+    lines += ["\n" + texts[title].strip() for title in titles if title in texts]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _kept(page: str) -> dict[str, str]:
+    """Return the sections of a page by their titles."""
+    texts = page.split("\n## ")[1:]
+    return {text.partition("\n")[0]: f"## {text}" for text in texts}
+
+
+def _made() -> str:
+    versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
+    return f"Made on {datetime.now():%Y-%m-%d}, on {_machine()}, with {versions}."
 
 
 def _machine() -> str:

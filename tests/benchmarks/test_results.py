@@ -186,7 +186,7 @@ def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> N
     section = Section("speed", "Speed", [Row("a", "1 x"), Row("b", "2 x", "at least 3 x", met=False)], ["A remark."])
     section.commands = [Runner(tmp_path, is_short=True).run("note", ["python", "-c", "pass"])]
     page = tmp_path / "results.md"
-    write_page(page, [section], is_short=True)
+    write_page(page, [section], ["Speed"], is_short=True)
     text = page.read_text(encoding="utf-8")
     assert "## Speed" in text
     assert "| a | 1 x |  |  |" in text
@@ -194,5 +194,17 @@ def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> N
     assert "A remark." in text
     assert "python -c pass   # " in text
     assert "not to be quoted" in text
-    write_page(page, [section], is_short=False)
+    write_page(page, [section], ["Speed"], is_short=False)
     assert "not to be quoted" not in page.read_text(encoding="utf-8")
+
+
+def test_sections_that_were_not_made_stay_on_the_page_in_their_order(tmp_path: Path) -> None:
+    page, titles = tmp_path / "results.md", ["Avoid: a robot roams", "Reach", "Speed"]
+    for name, value in (("Speed", "1 x"), ("Reach", "90 %"), ("Avoid: a robot roams", "99 %"), ("Gone", "0 %")):
+        write_page(page, [Section("", name, [Row("a number", value)])], [*titles, "Gone"], is_short=False)
+    before = page.read_text(encoding="utf-8")
+    write_page(page, [Section("", "Reach", [Row("a number", "95 %")])], titles, is_short=False)
+    text = page.read_text(encoding="utf-8")
+    assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == titles
+    assert text.count("\nMade on ") == 3
+    assert text == before.partition("\n## Gone")[0].replace("90 %", "95 %")
