@@ -4,22 +4,19 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.results.learning import TRAIL, evaluate, success_row, values
+from benchmarks.results.learning import TRAIL, aggregation, evaluate, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, SEEDS, ROUNDS = 1000, (0, 1, 2), 2
-_SHORT = (
-    *("--expert_episodes=8", "--episodes=4", "--validation_episodes=8"),
-    *("--rounds=1", "--policy.options=[--steps=50]"),
-)
+_SHORT, _STEPS = (80, 40, 16), 1500
 _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
 
 
 def aggregate(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
-    made = {seed: aggregated(run, seed) for seed in SEEDS}
+    made = {seed: aggregated(run, seed) for seed in run.seeds(SEEDS)}
     brains = {"clone": f"{_folder(0)}/round_0/policy"}
     brains |= {f"seed_{seed}": policy for seed, (policy, _) in made.items()}
     results = evaluate(
@@ -34,7 +31,7 @@ def aggregate(run: Runner, section: Section) -> None:
     )
     section.rows += [success_row(results, name) for name in ("gap_follower", "clone")]
     scores = {name: np.array(values(results, name, "score"), float) for name in ("gap_follower", *brains)}
-    for seed in SEEDS:
+    for seed in made:
         name = f"seed_{seed}"
         success = results["brains"][name]["success"]
         row = success_row(results, name)
@@ -43,10 +40,10 @@ def aggregate(run: Runner, section: Section) -> None:
         ratio = ratio_of_means(scores[name], scores["gap_follower"])
         what = f"{name} / gap_follower: mean score, paired"
         section.rows.append(Row(what, mean(asdict(ratio)), f"at least {_SCORE_GOAL}", ratio.value >= _SCORE_GOAL))
-    rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in SEEDS]
+    rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in made]
     section.rows.append(Row("time from nothing to the first seed's policy", f"{made[0][1]:.0f} s"))
     section.remarks.append(
-        f"{len(SEEDS)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` "
+        f"{len(made)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` "
         f"learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule took "
         "over before collisions and said in every frame what it would do; the others learned that, from all episodes "
         "so far."
@@ -55,11 +52,8 @@ def aggregate(run: Runner, section: Section) -> None:
 
 def aggregated(run: Runner, seed: int) -> tuple[str, float]:
     """Clone a rule by aggregation, and return the folder of the policy and how long that took [s]."""
-    config = "configs/train/dagger_turtlebot3_avoid.yaml"
-    command = ["bhd-train", f"--config_path={config}", f"--seed={seed}", f"--output_dir={run.path(_folder(seed))}"]
-    options = _SHORT if run.is_short else (f"--rounds={ROUNDS}",)
-    seconds = run.run(f"aggregate_train_{seed}", [*command, *options]).seconds
-    return f"{_folder(seed)}/round_{1 if run.is_short else ROUNDS}/policy", seconds
+    name, config = f"aggregate_train_{seed}", "dagger_turtlebot3_avoid"
+    return aggregation(run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS)
 
 
 def _folder(seed: int) -> str:

@@ -4,16 +4,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.results.learning import success_row, values
+from benchmarks.results.learning import aggregation, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 2
-_SHORT = (
-    *("--expert_episodes=8", "--episodes=4", "--validation_episodes=8"),
-    *("--rounds=1", "--policy.options=[--steps=50]"),
-)
+_SHORT, _STEPS = (40, 20, 16), 600
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
 _RULES = ("avoidance", "gap_follower")
 _BLANKED = 100  # episodes of the driver that is blind
@@ -21,15 +18,13 @@ _BLANKED = 100  # episodes of the driver that is blind
 
 def camera_drive(run: Runner, section: Section) -> None:
     """Let a rule that reads the lidar correct a driver that sees with a camera."""
-    config, last = "configs/train/dagger_turtlebot3_camera.yaml", 1 if run.is_short else ROUNDS
-    seeds = SEEDS[:1] if run.is_short else SEEDS
-    seconds = []
+    seeds, seconds, brains = run.seeds(SEEDS), [], {"clone": f"{_folder(0)}/round_0/policy"}
     for seed in seeds:
-        command = ["bhd-train", f"--config_path={config}", f"--seed={seed}", f"--output_dir={run.path(_folder(seed))}"]
-        options = _SHORT if run.is_short else (f"--rounds={ROUNDS}",)
-        seconds.append(run.run(f"camera_drive_train_{seed}", [*command, *options]).seconds)
-    brains = {"clone": f"{_folder(0)}/round_0/policy"}
-    brains |= {f"seed_{seed}": f"{_folder(seed)}/round_{last}/policy" for seed in seeds}
+        name, config = f"camera_drive_train_{seed}", "dagger_turtlebot3_camera"
+        brains[f"seed_{seed}"], time = aggregation(
+            run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS
+        )
+        seconds.append(time)
     learned = [
         option
         for name, folder in brains.items()
@@ -74,15 +69,15 @@ def camera_drive(run: Runner, section: Section) -> None:
         f"`bhd_cnn`, {len(seeds)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. "
         "It sees images of 64 x 48 pixels from the front camera, and the wheels' odometry. The lidar's ranges taught "
         "it how far away things are; they are no input, and neither is what ground it has visited. `clone` learned "
-        f"from the rule's episodes alone; the others drove in {last} further rounds, corrected by the rule. `blind` is "
-        "seed 0 with black images."
+        f"from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further rounds, corrected by the "
+        "rule. `blind` is seed 0 with black images."
     )
 
 
 def _evaluate(run: Runner, name: str, brains: list[str], only: tuple[str, ...], episodes: int) -> dict:
     config = "--config_path=configs/eval/turtlebot3_avoid_camera.yaml"
     command = ["bhd-eval", config, *brains, f"--only=[{','.join(only)}]", "--baseline=avoidance", "--videos=0"]
-    command += [f"--n_episodes={8 if run.is_short else episodes}", f"--output_dir={run.path(name)}"]
+    command += [f"--n_episodes={run.size(episodes, 16)}", f"--output_dir={run.path(name)}"]
     run.run(name, command)
     return run.read(name, "results.json")
 

@@ -14,23 +14,31 @@ EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 _ROAMING = ("gap_follower", "avoidance")
 TRAIL = ("--task.trail=true",)
-_REACH_EPISODES = (250, 750, 1500)
+_REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
+_FEW = ("--steps=1500", "--eval_steps=1500")
 _AVOID_TRAIN_S, _PPO_TRAIN_S = 120, 1200
 _REACH_GOAL, _PPO_GOAL = 0.97, 1.2
 
 
 def avoid(run: Runner, section: Section) -> None:
     """Cloning rules, and reinforcement learning, on the avoid task."""
-    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=200, options=("--seed=100",))
-    seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data")
+    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 40), options=("--seed=100",))
+    seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data", short=_FEW)
     gap = ("--seed=100", "--brain.type=gap_follower", *TRAIL)
-    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=400, options=gap)
-    train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data")
+    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 80), options=gap)
+    train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data", short=_FEW)
     start = (
         *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
         *("--critic_warmup=65536", "--ppo.log_std_init=-1.0"),
     )
-    ppo_seconds = train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start)
+    ppo_seconds = train(
+        run,
+        "avoid_ppo",
+        "ppo_turtlebot3",
+        "avoid/ppo",
+        options=start,
+        short=("--steps=200000", "--validation.freq=100000"),
+    )
     results = evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
     # The task reports more to these two; the episodes are the same.
     brains = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
@@ -108,19 +116,20 @@ def reach(run: Runner, section: Section) -> None:
     """Cloning a rule on the reach task, from few to many episodes; the last is the policy that others start from."""
     options = (*TOOL, "--task.hold_s=1.0", "--seed=100")
     seconds, folders = {}, {}
-    for episodes in _REACH_EPISODES:
+    numbers = _FEW_EPISODES if run.is_short else _REACH_EPISODES
+    for episodes in numbers:
         data, folder = (
             f"reach/data_{episodes}",
-            "reach/bc" if episodes == _REACH_EPISODES[-1] else f"reach/bc_{episodes}",
+            "reach/bc" if episodes == numbers[-1] else f"reach/bc_{episodes}",
         )
         record(run, f"reach_record_{episodes}", "ur5_reach", data, episodes=episodes, options=options)
         before = run.commands[-1].seconds
-        seconds[episodes] = before + train(run, f"reach_bc_{episodes}", "bc_ur5_reach", folder, data)
+        seconds[episodes] = before + train(run, f"reach_bc_{episodes}", "bc_ur5_reach", folder, data, short=_FEW)
         folders[f"bc_{episodes}"] = folder
     results = evaluate(run, "reach_eval", "ur5_reach", folders, rules=("reach",), baseline="reach", options=TOOL)
     section.rows.append(success_row(results, "reach"))
-    for episodes in _REACH_EPISODES:
-        is_last = episodes == _REACH_EPISODES[-1]
+    for episodes in numbers:
+        is_last = episodes == numbers[-1]
         section.rows.append(success_row(results, f"bc_{episodes}", _REACH_GOAL if is_last else None))
         section.rows.append(Row(f"bc_{episodes}: time from nothing", f"{seconds[episodes]:.0f} s"))
     section.remarks.append("`bc_N` learned from N episodes, all with the same number of steps.")
@@ -131,8 +140,6 @@ def reach(run: Runner, section: Section) -> None:
 
 def record(run: Runner, name: str, config: str, root: str, *, episodes: int, options: Sequence[str] = ()) -> None:
     """Record episodes of the rule that the configuration names."""
-    if run.is_short:
-        episodes = max(8, episodes // 50)
     run.run(
         name,
         [
@@ -144,13 +151,44 @@ def record(run: Runner, name: str, config: str, root: str, *, episodes: int, opt
 
 
 def train(
-    run: Runner, name: str, config: str, output: str, root: str | None = None, *, options: Sequence[str] = ()
+    run: Runner,
+    name: str,
+    config: str,
+    output: str,
+    root: str | None = None,
+    *,
+    options: Sequence[str] = (),
+    short: Sequence[str] = (),
 ) -> float:
-    """Train, and return how long that took, start-up included [s]."""
+    """Train, with further options in a short run; return how long that took, start-up included [s]."""
     data = options if root is None else (f"--dataset.root={run.path(root)}", *options)
-    short = ("--steps=50",) if run.is_short else ()
     command = ["bhd-train", f"--config_path=configs/train/{config}.yaml", *data, f"--output_dir={run.path(output)}"]
-    return run.run(name, [*command, *short]).seconds
+    return run.run(name, [*command, *(short if run.is_short else ())]).seconds
+
+
+def aggregation(
+    run: Runner, name: str, config: str, output: str, *, seed: int, rounds: int, short: Sequence[int], steps: int
+) -> tuple[str, float]:
+    """Learn by aggregation, and return the folder of the last round's policy and how long that took [s].
+
+    Args:
+        run: runs it.
+        name: what its note is called.
+        config: its configuration.
+        output: its folder.
+        seed: of recordings and trainings.
+        rounds: beyond the expert's own episodes; one in a short run.
+        short: in a short run, how many episodes the expert drives, the learner drives, and it is validated on.
+        steps: of each training of a short run.
+    """
+    rounds = run.size(rounds, 1)
+    command = ["bhd-train", f"--config_path=configs/train/{config}.yaml", f"--seed={seed}", f"--rounds={rounds}"]
+    if run.is_short:
+        names = ("expert_episodes", "episodes", "validation_episodes")
+        command += [f"--{key}={value}" for key, value in zip(names, short, strict=True)]
+        command += [f"--policy.options=[--steps={steps}]"]
+    ran = run.run(name, [*command, f"--output_dir={run.path(output)}"])
+    return f"{output}/round_{rounds}/policy", ran.seconds
 
 
 def evaluate(
@@ -165,7 +203,7 @@ def evaluate(
     episodes: int = EPISODES,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = 16 if run.is_short else episodes
+    episodes = run.size(episodes, 32)
     learned = [
         option
         for label, folder in brains.items()

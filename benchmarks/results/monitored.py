@@ -1,6 +1,6 @@
 """The section about reinforcement learning behind the collision monitor, from drivers that learned by aggregation."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,19 +13,19 @@ from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 _FAILURES_GOAL, _RULE_GOAL = 5, 1.5
-_SHORT = ("--env.n_envs=8", "--ppo.n_steps=8", "--validation.n_episodes=4", "--validation.confirm=4")
+_SHORT = ("--steps=100000", "--validation.freq=50000", "--validation.n_episodes=16", "--validation.confirm=16")
 
 
 def monitored(run: Runner, section: Section) -> None:
     """Train drivers that learned by aggregation further, with PPO and the collision monitor."""
-    clones, learned, seconds = {}, {}, []
-    for seed in SEEDS:
+    seeds, clones, learned, seconds = run.seeds(SEEDS), {}, {}, []
+    for seed in seeds:
         clones[f"clone_{seed}"], _ = aggregated(run, seed)
         start = f"--start_from={run.path(clones[f'clone_{seed}'])}"
-        options = (start, f"--seed={seed}", *(_SHORT if run.is_short else ()))
+        options = (start, f"--seed={seed}")
         folder = f"monitored/seed_{seed}"
         name = f"monitored_train_{seed}"
-        seconds.append(train(run, name, "ppo_turtlebot3_monitor", folder, options=options))
+        seconds.append(train(run, name, "ppo_turtlebot3_monitor", folder, options=options, short=_SHORT))
         learned[f"ppo_{seed}"] = f"{folder}/checkpoints/best"
     config, rule = "turtlebot3_avoid", "avoidance"
     alone = evaluate(
@@ -41,7 +41,7 @@ def monitored(run: Runner, section: Section) -> None:
         episodes=EPISODES,
     )
     section.rows += [success_row(alone, name) for name in (rule, *clones)]
-    section.rows += rows(alone, behind, SEEDS)
+    section.rows += rows(alone, behind, seeds)
     section.rows.append(Row("time of PPO, the first seed", f"{seconds[0]:.0f} s"))
     section.remarks.append(
         "`clone_N` learned from `gap_follower` by aggregation, `ppo_N` from there by PPO with the monitor in the loop "
@@ -49,7 +49,7 @@ def monitored(run: Runner, section: Section) -> None:
     )
 
 
-def rows(alone: Mapping[str, Any], behind: Mapping[str, Any], seeds: tuple[int, ...]) -> list[Row]:
+def rows(alone: Mapping[str, Any], behind: Mapping[str, Any], seeds: Sequence[int]) -> list[Row]:
     """Return the rows of the brains behind the monitor, with the goals of the learned ones.
 
     Args:

@@ -61,6 +61,14 @@ class Runner:
         self.folder, self.is_short = folder, is_short
         self.commands: list[Ran] = []
 
+    def size(self, full: int, short: int) -> int:
+        """Return how much of something there is to be: in a full run, or in a short one."""
+        return short if self.is_short else full
+
+    def seeds(self, seeds: Sequence[int]) -> Sequence[int]:
+        """Return the training seeds: of a short run only the first."""
+        return seeds[:1] if self.is_short else seeds
+
     def path(self, *parts: str) -> Path:
         """Return a path in the folder, relative to the repository if it lies there; its parent exists."""
         path = self.folder.joinpath(*parts)

@@ -23,6 +23,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )
 _PIXELS_GOAL, _ROUNDS = 0.6, 2
+_FEW = ("--steps=500", "--eval_steps=500")
 _OTHERS = ("act", "diffusion")
 _BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
 
@@ -30,18 +31,19 @@ _BLANKED = 100  # episodes of the brains that are deaf or blind: none of them su
 def see(run: Runner, section: Section) -> None:
     """Learn to see tables, and pick what an instruction names from what is seen."""
     record_tables(run)
-    for seed in SEEDS:
+    seeds = run.seeds(SEEDS)
+    for seed in seeds:
         train_perception(run, seed)
     looks = _evaluate(run, "see_look", "ur5_look", _seeing(run), ())
-    for name in _names():
+    for name in _names(run):
         _perceived(section, name, looks["brains"][name]["perception"])
-    for number, (what, options, goal) in enumerate(WORLDS):
+    for number, (what, options, goal) in _worlds(run):
         results = _evaluate(run, f"see_{number}", "ur5_pick", _seeing(run), options)
-        for name in _names():
+        for name in _names(run):
             row, low = success_row(results, name), results["brains"][name]["success"]["low"]
             words = "" if goal is None else f"lower end at least {goal:.0%}"
             section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
-        section.rows.append(seeds_row(results, _names(), what))
+        section.rows.append(seeds_row(results, _names(run), what))
     blanked = []
     for name, sense in (("deaf", "instruction"), ("blind", "images")):
         inner = (f"--brains.{name}.brain.type=language", f"--brains.{name}.brain.perception.path={_path(run, 0)}")
@@ -52,7 +54,7 @@ def see(run: Runner, section: Section) -> None:
         Row("time from nothing to the first seed", f"{sum(one.seconds for one in run.commands[:2]):.0f} s")
     )
     section.remarks.append(
-        f"{len(SEEDS)} seeds of the training. The brain `language` sees with the checkpoint and gets nothing else of "
+        f"{len(seeds)} seeds of the training. The brain `language` sees with the checkpoint and gets nothing else of "
         "the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind one black "
         "images: both refuse, and say why. What was learned from has no object of the style of those that it has not "
         "seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
@@ -61,27 +63,29 @@ def see(run: Runner, section: Section) -> None:
 
 def record_tables(run: Runner) -> None:
     """Record the tables that are learned to be seen."""
-    record(run, "see_record", "ur5_look", "see/tables", episodes=12_000, options=("--seed=11",))
+    record(run, "see_record", "ur5_look", "see/tables", episodes=run.size(12_000, 800), options=("--seed=11",))
 
 
 def train_perception(run: Runner, seed: int) -> str:
     """Train a perception on them; return its folder."""
-    train(run, f"see_train_{seed}", "perception_ur5", _folder(seed), "see/tables", options=(f"--seed={seed}",))
+    options = (f"--seed={seed}",)
+    train(run, f"see_train_{seed}", "perception_ur5", _folder(seed), "see/tables", options=options, short=_FEW)
     return _folder(seed)
 
 
 def pixels(run: Runner, section: Section) -> None:
     """Learn to pick what an instruction names from images, end to end."""
     size = ("--robot.camera_width=160", "--robot.camera_height=120")
-    record(run, "pixels_tables", "ur5_look", "pixels/tables", episodes=12_000, options=("--seed=11", *size))
-    last = 1 if run.is_short else _ROUNDS
-    folders = {}
-    for seed in SEEDS:
+    record(
+        run, "pixels_tables", "ur5_look", "pixels/tables", episodes=run.size(12_000, 800), options=("--seed=11", *size)
+    )
+    last, folders = run.size(_ROUNDS, 1), {}
+    for seed in run.seeds(SEEDS):
         eyes, folder = f"pixels/perception_{seed}", f"pixels/seed_{seed}"
         options = (f"--seed={seed}", "--steps=6000")
-        train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options)
-        learn = [f"--policy.perception={run.path(eyes)}", *(["--steps=50"] if run.is_short else [])]
-        few = ("--expert_episodes=16", "--episodes=8", "--validation_episodes=8")
+        train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
+        learn = [f"--policy.perception={run.path(eyes)}", *(["--steps=1000"] if run.is_short else [])]
+        few = ("--expert_episodes=80", "--episodes=40", "--validation_episodes=16")
         command = ["bhd-train", "--config_path=configs/train/dagger_ur5_pixels.yaml", f"--rounds={last}"]
         command += [f"--policy.options=[{', '.join(learn)}]", *(few if run.is_short else ())]
         run.run(f"pixels_train_{seed}", [*command, f"--seed={seed}", f"--output_dir={run.path(folder)}"])
@@ -92,18 +96,18 @@ def pixels(run: Runner, section: Section) -> None:
         for name, folder in folders.items()
         for option in (f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}")
     ]
-    for number, (what, options, _) in enumerate(WORLDS):
+    for number, (what, options, _) in _worlds(run):
         results = _evaluate(run, f"pixels_{number}", "ur5_pick_pixels", brains, options)
         goal = _PIXELS_GOAL if number == 0 else None
-        for name in _names():
+        for name in _names(run):
             row, low = success_row(results, name), results["brains"][name]["success"]["low"]
             words = "" if goal is None else f"lower end at least {goal:.0%}"
             section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
-        section.rows.append(seeds_row(results, _names(), what))
+        section.rows.append(seeds_row(results, _names(run), what))
     others, picks = [], f"pixels/seed_{SEEDS[0]}/round_0/data"
     for name in _OTHERS:
         folder = f"pixels/{name}"
-        train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, picks)
+        train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, picks, short=("--steps=4", "--batch_size=8"))
         others += [f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}"]
     results = _evaluate(run, "pixels_others", "ur5_pick_pixels", others, (_ANY,), names=_OTHERS, episodes=_BLANKED)
     section.rows += [
@@ -121,7 +125,7 @@ def pixels(run: Runner, section: Section) -> None:
     section.rows += [success_row(results, name) for name in ("deaf", "blind")]
     section.rows.append(Row("time from nothing to the first seed", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"`bhd_pixels` after {last} rounds of aggregation, {len(SEEDS)} seeds of recordings and trainings: from an "
+        f"`bhd_pixels` after {last} rounds of aggregation, {len(folders)} seeds of recordings and trainings: from an "
         "episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's state to tool poses. True "
         "poses taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black "
         "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from every frame of the "
@@ -149,21 +153,27 @@ def _evaluate(
     names: Sequence[str] = (),
     episodes: int = EPISODES,
 ) -> Any:
-    only = ",".join(names or _names())
+    only = ",".join(names or _names(run))
     command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
-    command += [f"--only=[{only}]", f"--n_episodes={16 if run.is_short else episodes}", "--videos=0"]
+    command += [f"--only=[{only}]", f"--n_episodes={run.size(episodes, 16)}", "--videos=0"]
     run.run(name, [*command, f"--output_dir={run.path(name)}"])
     return run.read(name, "results.json")
 
 
-def _names() -> list[str]:
-    return [f"seed_{seed}" for seed in SEEDS]
+def _worlds(run: Runner) -> Sequence[tuple[int, tuple[str, tuple[str, ...], float | None]]]:
+    """Return the worlds with their numbers; of a short run the first, and the one in which words decide."""
+    worlds = list(enumerate(WORLDS))
+    return [worlds[0], worlds[-1]] if run.is_short else worlds
+
+
+def _names(run: Runner) -> list[str]:
+    return [f"seed_{seed}" for seed in run.seeds(SEEDS)]
 
 
 def _seeing(run: Runner) -> list[str]:
     return [
         option
-        for seed, name in zip(SEEDS, _names(), strict=True)
+        for seed, name in zip(run.seeds(SEEDS), _names(run), strict=True)
         for option in (f"--brains.{name}.type=language", f"--brains.{name}.perception.path={_path(run, seed)}")
     ]
 
