@@ -7,7 +7,10 @@ other sections of the page stay as they are.
 import argparse
 import shutil
 import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 
 from benchmarks.results.adaptation import fine_tune, move_camera
 from benchmarks.results.aggregation import aggregate
@@ -21,26 +24,30 @@ from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
 
-# Name, title, and what runs the commands and fills the section.
-MEASURES = (
-    ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
-    ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
-    (
-        "camera_drive",
-        "Avoid, from the front camera: a rule that reads the lidar corrects it",
-        camera_drive,
-    ),
-    ("monitored", "Avoid, by aggregation and then PPO, with the collision monitor", monitored),
-    ("reach", "Reach: a UR5 brings its tool to a pose", reach),
-    ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
-    ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
-    ("pixels", "Pick, from pixels: the same end to end", pixels),
-    ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
-    ("move_camera", "Fine-tune: 20 tables before a camera that was moved", move_camera),
-    ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
-    ("speed", "Speed", speed),
-)
+Measure = Callable[[Runner, Section], None]
 
+# Name, title, and what runs the commands and fills the section; in groups of which one section uses what another made.
+GROUPS: tuple[tuple[tuple[str, str, Measure], ...], ...] = (
+    (("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),),
+    (
+        ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
+        ("monitored", "Avoid, by aggregation and then PPO, with the collision monitor", monitored),
+    ),
+    (("camera_drive", "Avoid, from the front camera: a rule that reads the lidar corrects it", camera_drive),),
+    (
+        ("reach", "Reach: a UR5 brings its tool to a pose", reach),
+        ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
+    ),
+    (("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),),
+    (
+        ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
+        ("move_camera", "Fine-tune: 20 tables before a camera that was moved", move_camera),
+    ),
+    (("pixels", "Pick, from pixels: the same end to end", pixels),),
+    (("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),),
+)
+LAST = ("speed", "Speed", speed)  # alone, whatever else runs side by side
+MEASURES = (*(one for group in GROUPS for one in group), LAST)
 _FOLDER, _PAGE = "outputs/results", "docs/reference/results.md"
 
 
@@ -52,31 +59,48 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, help=f"where everything goes: {_FOLDER}, {_FOLDER}_short")
     parser.add_argument("--page", type=Path, help=f"what is written: {_PAGE}, or results.md in the folder of --short")
     parser.add_argument("--short", action="store_true", help="a short run, which shows in which direction numbers go")
+    parser.add_argument("--jobs", type=int, help="sections side by side, each on one core: 1, or 2 with --short")
     parser.add_argument("--fresh", action="store_true", help="begin anew")
     options = parser.parse_args(arguments)
     folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
     page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
     if options.fresh and folder.exists():
         shutil.rmtree(folder)
-    sections = []
-    for name, title, measure in MEASURES:
-        if name not in options.only:
-            continue
-        section, run = Section(name, title), Runner(folder, is_short=options.short)
-        try:
-            measure(run, section)
-        except FailedError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            return 2
-        section.commands = run.commands
-        sections.append(section)
-        # After each section: what takes hours may be stopped.
-        write_page(page, sections, [title for _, title, _ in MEASURES], is_short=options.short)
+    sections: list[Section] = []
+    lock = Lock()
+
+    def make(group: Sequence[tuple[str, str, Measure]]) -> None:
+        for name, title, measure in group:
+            if name not in options.only:
+                continue
+            section, run = Section(name, title), Runner(folder, is_short=options.short)
+            try:
+                measure(run, section)
+            except FailedError as error:
+                raise FailedError(f"{name}: {error}") from None
+            section.commands = run.commands
+            with lock:
+                sections.append(section)
+                # After each section: what takes hours may be stopped.
+                write_page(page, sections, [title for _, title, _ in MEASURES], is_short=options.short)
+
+    failures = []
+    with ThreadPoolExecutor(options.jobs or (2 if options.short else 1)) as pool:
+        for done in [pool.submit(make, group) for group in GROUPS]:
+            try:
+                done.result()
+            except FailedError as error:
+                failures.append(str(error))
+    try:
+        make([LAST])
+    except FailedError as error:
+        failures.append(str(error))
+    if failures:
+        print("\n".join(failures), file=sys.stderr)
+        return 2
     missed = [f"{section.name}: {row.what}" for section in sections for row in section.rows if row.met is False]
-    print(
-        f"Written: {page.relative_to(REPOSITORY) if page.is_relative_to(REPOSITORY) else page}."
-        + (f" Missed: {'; '.join(missed)}." if missed else "")
-    )
+    where = page.relative_to(REPOSITORY) if page.is_relative_to(REPOSITORY) else page
+    print(f"Written: {where}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
     return 1 if missed else 0
 
 

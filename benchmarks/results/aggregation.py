@@ -10,7 +10,7 @@ from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, SEEDS, ROUNDS = 1000, (0, 1, 2), 2
-_SHORT, _STEPS = (80, 40, 16), 1500
+_SHORT, _STEPS = (60, 30, 8), 1000
 _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
 
 

@@ -10,7 +10,7 @@ from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 2
-_SHORT, _STEPS = (40, 20, 16), 600
+_SHORT, _STEPS = (30, 15, 8), 500
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
 _RULES = ("avoidance", "gap_follower")
 _BLANKED = 100  # episodes of the driver that is blind

@@ -203,7 +203,7 @@ def evaluate(
     episodes: int = EPISODES,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = run.size(episodes, 32)
+    episodes = run.size(episodes, 24)
     learned = [
         option
         for label, folder in brains.items()
@@ -215,6 +215,7 @@ def evaluate(
         [
             *("bhd-eval", f"--config_path=configs/eval/{config}.yaml", f"--n_episodes={episodes}", *learned),
             *(f"--only=[{only}]", f"--baseline={baseline}", f"--output_dir={run.path(name)}", "--n_envs=32"),
+            "--videos=0",
             *options,
         ],
     )

@@ -1,7 +1,7 @@
 """Runs the commands that results come from, each once, and remembers what they were and how long they took."""
 
 import json
-import resource
+import os
 import shlex
 import subprocess
 import sys
@@ -91,21 +91,22 @@ class Runner:
         if note.exists():
             kept = Ran(**json.loads(note.read_text(encoding="utf-8")))
             if kept.command == command:
-                print(f"== {command}\n-- was run before, {kept.seconds:.0f} s", flush=True)
+                print(f"== {command}\n-- {name}: was run before, {kept.seconds:.0f} s", flush=True)
                 self.commands.append(kept)
                 return kept
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
-        started, used = time.perf_counter(), _cpu_seconds()
+        started = time.perf_counter()
         with log.open("w", encoding="utf-8") as file:
-            done = subprocess.run(
-                _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, check=False
-            )
-        ran = Ran(command, time.perf_counter() - started, done.returncode, _cpu_seconds() - used)
-        if done.returncode not in allowed:
+            process = subprocess.Popen(_executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT)
+            # Its own processor time, and that of the processes that it waited for: others may run beside it.
+            _, ended, used = os.wait4(process.pid, 0)
+        status = process.returncode = os.waitstatus_to_exitcode(ended)
+        ran = Ran(command, time.perf_counter() - started, status, used.ru_utime + used.ru_stime)
+        if status not in allowed:
             tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
-            raise FailedError(f"{command}\nended with status {done.returncode}. The end of {log}:\n{tail}")
-        print(f"-- {ran.seconds:.0f} s", flush=True)
+            raise FailedError(f"{command}\nended with status {status}. The end of {log}:\n{tail}")
+        print(f"-- {name}: {ran.seconds:.0f} s", flush=True)
         note.write_text(json.dumps(asdict(ran), indent=1), encoding="utf-8")
         self.commands.append(ran)
         return ran
@@ -113,12 +114,6 @@ class Runner:
     def read(self, *parts: str) -> Any:
         """Return what a JSON file in the folder holds."""
         return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
-
-
-def _cpu_seconds() -> float:
-    """Return the processor time of all processes that were started here and have ended [s]."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _executable(arguments: Sequence[str]) -> list[str]:

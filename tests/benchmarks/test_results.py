@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
+from benchmarks.results import __main__ as program
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
@@ -180,6 +181,33 @@ def test_a_command_is_run_once_and_again_when_it_changed(tmp_path: Path) -> None
     assert missed.status == 1
     with pytest.raises(FailedError, match=r"ended with status 3[\s\S]*out of order"):
         run.run("note", ["python", "-c", "print('out of order'); raise SystemExit(3)"])
+
+
+def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def busy(run: Runner, section: Section) -> None:
+        run.run(section.name, ["python", "-c", "sum(range(30_000_000))"])
+        section.rows.append(Row("a number", "1", "", met=True))
+
+    def idle(run: Runner, section: Section) -> None:
+        run.run(section.name, ["python", "-c", "pass"])
+
+    def broken(run: Runner, _: Section) -> None:
+        run.run("broken", ["python", "-c", "raise SystemExit(3)"])
+
+    groups = ((("busy", "Busy", busy),), (("broken", "Broken", broken),), (("idle", "Idle", idle),))
+    monkeypatch.setattr(program, "GROUPS", groups)
+    monkeypatch.setattr(program, "LAST", ("last", "Last", idle))
+    monkeypatch.setattr(program, "MEASURES", (*(one for group in groups for one in group), program.LAST))
+    options = [f"--folder={tmp_path}", f"--page={tmp_path / 'page.md'}", "--jobs=3"]
+    assert program.main(options) == 2
+    assert "broken: python -c 'raise SystemExit(3)'" in capsys.readouterr().err
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == ["Busy", "Idle", "Last"]
+    used = {name: json.loads((tmp_path / "notes" / f"{name}.json").read_text()) for name in ("busy", "idle")}
+    assert used["busy"]["cpu_seconds"] > 3 * used["idle"]["cpu_seconds"]
+    assert program.main([*options, "--only", "idle"]) == 0
 
 
 def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> None:
