@@ -4,13 +4,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.results.learning import TRAIL, aggregation, evaluate, success_row, values
+from benchmarks.results.learning import SHORTER, TRAIL, aggregation, evaluate, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, SEEDS, ROUNDS = 1000, (0, 1, 2), 2
-_SHORT, _STEPS = (60, 30, 8), 1000
+_SHORT, _STEPS = (40, 20, 8), 800
 _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
 
 
@@ -26,7 +26,7 @@ def aggregate(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=TRAIL,
+        options=(*TRAIL, *(SHORTER if run.is_short else ())),
         episodes=EPISODES,
     )
     section.rows += [success_row(results, name) for name in ("gap_follower", "clone")]
@@ -53,7 +53,9 @@ def aggregate(run: Runner, section: Section) -> None:
 def aggregated(run: Runner, seed: int) -> tuple[str, float]:
     """Clone a rule by aggregation, and return the folder of the policy and how long that took [s]."""
     name, config = f"aggregate_train_{seed}", "dagger_turtlebot3_avoid"
-    return aggregation(run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS)
+    return aggregation(
+        run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS, options=SHORTER
+    )
 
 
 def _folder(seed: int) -> str:

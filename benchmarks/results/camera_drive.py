@@ -4,13 +4,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.results.learning import aggregation, success_row, values
+from benchmarks.results.learning import SHORTER, aggregation, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 2
-_SHORT, _STEPS = (30, 15, 8), 500
+_SHORT, _STEPS = (24, 12, 8), 400
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
 _RULES = ("avoidance", "gap_follower")
 _BLANKED = 100  # episodes of the driver that is blind
@@ -22,7 +22,7 @@ def camera_drive(run: Runner, section: Section) -> None:
     for seed in seeds:
         name, config = f"camera_drive_train_{seed}", "dagger_turtlebot3_camera"
         brains[f"seed_{seed}"], time = aggregation(
-            run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS
+            run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS, options=SHORTER
         )
         seconds.append(time)
     learned = [
@@ -77,7 +77,8 @@ def camera_drive(run: Runner, section: Section) -> None:
 def _evaluate(run: Runner, name: str, brains: list[str], only: tuple[str, ...], episodes: int) -> dict:
     config = "--config_path=configs/eval/turtlebot3_avoid_camera.yaml"
     command = ["bhd-eval", config, *brains, f"--only=[{','.join(only)}]", "--baseline=avoidance", "--videos=0"]
-    command += [f"--n_episodes={run.size(episodes, 16)}", f"--output_dir={run.path(name)}"]
+    command += [f"--n_episodes={run.size(episodes, 8)}", f"--output_dir={run.path(name)}"]
+    command += SHORTER if run.is_short else ()
     run.run(name, command)
     return run.read(name, "results.json")
 

@@ -5,8 +5,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+import yaml
 
-from benchmarks.results.runner import FailedError, Runner
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds, rate
 from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
@@ -15,17 +16,25 @@ TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 _ROAMING = ("gap_follower", "avoidance")
 TRAIL = ("--task.trail=true",)
 _REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
-_FEW = ("--steps=1500", "--eval_steps=1500")
+_FEW = ("--steps=800", "--eval_steps=800")
+# Too few to learn anything by: they show that the commands work.
+FEW_PPO = (
+    *("--steps=20000", "--critic_warmup=8192", "--env.n_envs=32"),
+    *("--validation.freq=10000", "--validation.n_episodes=8"),
+)
+SHORTER = ("--task.duration_s=30",)  # episodes of a short run
 _AVOID_TRAIN_S, _PPO_TRAIN_S = 120, 1200
 _REACH_GOAL, _PPO_GOAL = 0.97, 1.2
 
 
 def avoid(run: Runner, section: Section) -> None:
     """Cloning rules, and reinforcement learning, on the avoid task."""
-    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 40), options=("--seed=100",))
+    shorter = SHORTER if run.is_short else ()
+    options = ("--seed=100", *shorter)
+    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 20), options=options)
     seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data", short=_FEW)
-    gap = ("--seed=100", "--brain.type=gap_follower", *TRAIL)
-    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 80), options=gap)
+    gap = ("--seed=100", "--brain.type=gap_follower", *TRAIL, *shorter)
+    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 40), options=gap)
     train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data", short=_FEW)
     start = (
         *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
@@ -37,9 +46,17 @@ def avoid(run: Runner, section: Section) -> None:
         "ppo_turtlebot3",
         "avoid/ppo",
         options=start,
-        short=("--steps=200000", "--validation.freq=100000"),
+        short=FEW_PPO,
     )
-    results = evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
+    results = evaluate(
+        run,
+        "avoid_eval",
+        "turtlebot3_avoid",
+        {"bc": "avoid/bc"},
+        rules=_ROAMING,
+        baseline="avoidance",
+        options=shorter,
+    )
     # The task reports more to these two; the episodes are the same.
     brains = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
     with_trail = evaluate(
@@ -49,7 +66,7 @@ def avoid(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=TRAIL,
+        options=(*TRAIL, *shorter),
     )
     if _scores(with_trail, "gap_follower") != _scores(results, "gap_follower"):
         raise FailedError("A rule that does not use the trail did something else where the task reports it.")
@@ -63,7 +80,7 @@ def avoid(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=(*TRAIL, "--robot.collision_monitor=true"),
+        options=(*TRAIL, "--robot.collision_monitor=true", *shorter),
     )
     for name in (*_ROAMING, "bc", *brains):
         section.rows.append(success_row(results, name))
@@ -167,7 +184,17 @@ def train(
 
 
 def aggregation(
-    run: Runner, name: str, config: str, output: str, *, seed: int, rounds: int, short: Sequence[int], steps: int
+    run: Runner,
+    name: str,
+    config: str,
+    output: str,
+    *,
+    seed: int,
+    rounds: int,
+    short: Sequence[int],
+    steps: int,
+    policy: Sequence[str] = (),
+    options: Sequence[str] = (),
 ) -> tuple[str, float]:
     """Learn by aggregation, and return the folder of the last round's policy and how long that took [s].
 
@@ -180,13 +207,21 @@ def aggregation(
         rounds: beyond the expert's own episodes; one in a short run.
         short: in a short run, how many episodes the expert drives, the learner drives, and it is validated on.
         steps: of each training of a short run.
+        policy: options of each training.
+        options: of recordings and validations of a short run, beside those of the configuration.
     """
-    rounds = run.size(rounds, 1)
-    command = ["bhd-train", f"--config_path=configs/train/{config}.yaml", f"--seed={seed}", f"--rounds={rounds}"]
+    rounds, path = run.size(rounds, 1), f"configs/train/{config}.yaml"
+    command = ["bhd-train", f"--config_path={path}", f"--seed={seed}", f"--rounds={rounds}"]
     if run.is_short:
         names = ("expert_episodes", "episodes", "validation_episodes")
         command += [f"--{key}={value}" for key, value in zip(names, short, strict=True)]
-        command += [f"--policy.options=[--steps={steps}]"]
+        policy = (*policy, f"--steps={steps}")
+    if run.is_short and options:
+        parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
+        for part in ("expert", "learner", "evaluation"):
+            command.append(f"--{part}.options=[{', '.join([*parts[part].get('options', ()), *options])}]")
+    if policy:
+        command.append(f"--policy.options=[{', '.join(policy)}]")
     ran = run.run(name, [*command, f"--output_dir={run.path(output)}"])
     return f"{output}/round_{rounds}/policy", ran.seconds
 
@@ -203,7 +238,7 @@ def evaluate(
     episodes: int = EPISODES,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = run.size(episodes, 24)
+    episodes = run.size(episodes, 16)
     learned = [
         option
         for label, folder in brains.items()

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.aggregation import EPISODES, SEEDS, aggregated
-from benchmarks.results.learning import TRAIL, evaluate, success_row, train, values
+from benchmarks.results.learning import FEW_PPO, SHORTER, TRAIL, evaluate, success_row, train, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 _FAILURES_GOAL, _RULE_GOAL = 5, 1.5
-_SHORT = ("--steps=100000", "--validation.freq=50000", "--validation.n_episodes=16", "--validation.confirm=16")
+_SHORT = (*FEW_PPO, "--validation.confirm=8")
 
 
 def monitored(run: Runner, section: Section) -> None:
@@ -28,8 +28,9 @@ def monitored(run: Runner, section: Section) -> None:
         seconds.append(train(run, name, "ppo_turtlebot3_monitor", folder, options=options, short=_SHORT))
         learned[f"ppo_{seed}"] = f"{folder}/checkpoints/best"
     config, rule = "turtlebot3_avoid", "avoidance"
+    driving = (*TRAIL, *(SHORTER if run.is_short else ()))
     alone = evaluate(
-        run, "monitored_alone_eval", config, clones, rules=(rule,), baseline=rule, options=TRAIL, episodes=EPISODES
+        run, "monitored_alone_eval", config, clones, rules=(rule,), baseline=rule, options=driving, episodes=EPISODES
     )
     behind = evaluate(
         run,
@@ -37,7 +38,7 @@ def monitored(run: Runner, section: Section) -> None:
         config,
         clones | learned,
         baseline=next(iter(clones)),
-        options=(*TRAIL, "--robot.collision_monitor=true"),
+        options=(*driving, "--robot.collision_monitor=true"),
         episodes=EPISODES,
     )
     section.rows += [success_row(alone, name) for name in (rule, *clones)]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.results.learning import record, seeds_row, success_row, train
+from benchmarks.results.learning import aggregation, record, seeds_row, success_row, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 
@@ -23,7 +23,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )
 _PIXELS_GOAL, _ROUNDS = 0.6, 2
-_FEW = ("--steps=500", "--eval_steps=500")
+_FEW = ("--steps=300", "--eval_steps=300")
 _OTHERS = ("act", "diffusion")
 _BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
 
@@ -84,12 +84,10 @@ def pixels(run: Runner, section: Section) -> None:
         eyes, folder = f"pixels/perception_{seed}", f"pixels/seed_{seed}"
         options = (f"--seed={seed}", "--steps=6000")
         train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
-        learn = [f"--policy.perception={run.path(eyes)}", *(["--steps=1000"] if run.is_short else [])]
-        few = ("--expert_episodes=80", "--episodes=40", "--validation_episodes=16")
-        command = ["bhd-train", "--config_path=configs/train/dagger_ur5_pixels.yaml", f"--rounds={last}"]
-        command += [f"--policy.options=[{', '.join(learn)}]", *(few if run.is_short else ())]
-        run.run(f"pixels_train_{seed}", [*command, f"--seed={seed}", f"--output_dir={run.path(folder)}"])
-        folders[f"seed_{seed}"] = f"{folder}/round_{last}/policy"
+        name, config, learn = f"pixels_train_{seed}", "dagger_ur5_pixels", [f"--policy.perception={run.path(eyes)}"]
+        folders[f"seed_{seed}"], _ = aggregation(
+            run, name, config, folder, seed=seed, rounds=_ROUNDS, short=(60, 30, 8), steps=800, policy=learn
+        )
     seconds = sum(one.seconds for one in run.commands[:3])
     brains = [
         option
@@ -155,7 +153,7 @@ def _evaluate(
 ) -> Any:
     only = ",".join(names or _names(run))
     command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
-    command += [f"--only=[{only}]", f"--n_episodes={run.size(episodes, 16)}", "--videos=0"]
+    command += [f"--only=[{only}]", f"--n_episodes={run.size(episodes, 12)}", "--videos=0"]
     run.run(name, [*command, f"--output_dir={run.path(name)}"])
     return run.read(name, "results.json")
 
