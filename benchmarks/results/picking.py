@@ -8,7 +8,7 @@ from benchmarks.results.section import Row, Section
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 3
 _GOAL = 0.97
-_SHORT, _STEPS = (100, 50, 8), 800
+_SHORT, _STEPS = (120, 60, 8), 2500
 
 
 def pick(run: Runner, section: Section) -> None:

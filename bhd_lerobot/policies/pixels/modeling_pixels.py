@@ -302,10 +302,14 @@ class _Reader(nn.Module):
         self.said = nn.Linear(64, size)
 
     def forward(self, tokens: Tensor) -> Tensor:
+        # Each sentence of a batch once, and nothing behind the end of the longest: the same answer in a quarter of the
+        # time, most of which a training would spend here.
+        length = int((tokens != 0).sum(1).max())
+        tokens, which = torch.unique(tokens[:, : max(1, length)], dim=0, return_inverse=True)
         is_end = (tokens == 0).unsqueeze(1)
         values = functional.relu(self.near(self.letters(tokens).transpose(1, 2))).masked_fill(is_end, 0.0)
         values = functional.relu(self.far(values)).masked_fill(is_end, 0.0)
-        result: Tensor = self.said(values.amax(-1))
+        result: Tensor = self.said(values.amax(-1))[which]
         return result
 
 
