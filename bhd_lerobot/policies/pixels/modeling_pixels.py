@@ -36,6 +36,7 @@ _SAME = (
 )
 _SHAPE = ("channels", "hidden", "context")
 _SHARPNESS = 4  # attention is to fall off from an object's centre as this power of how near a cell is
+_WITHIN = 0.03  # [m] cells whose places are so near to each other's are about the same object
 _THUMBNAIL = 8  # every so many pixels of an image, by which it is known again
 
 
@@ -272,11 +273,21 @@ class PixelsPolicy(PreTrainedPolicy):
         bias = cells[..., 3].clamp_min(1e-4).log()  # where nothing is, nothing is meant
         said = self.reader(tokens)
         attention = self.named(said, cells, bias)
-        named = torch.einsum("bhn,bnc->bhc", attention, cells)[:, 0]
+        named = torch.einsum("bn,bnc->bc", self._of_one(attention[:, 0], cells), cells)
         about = torch.cat([cells, cells[..., :3] - named[:, None, :3]], dim=-1)
         around = self.others(torch.cat([said, named], dim=-1), about, bias)
         further = torch.einsum("bhn,bnc->bhc", around, self.value(about))
         return torch.cat([named, further.flatten(1)], dim=-1), attention[:, 0]
+
+    def _of_one(self, attention: Tensor, cells: Tensor) -> Tensor:
+        """Return the attention, shape (batch, cells), to the object that has most of it, none to others; sums of 1.
+
+        Half of it here and half there must not become a place between two objects.
+        """
+        place = cells[..., :2] * self._extent[:2]
+        most = attention.argmax(1, keepdim=True).unsqueeze(-1).expand(-1, -1, 2)
+        weight = attention * ((place - place.gather(1, most)).norm(dim=-1) < _WITHIN)
+        return weight / weight.sum(1, keepdim=True)
 
     def _act(self, seen: Tensor, state: Tensor) -> Tensor:
         values = torch.cat([state[:, self._columns], seen], dim=-1)

@@ -78,7 +78,7 @@ def test_it_learns_to_look_at_what_is_named() -> None:
     assert torch.equal(samples[IMAGE][:, 0].sum((2, 3)), other[IMAGE][:, 0].sum((2, 3)))
     both = {key: torch.cat([samples[key], other[key]]) for key in samples}
     policy.train()
-    for _ in range(60):
+    for _ in range(90):
         loss, parts = policy.forward(both)
         optimizer.zero_grad()
         loss.backward()
