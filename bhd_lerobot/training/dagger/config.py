@@ -52,6 +52,8 @@ class AggregationConfig:
         learner: a configuration of `bhd-record`, with the brain ``dagger``; its learner's path is the last policy.
         policy: a configuration of `bhd-train`.
         evaluation: a configuration of `bhd-eval`; of it robot and task are used, for the curve over the rounds.
+        data: folders of datasets that were recorded before, of the same robot and task; every round learns from them,
+            too.
         output_dir: where everything goes; the same command goes on there with what is not done yet.
         rounds: rounds after the first.
         expert_episodes: that the expert drives alone.
@@ -65,6 +67,7 @@ class AggregationConfig:
     learner: StageConfig = field(default_factory=StageConfig)
     policy: StageConfig = field(default_factory=StageConfig)
     evaluation: StageConfig = field(default_factory=StageConfig)
+    data: list[str] = field(default_factory=list)
     output_dir: str = ""
     rounds: int = 2
     expert_episodes: int = 400

@@ -58,9 +58,12 @@ def train(config: AggregationConfig, console: Console | None = None) -> int:
         console: where progress is shown; standard error if None.
 
     Raises:
-        BhdError: the configuration cannot be honoured, or is another than that of the folder.
+        BhdError: the configuration cannot be honoured, or is another than that of the folder; there is no dataset where
+            one is to be.
     """
     stages = read_stages(config)
+    for root in config.data:
+        dataset_info(Path(root).expanduser())
     folder = Path(config.output_dir).expanduser()
     _keep_to(folder, config)
     rounds = _Rounds(config, stages, folder, console or Console(stderr=True))
@@ -178,9 +181,10 @@ class _Rounds:
 
     def _data(self, number: int, folder: Path) -> Path:
         """Return the dataset of all rounds so far."""
-        if not number:
+        if not number and not self._config.data:
             return folder / "data"
         parts = [self._folder / f"round_{one}" / "data" for one in range(number + 1)]
+        parts += [Path(root).expanduser() for root in self._config.data]
         target = folder / "all"
         # Merging is quick, and a merge that was cut short leaves nothing.
         shutil.rmtree(target, ignore_errors=True)

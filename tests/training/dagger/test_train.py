@@ -105,6 +105,20 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
 
 
+def test_every_round_learns_from_data_that_was_recorded_before_as_well(tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("before", "after")]
+    for folder in folders:
+        folder.mkdir()
+    assert main([f"--config_path={settings(folders[0], rounds=0)}"]) == 0
+    before = folders[0] / "run" / "round_0" / "data"
+    assert main([f"--config_path={settings(folders[1], rounds=0, seed=5)}", f"--data=[{before}]"]) == 0
+    run = folders[1] / "run"
+    frames = [dataset_info(root).frames for root in (before, run / "round_0" / "data")]
+    learned = PolicyContract.load(run / "round_0" / "policy").dataset
+    assert learned is not None
+    assert (learned["episodes"], learned["frames"]) == (4, sum(frames))
+
+
 def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,6 +147,7 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     [
         ({"rounds": -1}, "rounds is -1; it must be at least 0"),
         ({"output_dir": ""}, "output_dir is empty"),
+        ({"data": ["nowhere"]}, "nowhere"),
         ({"policy": {"config": "", "options": []}}, "policy.config is empty; name a configuration file"),
         ({"policy": {"config": "missing.yaml", "options": []}}, "missing.yaml"),
         (
