@@ -194,6 +194,7 @@ def aggregation(
     short: Sequence[int],
     steps: int,
     policy: Sequence[str] = (),
+    data: Sequence[str] = (),
     options: Sequence[str] = (),
 ) -> tuple[str, float]:
     """Learn by aggregation, and return the folder of the last round's policy and how long that took [s].
@@ -208,6 +209,7 @@ def aggregation(
         short: in a short run, how many episodes the expert drives, the learner drives, and it is validated on.
         steps: of each training of a short run.
         policy: options of each training.
+        data: datasets that are learned from in every round, too.
         options: of recordings and validations of a short run, beside those of the configuration.
     """
     rounds, path = run.size(rounds, 1), f"configs/train/{config}.yaml"
@@ -220,6 +222,8 @@ def aggregation(
         parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
         for part in ("expert", "learner", "evaluation"):
             command.append(f"--{part}.options=[{', '.join([*parts[part].get('options', ()), *options])}]")
+    if data:
+        command.append(f"--data=[{', '.join(data)}]")
     if policy:
         command.append(f"--policy.options=[{', '.join(policy)}]")
     ran = run.run(name, [*command, f"--output_dir={run.path(output)}"])

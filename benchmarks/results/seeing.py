@@ -79,6 +79,9 @@ def pixels(run: Runner, section: Section) -> None:
     record(
         run, "pixels_tables", "ur5_look", "pixels/tables", episodes=run.size(12_000, 800), options=("--seed=11", *size)
     )
+    # Of these only the first frame: what is meant is learned from many tables, and picking from fewer.
+    firsts, options = "pixels/firsts", ("--seed=500", "--task.duration_s=0.1")
+    record(run, "pixels_firsts", "ur5_pick_pixels", firsts, episodes=run.size(6_000, 400), options=options)
     last, folders = run.size(_ROUNDS, 1), {}
     for seed in run.seeds(SEEDS):
         eyes, folder = f"pixels/perception_{seed}", f"pixels/seed_{seed}"
@@ -86,9 +89,18 @@ def pixels(run: Runner, section: Section) -> None:
         train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
         name, config, learn = f"pixels_train_{seed}", "dagger_ur5_pixels", [f"--policy.perception={run.path(eyes)}"]
         folders[f"seed_{seed}"], _ = aggregation(
-            run, name, config, folder, seed=seed, rounds=_ROUNDS, short=(60, 30, 8), steps=800, policy=learn
+            run,
+            name,
+            config,
+            folder,
+            seed=seed,
+            rounds=_ROUNDS,
+            short=(60, 30, 8),
+            steps=800,
+            policy=learn,
+            data=[str(run.path(firsts))],
         )
-    seconds = sum(one.seconds for one in run.commands[:3])
+    seconds = sum(one.seconds for one in run.commands[:4])
     brains = [
         option
         for name, folder in folders.items()
