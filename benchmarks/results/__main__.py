@@ -8,9 +8,9 @@ import argparse
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock
 
 from benchmarks.results.adaptation import fine_tune, move_camera
 from benchmarks.results.aggregation import aggregate
@@ -62,18 +62,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, help="sections side by side, each on one core: 1, or 2 with --short")
     parser.add_argument("--fresh", action="store_true", help="begin anew")
     options = parser.parse_args(arguments)
+    jobs = (2 if options.short else 1) if options.jobs is None else options.jobs
+    if jobs < 1:
+        parser.error(f"--jobs is {jobs}; it must be at least 1.")
     folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
     page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
     if options.fresh and folder.exists():
         shutil.rmtree(folder)
     sections: list[Section] = []
-    lock = Lock()
+    lock, stopped = Lock(), Event()
 
     def make(group: Sequence[tuple[str, str, Measure]]) -> None:
         for name, title, measure in group:
             if name not in options.only:
                 continue
-            section, run = Section(name, title), Runner(folder, is_short=options.short)
+            section, run = Section(name, title), Runner(folder, is_short=options.short, stopped=stopped)
             try:
                 measure(run, section)
             except FailedError as error:
@@ -85,16 +88,19 @@ def main(arguments: list[str] | None = None) -> int:
                 write_page(page, sections, [title for _, title, _ in MEASURES], is_short=options.short)
 
     failures = []
-    with ThreadPoolExecutor(options.jobs or (2 if options.short else 1)) as pool:
-        for done in [pool.submit(make, group) for group in GROUPS]:
-            try:
-                done.result()
-            except FailedError as error:
-                failures.append(str(error))
     try:
-        make([LAST])
-    except FailedError as error:
-        failures.append(str(error))
+        for stage, width in ((GROUPS, jobs), (([LAST],), 1)):
+            with ThreadPoolExecutor(width) as pool:
+                running = [pool.submit(make, group) for group in stage]
+                try:
+                    failures += [str(error) for one in running if (error := _failure(one)) is not None]
+                except KeyboardInterrupt:
+                    # What runs got the signal, too, or ends by itself; nothing else is begun.
+                    stopped.set()
+                    raise
+    except KeyboardInterrupt:
+        print("Stopped. The same command goes on with what is not done yet.", file=sys.stderr)
+        return 130
     if failures:
         print("\n".join(failures), file=sys.stderr)
         return 2
@@ -102,6 +108,15 @@ def main(arguments: list[str] | None = None) -> int:
     where = page.relative_to(REPOSITORY) if page.is_relative_to(REPOSITORY) else page
     print(f"Written: {where}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
     return 1 if missed else 0
+
+
+def _failure(running: Future[None]) -> FailedError | None:
+    """Wait for a group of sections; return why one of them was not made."""
+    try:
+        running.result()
+    except FailedError as error:
+        return error
+    return None
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.results.section import Section
+from bhd_lerobot.datasets.storage.disk import Disk
 
 _PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
 _HEAD = (
@@ -38,7 +39,8 @@ def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *
         texts[section.title] = "\n".join([first, "", _made(), *rest])
     lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
     lines += ["\n" + texts[title].strip() for title in titles if title in texts]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    # What other sessions took hours for is on it: it is never half written.
+    Disk().publish(path, ("\n".join(lines) + "\n").encode())
 
 
 def _kept(page: str) -> dict[str, str]:

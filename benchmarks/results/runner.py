@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -55,10 +56,11 @@ class Runner:
     Args:
         folder: where everything goes.
         is_short: a short run, whose numbers are not to be quoted.
+        stopped: once it is set, no further command is begun.
     """
 
-    def __init__(self, folder: Path, *, is_short: bool) -> None:
-        self.folder, self.is_short = folder, is_short
+    def __init__(self, folder: Path, *, is_short: bool, stopped: Event | None = None) -> None:
+        self.folder, self.is_short, self._stopped = folder, is_short, stopped
         self.commands: list[Ran] = []
 
     def size(self, full: int, short: int) -> int:
@@ -87,6 +89,8 @@ class Runner:
             FailedError: it failed; the message names its log.
         """
         command = shlex.join(arguments)
+        if self._stopped is not None and self._stopped.is_set():
+            raise FailedError(f"{command}\nwas not begun: the run was stopped.")
         note = REPOSITORY / self.path("notes", f"{name}.json")
         if note.exists():
             kept = Ran(**json.loads(note.read_text(encoding="utf-8")))

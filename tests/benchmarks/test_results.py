@@ -3,9 +3,11 @@
 import json
 import math
 import re
+import signal
+import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from benchmarks.results.runner import FailedError, Runner
 from benchmarks.results.section import Row, Section, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
 from tests.cases import each_case
+from tests.waiting import until
 
 RATIO = {"median": 12.3, "low": 11.0, "high": 14.0, "turns": 3}
 
@@ -208,6 +211,29 @@ def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
     used = {name: json.loads((tmp_path / "notes" / f"{name}.json").read_text()) for name in ("busy", "idle")}
     assert used["busy"]["cpu_seconds"] > 3 * used["idle"]["cpu_seconds"]
     assert program.main([*options, "--only", "idle"]) == 0
+
+
+def test_a_run_that_is_stopped_begins_nothing_else_and_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun = []
+
+    def interrupted(run: Runner, _: Section) -> None:
+        run.run("first", ["python", "-c", "pass"])
+        begun.append("first")
+        signal.pthread_kill(cast(int, threading.main_thread().ident), signal.SIGINT)
+        until(lambda: run._stopped is not None and run._stopped.is_set(), "the run was stopped")
+        run.run("second", ["python", "-c", "pass"])
+        begun.append("second")
+
+    monkeypatch.setattr(program, "GROUPS", ((("one", "One", interrupted),), (("two", "Two", interrupted),)))
+    monkeypatch.setattr(program, "MEASURES", (("one", "One", interrupted), ("two", "Two", interrupted), program.LAST))
+    assert program.main([f"--folder={tmp_path}", f"--page={tmp_path / 'page.md'}"]) == 130
+    assert begun == ["first"]
+    assert "goes on with what is not done yet" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        program.main(["--jobs=0"])
+    assert "--jobs is 0; it must be at least 1" in capsys.readouterr().err
 
 
 def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> None:

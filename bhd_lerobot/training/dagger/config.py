@@ -165,6 +165,14 @@ def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
 
 
 def kept(folder: Path) -> dict[str, Any] | None:
-    """Return the configuration that a folder's rounds were made with; None if there is none."""
+    """Return the configuration that a folder's rounds were made with; None if there is none.
+
+    An option that was not there yet when they were made has its default.
+
+    Raises:
+        ConfigError: it cannot be read, or has what is no option.
+    """
     file = folder / "config.yaml"
-    return configuration.read_file(file) if file.is_file() else None
+    if not file.is_file():
+        return None
+    return configuration.encode(parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"]))
