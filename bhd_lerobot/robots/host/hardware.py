@@ -12,6 +12,7 @@ from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
 
 _READY_S = 10.0  # that a robot may take until it follows commands: brakes are released, a stop is left
+_AGAIN_S = 1.0  # after which a robot that is still stopped is asked again: a datagram is lost, or it asks for a pause
 _POLL_S = 0.005
 _CALLS = ("open", "enable", "read", "write", "set_mode", "recover", "close")
 
@@ -116,20 +117,24 @@ class Hardware(Plant):
         self._patiently(self._plant.open, "opened")
 
     def prepare(self, reading: PlantReading) -> None:
-        """Make the robot follow commands, and wait until it does.
+        """Make the robot follow commands, and wait until it does; a stop of its own is left as often as it takes.
 
         Raises:
             RealtimeError: it does not within ten seconds.
         """
         self.problem = ""
         self.read(reading)
-        if reading.safety[0] != SafetyStatus.NORMAL:
-            self._patiently(self._plant.recover, "recovered")
+        self._leave_a_stop(reading)
         self._patiently(self._plant.enable, "enabled")
-        end = self._clock() + round(_READY_S * 1e9)
+        asked = self._clock()
+        end = asked + round(_READY_S * 1e9)
         while why := self.not_ready(reading):
-            if self._clock() > end:
+            now = self._clock()
+            if now > end:
                 raise RealtimeError(f"The plant {self._name} is not ready after {_READY_S:g} s: {why}.")
+            if now - asked > _AGAIN_S * 1e9 and self._leave_a_stop(reading):
+                self._patiently(self._plant.enable, "enabled")
+                asked = now
             self._sleep(_POLL_S)
             self.problem = ""  # it may have been over in a moment
 
@@ -147,6 +152,13 @@ class Hardware(Plant):
             return "it reads what is not a finite number"
         status = SafetyStatus(int(reading.safety[0]))
         return "" if status == SafetyStatus.NORMAL else f"its safety status is {status.name}"
+
+    def _leave_a_stop(self, reading: PlantReading) -> bool:
+        """Ask the robot to leave a stop of its own; return False if it is in none, or cannot say."""
+        if self.problem or reading.safety[0] == SafetyStatus.NORMAL:
+            return False
+        self._patiently(self._plant.recover, "recovered")
+        return True
 
     def _patiently(self, call: Callable[[], Any], done: str) -> None:
         try:

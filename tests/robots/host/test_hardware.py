@@ -240,6 +240,22 @@ def test_a_robot_that_fails_for_a_moment_before_it_starts_is_waited_for() -> Non
     assert rig.drive(2) == Mode.TRACKING
 
 
+@each_case("asked", [1, 2, 7])
+def test_a_stop_of_its_own_that_is_not_left_at_once_is_left_when_it_is_asked_again(asked: int) -> None:
+    rig = Rig()
+    rig.plant.safety = SafetyStatus.STOPPED
+
+    def unlock() -> bool:
+        if rig.plant.calls.count("recover") == asked:
+            rig.plant.safety = SafetyStatus.NORMAL
+        return True
+
+    rig.plant.broken["recover"] = unlock
+    rig.start()
+    assert rig.plant.calls.count("recover") == asked
+    assert rig.drive(2) == Mode.TRACKING
+
+
 @each_case("done", ["opened", "enabled"])
 def test_a_robot_that_cannot_be_reached_is_named(done: str) -> None:
     plant = Perfect()
