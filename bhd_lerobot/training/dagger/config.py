@@ -101,11 +101,15 @@ class Stages:
 
     Attributes:
         expert: the type of the expert's brain.
+        robot: the type of its robot.
+        fps: frames a second [Hz].
         has_advice: whether the expert's action is recorded in every frame.
         steps: of a training.
     """
 
     expert: str
+    robot: str
+    fps: int
     has_advice: bool
     steps: int
 
@@ -133,7 +137,13 @@ def read_stages(config: AggregationConfig) -> Stages:
             "Leave it out of its options."
         )
     configuration.parse(EvalConfig, command(config.evaluation, {}))
-    return Stages(str(kinds[0]), learner.dataset.expert_action, policy.steps)
+    return Stages(
+        expert=str(kinds[0]),
+        robot=expert.robot.type,
+        fps=expert.dataset.fps,
+        has_advice=learner.dataset.expert_action,
+        steps=policy.steps,
+    )
 
 
 def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:

@@ -62,8 +62,7 @@ def train(config: AggregationConfig, console: Console | None = None) -> int:
             one is to be.
     """
     stages = read_stages(config)
-    for root in config.data:
-        dataset_info(Path(root).expanduser())
+    _check_data(config, stages)
     folder = Path(config.output_dir).expanduser()
     _keep_to(folder, config)
     rounds = _Rounds(config, stages, folder, console or Console(stderr=True))
@@ -74,6 +73,23 @@ def train(config: AggregationConfig, console: Console | None = None) -> int:
         return stopped.status
     rounds.conclude()
     return 0
+
+
+def _check_data(config: AggregationConfig, stages: Stages) -> None:
+    """Check datasets that were recorded before, so that nothing is recorded in vain; merging checks their features.
+
+    Raises:
+        ConfigError: one is of another robot or frame rate.
+        DatasetError: there is none.
+    """
+    for root in config.data:
+        found = dataset_info(Path(root).expanduser())
+        if (found.robot_type, found.fps) != (stages.robot, stages.fps):
+            raise ConfigError(
+                f"data names {root}, in which a {found.robot_type} was recorded with {found.fps} frames a second; the "
+                f"expert of {config.expert.config!r} drives a {stages.robot} with {stages.fps}. Name datasets of that "
+                "robot and frame rate."
+            )
 
 
 def _keep_to(folder: Path, config: AggregationConfig) -> None:

@@ -110,7 +110,9 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
 
 
-def test_every_round_learns_from_data_that_was_recorded_before_as_well(tmp_path: Path) -> None:
+def test_every_round_learns_from_data_that_was_recorded_before_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folders = [tmp_path / name for name in ("before", "after")]
     for folder in folders:
         folder.mkdir()
@@ -122,6 +124,14 @@ def test_every_round_learns_from_data_that_was_recorded_before_as_well(tmp_path:
     learned = PolicyContract.load(run / "round_0" / "policy").dataset
     assert learned is not None
     assert (learned["episodes"], learned["frames"]) == (4, sum(frames))
+    # Data of another frame rate is refused before anything is recorded.
+    other = folders[1] / "other"
+    given = settings(folders[1], rounds=0, output_dir=str(other))
+    info = before / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": 5}))
+    assert main([f"--config_path={given}", f"--data=[{before}]"]) == 2
+    assert not other.exists()
+    assert "with 5 frames a second; the expert of" in " ".join(capsys.readouterr().err.split())
 
 
 def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
