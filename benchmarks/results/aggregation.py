@@ -4,9 +4,10 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.results.learning import SHORTER, TRAIL, aggregation, evaluate, success_row, values
+from benchmarks.results.learning import SHORTER, aggregation, evaluate, roaming, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
+from bhd_lerobot.errors import counted
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, SEEDS, ROUNDS = 1000, (0, 1, 2), 2
@@ -26,7 +27,7 @@ def aggregate(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=(*TRAIL, *(SHORTER if run.is_short else ())),
+        options=roaming(run),
         episodes=EPISODES,
     )
     section.rows += [success_row(results, name) for name in ("gap_follower", "clone")]
@@ -43,7 +44,8 @@ def aggregate(run: Runner, section: Section) -> None:
     rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in made]
     section.rows.append(Row("time from nothing to the first seed's policy", f"{made[0][1]:.0f} s"))
     section.remarks.append(
-        f"{len(made)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` "
+        f"{counted(len(made), 'seed')} of recording and training; success from {min(rates):.1%} to "
+        f"{max(rates):.1%}. `clone` "
         f"learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule took "
         "over before collisions and said in every frame what it would do; the others learned that, from all episodes "
         "so far."

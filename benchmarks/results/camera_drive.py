@@ -7,6 +7,7 @@ import numpy as np
 from benchmarks.results.learning import SHORTER, aggregation, success_row, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
+from bhd_lerobot.errors import counted
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 2
@@ -66,7 +67,8 @@ def camera_drive(run: Runner, section: Section) -> None:
     )
     rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in seeds]
     section.remarks.append(
-        f"`bhd_cnn`, {len(seeds)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. "
+        f"`bhd_cnn`, {counted(len(seeds), 'seed')} of recording and training; success from {min(rates):.1%} to "
+        f"{max(rates):.1%}. "
         "It sees images of 64 x 48 pixels from the front camera, and the wheels' odometry. The lidar's ranges taught "
         "it how far away things are; they are no input, and neither is what ground it has visited. `clone` learned "
         f"from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further rounds, corrected by the "

@@ -13,8 +13,10 @@ from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
-_ROAMING = ("gap_follower", "avoidance")
-TRAIL = ("--task.trail=true",)
+_TEACHER = "gap_follower"
+_ROAMING = (_TEACHER, "avoidance")
+# What learned from that teacher.
+_PUPILS = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
 _REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
 _FEW = ("--steps=800", "--eval_steps=800")
 # Too few to learn anything by: they show that the commands work.
@@ -33,65 +35,31 @@ def avoid(run: Runner, section: Section) -> None:
     options = ("--seed=100", *shorter)
     record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 20), options=options)
     seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data", short=_FEW)
-    gap = ("--seed=100", "--brain.type=gap_follower", *TRAIL, *shorter)
+    gap = ("--seed=100", "--brain.type=gap_follower", *roaming(run))
     record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 40), options=gap)
     train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data", short=_FEW)
     start = (
         *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
         *("--critic_warmup=65536", "--ppo.log_std_init=-1.0"),
     )
-    ppo_seconds = train(
-        run,
-        "avoid_ppo",
-        "ppo_turtlebot3",
-        "avoid/ppo",
-        options=start,
-        short=FEW_PPO,
-    )
-    results = evaluate(
-        run,
-        "avoid_eval",
-        "turtlebot3_avoid",
-        {"bc": "avoid/bc"},
-        rules=_ROAMING,
-        baseline="avoidance",
-        options=shorter,
+    ppo_seconds = train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start, short=FEW_PPO)
+
+    config, rule = "turtlebot3_avoid", "avoidance"
+    results = evaluate(run, "avoid_eval", config, {"bc": "avoid/bc"}, rules=_ROAMING, baseline=rule, options=shorter)
+    with_trail, monitored = (
+        evaluate(run, name, config, _PUPILS, rules=(_TEACHER,), baseline=_TEACHER, options=(*roaming(run), *more))
+        for name, more in (("avoid_trail_eval", ()), ("avoid_monitor_eval", ("--robot.collision_monitor=true",)))
     )
     # The task reports more to these two; the episodes are the same.
-    brains = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
-    with_trail = evaluate(
-        run,
-        "avoid_trail_eval",
-        "turtlebot3_avoid",
-        brains,
-        rules=("gap_follower",),
-        baseline="gap_follower",
-        options=(*TRAIL, *shorter),
-    )
-    if _scores(with_trail, "gap_follower") != _scores(results, "gap_follower"):
+    if _scores(with_trail, _TEACHER) != _scores(results, _TEACHER):
         raise FailedError("A rule that does not use the trail did something else where the task reports it.")
-    for name in brains:
+    for name in _PUPILS:
         results["brains"][name] = with_trail["brains"][name]
-    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in brains]
-    monitored = evaluate(
-        run,
-        "avoid_monitor_eval",
-        "turtlebot3_avoid",
-        brains,
-        rules=("gap_follower",),
-        baseline="gap_follower",
-        options=(*TRAIL, "--robot.collision_monitor=true", *shorter),
-    )
-    for name in (*_ROAMING, "bc", *brains):
-        section.rows.append(success_row(results, name))
-        section.rows.append(Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"])))
-    for name in ("gap_follower", *brains):
-        success = success_row(monitored, name)
-        section.rows.append(replace(success, what=f"with the collision monitor, {success.what}"))
-        score = mean(monitored["brains"][name]["means"]["score"])
-        section.rows.append(Row(f"with the collision monitor, {name}: mean score", score))
-    difference = mean_difference(_scores(results, "bc"), _scores(results, "avoidance"))
-    more = _failures(results, "bc") - _failures(results, "avoidance")
+    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in _PUPILS]
+
+    section.rows += _levels(results, monitored)
+    difference = mean_difference(_scores(results, "bc"), _scores(results, rule))
+    more = _failures(results, "bc") - _failures(results, rule)
     section.rows += [
         Row("bc: time of training", f"{seconds:.0f} s", f"at most {_AVOID_TRAIN_S} s", seconds <= _AVOID_TRAIN_S),
         Row(
@@ -103,10 +71,11 @@ def avoid(run: Runner, section: Section) -> None:
         Row("bc: failures beyond its teacher's", str(more), "at most 0", more <= 0),
         Row("ppo: time of training", f"{ppo_seconds:.0f} s", f"at most {_PPO_TRAIN_S} s", ppo_seconds <= _PPO_TRAIN_S),
     ]
-    failures = {name: _failures(results, name) for name in ("gap_follower", "bc", "ppo")}
-    least = min(failures["gap_follower"], failures["bc"])
-    best = max(("gap_follower", "bc"), key=lambda name: float(np.mean(_scores(results, name))))
+    failures = {name: _failures(results, name) for name in (_TEACHER, "bc", "ppo")}
+    least = min(failures[_TEACHER], failures["bc"])
+    best = max((_TEACHER, "bc"), key=lambda name: float(np.mean(_scores(results, name))))
     ratio = ratio_of_means(_scores(results, "ppo"), _scores(results, best))
+    over = ratio_of_means(_scores(results, "ppo"), _scores(results, rule))
     section.rows += [
         Row("ppo: failures", str(failures["ppo"]), f"at most {least}", failures["ppo"] <= least),
         Row(
@@ -115,18 +84,29 @@ def avoid(run: Runner, section: Section) -> None:
             f"at least {_PPO_GOAL}, its interval above 1",
             ratio.value >= _PPO_GOAL and ratio.low > 1,
         ),
+        Row("ppo / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))),
     ]
-    over = ratio_of_means(_scores(results, "ppo"), _scores(results, "avoidance"))
-    section.rows.append(Row("ppo / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))))
-    section.remarks.append(
+    section.remarks += [
         "`bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule remembers where it has been; a network "
         "does not, so the task reports to `gap_bc` and `ppo`, which starts from it, what ground around them "
-        "they have visited (`task.trail`)."
-    )
-    section.remarks.append(
+        "they have visited (`task.trail`).",
         "With the collision monitor (`robot.collision_monitor`) no brain touches anything; it takes speed away and "
-        "does not steer, so one that would have driven into something stands before it, and is stuck."
-    )
+        "does not steer, so one that would have driven into something stands before it, and is stuck.",
+    ]
+
+
+def _levels(results: Any, monitored: Any) -> list[Row]:
+    """Return the rows of success and score on the avoid task, without and with the collision monitor."""
+    rows = []
+    for found, names, where in (
+        (results, (*_ROAMING, "bc", *_PUPILS), ""),
+        (monitored, (_TEACHER, *_PUPILS), "with the collision monitor, "),
+    ):
+        for name in names:
+            success = success_row(found, name)
+            rows.append(replace(success, what=f"{where}{success.what}"))
+            rows.append(Row(f"{where}{name}: mean score", mean(found["brains"][name]["means"]["score"])))
+    return rows
 
 
 def reach(run: Runner, section: Section) -> None:
@@ -150,6 +130,11 @@ def reach(run: Runner, section: Section) -> None:
         section.rows.append(success_row(results, f"bc_{episodes}", _REACH_GOAL if is_last else None))
         section.rows.append(Row(f"bc_{episodes}: time from nothing", f"{seconds[episodes]:.0f} s"))
     section.remarks.append("`bc_N` learned from N episodes, all with the same number of steps.")
+
+
+def roaming(run: Runner) -> tuple[str, ...]:
+    """Return the options of episodes in which it is reported what ground a driver has visited."""
+    return "--task.trail=true", *(SHORTER if run.is_short else ())
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------

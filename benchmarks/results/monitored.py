@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.aggregation import EPISODES, SEEDS, aggregated
-from benchmarks.results.learning import FEW_PPO, SHORTER, TRAIL, evaluate, success_row, train, values
+from benchmarks.results.learning import FEW_PPO, evaluate, roaming, success_row, train, values
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from bhd_lerobot.evaluation.statistics import ratio_of_means
@@ -28,7 +28,7 @@ def monitored(run: Runner, section: Section) -> None:
         seconds.append(train(run, name, "ppo_turtlebot3_monitor", folder, options=options, short=_SHORT))
         learned[f"ppo_{seed}"] = f"{folder}/checkpoints/best"
     config, rule = "turtlebot3_avoid", "avoidance"
-    driving = (*TRAIL, *(SHORTER if run.is_short else ()))
+    driving = roaming(run)
     alone = evaluate(
         run, "monitored_alone_eval", config, clones, rules=(rule,), baseline=rule, options=driving, episodes=EPISODES
     )

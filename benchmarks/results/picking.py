@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from benchmarks.results.learning import TOOL, aggregation, evaluate, seeds_row, success_row
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
+from bhd_lerobot.errors import counted
 
 EPISODES, SEEDS, ROUNDS = 500, (0, 1, 2), 3
 _GOAL = 0.97
@@ -39,7 +40,8 @@ def pick(run: Runner, section: Section) -> None:
     section.rows.append(Row("time from nothing to the first seed's policy", f"{seconds[0]:.0f} s"))
     section.remarks.append(
         f"Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
-        f"says which is meant; none has seen an image or read a word. {len(seeds)} seeds of recording and training. "
+        f"says which is meant; none has seen an image or read a word. {counted(len(seeds), 'seed')} of recording "
+        "and training. "
         f"`clone` learned from episodes of `pick_servo` alone. In {run.size(ROUNDS, 1)} further rounds the last policy "
         "drove, and the rule said in every frame what it would do. A `fault` is a stop by the cerebellum; the report "
         "gives its reason."

@@ -8,6 +8,7 @@ from typing import Any
 from benchmarks.results.learning import aggregation, record, seeds_row, success_row, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
+from bhd_lerobot.errors import counted
 
 EPISODES, SEEDS = 500, (0, 1, 2)
 _ANY = "--task.language=any"
@@ -54,7 +55,8 @@ def see(run: Runner, section: Section) -> None:
         Row("time from nothing to the first seed", f"{sum(one.seconds for one in run.commands[:2]):.0f} s")
     )
     section.remarks.append(
-        f"{len(seeds)} seeds of the training. The brain `language` sees with the checkpoint and gets nothing else of "
+        f"{counted(len(seeds), 'seed')} of the training. The brain `language` sees with the checkpoint and gets "
+        "nothing else of "
         "the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind one black "
         "images: both refuse, and say why. What was learned from has no object of the style of those that it has not "
         "seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
@@ -135,7 +137,8 @@ def pixels(run: Runner, section: Section) -> None:
     section.rows += [success_row(results, name) for name in ("deaf", "blind")]
     section.rows.append(Row("time from nothing to the first seed", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"`bhd_pixels` after {last} rounds of aggregation, {len(folders)} seeds of recordings and trainings: from an "
+        f"`bhd_pixels` after {counted(last, 'round')} of aggregation, {counted(len(folders), 'seed')} of "
+        "recordings and trainings: from an "
         "episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's state to tool poses. True "
         "poses taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black "
         "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from every frame of the "
