@@ -15,6 +15,7 @@ _FINGER = 0.018  # [m] half the thickness of a finger, and a little room
 _PALM = 0.055  # [m] from the tool centre point up to where an object would touch the palm
 _LOWEST = 0.024  # [m] the tool centre point above the table: the finger tips reach 14 mm farther
 _ROOM = 0.026  # [m] by which the gripper is opened wider than the object
+_FIT = 0.008  # [m] by which the open gripper must at least be wider than the object
 _ENOUGH = 0.025  # [m] more room than this beside the fingers is of no use
 _CUP_YAWS = 12
 # [rad] Direction from the right to the left finger, beside that from the base to the tool, when the wrist is turned as
@@ -92,6 +93,8 @@ def plan_grasp(
     *,
     near: float | None = None,
     enough: float = _ENOUGH,
+    wider: float = 0.0,
+    least: float = 0.0,
 ) -> Grasp | None:
     """Return the grasp with the most room for the fingers, and of those the one with the least turn of the wrist.
 
@@ -101,6 +104,8 @@ def plan_grasp(
         max_opening: the gripper's largest opening [m].
         near: direction of the line through the fingers from which the turn is counted [rad]; that at home if None.
         enough: more room than this beside the fingers is of no use [m].
+        wider: by which the gripper is opened wider than for an object whose pose is known exactly, if it can be [m].
+        least: by which it must at least be possible, for a side of the object to be grasped at [m].
 
     Returns:
         The grasp, or None if the object does not fit between the fingers.
@@ -110,8 +115,8 @@ def plan_grasp(
     z = max(height / 2, height - _PALM, _LOWEST)
     grasps = []
     for yaw, width in _sides(target):
-        opening = min(max_opening, width + _ROOM)
-        if width + 0.008 > max_opening:
+        opening = min(max_opening, width + _ROOM + wider)
+        if width + _FIT + least > max_opening:
             continue
         reach = opening / 2 + _FINGER
         fingers = [(x + sign * reach * math.cos(yaw), y + sign * reach * math.sin(yaw)) for sign in (-1, 1)]

@@ -19,7 +19,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
-from bhd_lerobot.policies.manipulation.grasp import SeenObject, plan_grasp, pointing_down, read_objects
+from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
 from bhd_lerobot.policies.manipulation.pick import SQUEEZE, TRAVEL
 from bhd_lerobot.policies.manipulation.reach import TARGET
 
@@ -80,12 +80,20 @@ class PickServoConfig(ServoConfig):
     Attributes:
         lift_m: height that it lifts to [m].
         down_m: like `lead_m`, near the object [m].
+        wider_m: the gripper is opened by this much wider than it needs to know exactly where the object is, where other
+            objects leave room for that [m]; for policies that learn from it and know it less exactly.
     """
 
     POSITIVE: ClassVar[tuple[str, ...]] = (*ServoConfig.POSITIVE, "lift_m", "down_m")
 
     lift_m: float = 0.15
     down_m: float = 0.01
+    wider_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.wider_m <= MAX_OPENING:
+            raise ConfigError(f"brain.wider_m is {self.wider_m}; it must be 0 to {MAX_OPENING} [m].")
 
 
 class _ServoBrain(ConfiguredBrain):
@@ -220,8 +228,7 @@ class PickServoBrain(_ServoBrain):
         grasp, yaw = None, _finger_line(tool)
         if target is not None:
             others = [item for item in objects if item.index != target.index]
-            # From how the tool is turned now, so that a choice between two ways gets clearer while it turns.
-            grasp = plan_grasp(target, others, MAX_OPENING, near=yaw, enough=_ROOM)
+            grasp = self._plan(target, others, yaw)
         if target is None or grasp is None:
             return None
         x, y = grasp.x - float(self._error[0]), grasp.y - float(self._error[1])
@@ -249,6 +256,22 @@ class PickServoBrain(_ServoBrain):
         if height < TRAVEL - _CLEAR:  # up first, turned as it is: something may stand beside it
             return pointing_down(float(tool[0]), float(tool[1]), TRAVEL, yaw), slow, grasp.opening
         return pointing_down(x, y, TRAVEL + _ABOVE, grasp.yaw), fast, grasp.opening
+
+    def _plan(self, target: SeenObject, others: Sequence[SeenObject], yaw: float) -> Grasp | None:
+        """Return the grasp of an object; the widest that there is room for.
+
+        Args:
+            target: the object.
+            others: what else stands there.
+            yaw: of the line through the fingers now [rad]: counted from there, a choice between two ways gets clearer
+                while the tool turns.
+        """
+        wider, grasp = self.config.wider_m, None
+        for extra, least in ((wider, wider), (wider, 0.0), (0.0, 0.0)) if wider else ((0.0, 0.0),):
+            grasp = plan_grasp(target, others, MAX_OPENING, near=yaw, enough=_ROOM, wider=extra, least=least)
+            if grasp is not None and grasp.room >= _ROOM:
+                break
+        return grasp
 
 
 def _part(value: float, between: tuple[float, float]) -> float:

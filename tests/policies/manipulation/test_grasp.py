@@ -44,6 +44,22 @@ def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: fl
         assert narrow < grasp.opening <= MAX_OPENING
 
 
+@given(angles, st.floats(0.01, 0.09), st.floats(0.01, 0.09), st.floats(0, 0.03))
+def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_left(
+    yaw: float, length: float, width: float, wider: float
+) -> None:
+    one = box(length, width, yaw=yaw)
+    usual, wide = (plan_grasp(one, [], MAX_OPENING, wider=more) for more in (0.0, wider))
+    careful = plan_grasp(one, [], MAX_OPENING, wider=wider, least=wider)
+    assert (usual is None) == (wide is None)
+    if usual is not None and wide is not None:
+        assert wide == dataclasses.replace(usual, opening=min(MAX_OPENING, usual.opening + wider), room=wide.room)
+    if careful is not None:
+        assert careful.opening - careful.width >= wider
+    else:
+        assert min(length, width) + wider > MAX_OPENING - 0.01
+
+
 @each_case("one", [box(0.09, 0.079), cup(0.079), box(0.3, 0.3)])
 def test_what_fits_on_no_side_has_no_grasp(one: SeenObject) -> None:
     assert plan_grasp(one, [], MAX_OPENING) is None

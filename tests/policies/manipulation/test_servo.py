@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -63,11 +64,11 @@ def pick(config: PickServoConfig | None = None) -> PickServoBrain:
     return brain
 
 
-@each_case("randomised", [False, True])
-def test_it_picks(randomised: bool) -> None:
+@each_case(("randomised", "wider"), [(False, 0.0), (True, 0.016)])
+def test_it_picks(randomised: bool, wider: float) -> None:
     config = PickConfig(order="random", randomisation=RandomisationConfig(enabled=randomised))
     simulation = UR5Simulation(TOOL, 4)
-    loop = EpisodeLoop(simulation, PickTask(config, 4, 25), PickServoBrain())
+    loop = EpisodeLoop(simulation, PickTask(config, 4, 25), PickServoBrain(PickServoConfig(wider_m=wider)))
     episodes = list(loop.run([EpisodeSpec(i, episode_seed(5, i, "train")) for i in range(8)]))
     assert [episode.outcome.event for episode in episodes] == [Event.SUCCESS] * 8
 
@@ -119,6 +120,27 @@ def test_a_known_error_of_the_camera_is_taken_away() -> None:
     assert np.allclose(seen[:, :3], right[:, :3], atol=1e-6)
 
 
+def test_it_opens_wider_only_where_there_is_room() -> None:
+    rng = np.random.default_rng(5)
+    told = tables(200)
+    state = tools(200, rng)
+    state[:, 2] = 0.4  # above everything
+    usual, wide = (pick(PickServoConfig(wider_m=more)) for more in (0.0, 0.016))
+    openings = [brain.act(Observation(TOOL_NAMES, state, {}, told))[:, 7] for brain in (usual, wide)]
+    more = openings[1] - openings[0]
+    assert openings[1].max() <= MAX_OPENING + 1e-9
+    alone = told.reshape(200, MAX_OBJECTS, -1)[:, 1, 0] < 0.5
+    free = alone & (openings[1] < MAX_OPENING - 1e-9)
+    assert np.allclose(more[free & (more > 0)], 0.016)
+    # Neighbours in all directions, so near that wider fingers would stand in one: they are opened as they were.
+    target = np.array([1, 1, 0, 0.5, 0, 0.04, 1, 0, 0, 0, 0.05, 0.05, 0.08, 1, 0, 0])
+    ring = [(0.5 + 0.085 * np.cos(angle), 0.085 * np.sin(angle)) for angle in np.pi * np.arange(4) / 4]
+    beside = [[1, 0, 0, x, y, 0.04, 1, 0, 0, 0, 0.05, 0.05, 0.08, 0, 1, 0] for x, y in ring]
+    crowd = np.concatenate([target, *beside])[None]
+    answers = [brain.act(Observation(TOOL_NAMES, state[:1], {}, crowd))[0, 7] for brain in (usual, wide)]
+    assert answers[0] == answers[1] < MAX_OPENING
+
+
 def test_without_an_object_or_a_target_it_stays_where_it_is() -> None:
     state = tools(5, np.random.default_rng(3))
     nothing = np.zeros((5, len(ENVIRONMENT)))
@@ -149,6 +171,8 @@ def test_as_an_expert_it_says_in_every_frame_what_it_would_do() -> None:
     [
         (lambda: PickServoConfig(lead_m=0.0), "lead_m"),
         (lambda: PickServoConfig(down_m=-1.0), "down_m"),
+        (lambda: PickServoConfig(wider_m=-0.001), r"wider_m is -0.001; it must be 0 to 0.085"),
+        (lambda: PickServoConfig(wider_m=float("nan")), "wider_m"),
         (lambda: ReachServoConfig(lead_rad=4.0), "below pi"),
         (lambda: ServoConfig(camera_error_m=[0.0, 1.0, 0.0]), "camera_error_m"),
     ],
