@@ -73,6 +73,11 @@ class Grasp:
     width: float
     room: float
 
+    @property
+    def wider(self) -> float:
+        """By which the opening is wider than for an object whose pose is known exactly [m]; negative if narrower."""
+        return self.opening - self.width - _ROOM
+
     def pose(self, height: float) -> Pose:
         """Return the tool's pose above the grasp, at a height over the table [m]."""
         return pointing_down(self.x, self.y, height, self.yaw)

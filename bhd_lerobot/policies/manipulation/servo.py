@@ -247,9 +247,11 @@ class PickServoBrain(_ServoBrain):
                 return pose, slow, closed
             if height < low + _REACHED and turn < _TURNED_AROUND:
                 return pointing_down(x, y, low, yaw), slow, closed
-        if opening > grasp.opening - _OPEN and turn < _TURNED[1] and apart < _DOWN[1]:
+        beside = max(0.0, grasp.wider / 2)  # fingers that are farther apart may stand so much farther off
+        near = (_DOWN[0] + beside, _DOWN[1] + beside)
+        if opening > grasp.opening - _OPEN and turn < _TURNED[1] and apart < near[1]:
             # A part of the way: at a threshold, one who follows this law less exactly would wait for ever.
-            share = max(_part(apart, _DOWN), _part(turn, _TURNED))
+            share = max(_part(apart, near), _part(turn, _TURNED))
             down = low + share * (over - low)
             lead = fast if height > over + _BRAKE and not share else slow
             return pointing_down(x, y, down, grasp.yaw), lead, grasp.opening
