@@ -43,7 +43,6 @@ class PixelsConfig(PerceptionConfig):
         tool_columns: of the tool pose in `observation.state`, if it is observed: then actions also depend on where what
             is named is from there; found by their names.
         min_std: least standard deviation that a number of the state or an action is divided by, in its own unit.
-        place_noise_m: standard deviation of what is added in a training to where what is named is, x and y [m].
         pointing_weight: of the loss of where it looks: at what the instruction names.
         perception_weight: of the loss of ``bhd_perception``, where its weights are learned as well.
     """
@@ -63,7 +62,6 @@ class PixelsConfig(PerceptionConfig):
     residual_columns: list[int] = field(default_factory=list)
     tool_columns: list[int] = field(default_factory=list)
     min_std: float = 1e-3
-    place_noise_m: float = 0.004
     pointing_weight: float = 0.2
     perception_weight: float = 0.1
 
@@ -93,7 +91,7 @@ class PixelsConfig(PerceptionConfig):
             )
         if min(self.hidden_dims, default=1) < 1:
             raise ConfigError(f"policy.hidden_dims is {self.hidden_dims}; every width must be at least 1.")
-        for name in ("min_std", "place_noise_m", "pointing_weight", "perception_weight"):
+        for name in ("min_std", "pointing_weight", "perception_weight"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
 

@@ -77,14 +77,13 @@ class PixelsPolicy(PreTrainedPolicy):
         self.reader = _Reader(config.text_dim)
         self.named = _Attention(config.text_dim, cell, 1)
         self.others = _Attention(config.text_dim + cell, cell + 3, config.n_heads)
-        self._answers = self.perception.answer_size
-        self.value = nn.Linear(self._answers, _VALUES)
+        self.value = nn.Linear(cell + 3, _VALUES)
         # Of the state before it was normalised; of a checkpoint, with its weights.
         known = (kwargs.get("dataset_stats") or {}).get(OBS_STATE)
         for name, empty in (("mean", torch.zeros(state)), ("std", torch.ones(state))):
             value = empty if known is None else torch.as_tensor(known[name], dtype=torch.float32)
             self.register_buffer(f"_state_{name}", value.clamp(min=config.min_std) if name == "std" else value)
-        width = len(columns) + self._answers + config.n_heads * _VALUES
+        width = len(columns) + cell + config.n_heads * _VALUES
         width += relative_size(1) if config.tool_columns else 0
         layers: list[nn.Module] = []
         for hidden in config.hidden_dims:
@@ -154,9 +153,6 @@ class PixelsPolicy(PreTrainedPolicy):
         cells, where = self._cells(image)
         seen, attention = self._see(cells, self._tokens(batch))
         parts["pointing"] = config.pointing_weight * self._astray(attention, where, environment)
-        if self.training and config.place_noise_m:
-            noise = config.place_noise_m / self._extent[:2]
-            seen = torch.cat([seen[:, :2] + noise * torch.randn_like(seen[:, :2]), seen[:, 2:]], dim=-1)
         target = batch[ACTION]
         apart = (self._act(seen, batch[OBS_STATE][:, -1]) - target).abs()
         padding = batch.get(_PADDING)
@@ -280,11 +276,8 @@ class PixelsPolicy(PreTrainedPolicy):
         named = torch.einsum("bn,bnc->bc", self._of_one(attention[:, 0], cells), cells)
         about = torch.cat([cells, cells[..., :3] - named[:, None, :3]], dim=-1)
         around = self.others(torch.cat([said, named], dim=-1), about, bias)
-        # Actions depend on what is said of cells, not on their features: those would tell one table of the training
-        # from another, and what was done there would be learned by heart.
-        told = torch.cat([about[..., -3:], cells[..., 3 : self._answers]], dim=-1)
-        further = torch.einsum("bhn,bnc->bhc", around, self.value(told))
-        return torch.cat([named[:, : self._answers], further.flatten(1)], dim=-1), attention[:, 0]
+        further = torch.einsum("bhn,bnc->bhc", around, self.value(about))
+        return torch.cat([named, further.flatten(1)], dim=-1), attention[:, 0]
 
     def _of_one(self, attention: Tensor, cells: Tensor) -> Tensor:
         """Return the attention, shape (batch, cells), to the object that has most of it, none to others; sums of 1.

@@ -98,7 +98,7 @@ def test_it_learns_to_look_at_what_is_named() -> None:
 
 
 def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, samples = PixelsPolicy(made(place_noise_m=0.0)), batch()
+    policy, samples = PixelsPolicy(made()), batch()
     before = {name: values.clone() for name, values in policy.state_dict().items()}
     looks: list[int] = []
     look = policy._look
@@ -119,15 +119,6 @@ def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytes
     }
     assert not [name for name in changed if name.startswith("perception.")]
     assert {"reader.said.weight", "named.key.weight", "others.key.weight", "actor.0.weight"} <= changed
-
-
-def test_where_things_are_is_uncertain_in_a_training_only() -> None:
-    policy, samples = PixelsPolicy(made(place_noise_m=0.05)).eval(), batch()
-    assert policy.forward(samples)[0] == policy.forward(samples)[0]
-    policy.train()
-    losses = [policy.forward(samples)[1] for _ in range(3)]
-    assert len({one["action"] for one in losses}) == 3
-    assert len({one["pointing"] for one in losses}) == 1
 
 
 def test_actions_behind_the_end_do_not_count() -> None:
@@ -275,7 +266,6 @@ def test_an_instruction_is_needed_and_never_cut_off() -> None:
         ({"chunk_size": 0}, "policy.chunk_size is 0; it must be at least 1"),
         ({"n_action_steps": 5}, "n_action_steps is 5, but only policy.chunk_size = 4"),
         ({"hidden_dims": [0]}, "every width must be at least 1"),
-        ({"place_noise_m": -1.0}, "place_noise_m is -1.0; it must be 0 or positive"),
         ({"pointing_weight": -1.0}, "policy.pointing_weight is -1.0"),
         ({"ignored_columns": [14]}, r"policy.ignored_columns is \[14\]"),
         ({"ignored_columns": []}, "matches no number of observation.state"),
