@@ -16,7 +16,7 @@ TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 _TEACHER = "gap_follower"
 _ROAMING = (_TEACHER, "avoidance")
 # What learned from that teacher.
-_PUPILS = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
+_STUDENTS = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
 _REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
 _FEW = ("--steps=800", "--eval_steps=800")
 # Too few to learn anything by: they show that the commands work.
@@ -47,15 +47,15 @@ def avoid(run: Runner, section: Section) -> None:
     config, rule = "turtlebot3_avoid", "avoidance"
     results = evaluate(run, "avoid_eval", config, {"bc": "avoid/bc"}, rules=_ROAMING, baseline=rule, options=shorter)
     with_trail, monitored = (
-        evaluate(run, name, config, _PUPILS, rules=(_TEACHER,), baseline=_TEACHER, options=(*roaming(run), *more))
+        evaluate(run, name, config, _STUDENTS, rules=(_TEACHER,), baseline=_TEACHER, options=(*roaming(run), *more))
         for name, more in (("avoid_trail_eval", ()), ("avoid_monitor_eval", ("--robot.collision_monitor=true",)))
     )
     # The task reports more to these two; the episodes are the same.
     if _scores(with_trail, _TEACHER) != _scores(results, _TEACHER):
         raise FailedError("A rule that does not use the trail did something else where the task reports it.")
-    for name in _PUPILS:
+    for name in _STUDENTS:
         results["brains"][name] = with_trail["brains"][name]
-    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in _PUPILS]
+    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in _STUDENTS]
 
     section.rows += _levels(results, monitored)
     difference = mean_difference(_scores(results, "bc"), _scores(results, rule))
@@ -99,8 +99,8 @@ def _levels(results: Any, monitored: Any) -> list[Row]:
     """Return the rows of success and score on the avoid task, without and with the collision monitor."""
     rows = []
     for found, names, where in (
-        (results, (*_ROAMING, "bc", *_PUPILS), ""),
-        (monitored, (_TEACHER, *_PUPILS), "with the collision monitor, "),
+        (results, (*_ROAMING, "bc", *_STUDENTS), ""),
+        (monitored, (_TEACHER, *_STUDENTS), "with the collision monitor, "),
     ):
         for name in names:
             success = success_row(found, name)

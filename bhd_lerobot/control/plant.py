@@ -98,6 +98,8 @@ class Plant(Protocol):
     def recover(self) -> bool:
         """Begin to leave a stop of the robot's own, because a person or a new episode resets it.
 
+        Before an episode it is called again each second for as long as the robot is stopped.
+
         Returns:
             Whether the robot may have moved by itself: its reference then starts from where it is.
         """

@@ -154,8 +154,8 @@ class Hardware(Plant):
         return "" if status == SafetyStatus.NORMAL else f"its safety status is {status.name}"
 
     def _leave_a_stop(self, reading: PlantReading) -> bool:
-        """Ask the robot to leave a stop of its own; return False if it is in none, or cannot say."""
-        if self.problem or reading.safety[0] == SafetyStatus.NORMAL:
+        """Ask the robot to leave a stop of its own; return False if it is in none."""
+        if reading.safety[0] == SafetyStatus.NORMAL:
             return False
         self._patiently(self._plant.recover, "recovered")
         return True

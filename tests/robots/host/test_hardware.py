@@ -256,6 +256,15 @@ def test_a_stop_of_its_own_that_is_not_left_at_once_is_left_when_it_is_asked_aga
     assert rig.drive(2) == Mode.TRACKING
 
 
+def test_a_robot_that_cannot_be_read_before_it_left_its_stop_is_asked_to() -> None:
+    rig = Rig()
+    rig.plant.broken["read"] = boom
+    rig.plant.broken["recover"] = lambda: rig.plant.broken.pop("read") is not None
+    rig.start()
+    assert rig.slept < 1
+    assert rig.drive(2) == Mode.TRACKING
+
+
 @each_case("done", ["opened", "enabled"])
 def test_a_robot_that_cannot_be_reached_is_named(done: str) -> None:
     plant = Perfect()
