@@ -44,10 +44,10 @@ def aggregate(run: Runner, section: Section) -> None:
     rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in made]
     section.rows.append(Row("time from nothing to the first seed's policy", f"{made[0][1]:.0f} s"))
     section.remarks.append(
-        f"{counted(len(made), 'seed')} of recording and training; success from {min(rates):.1%} to "
-        f"{max(rates):.1%}. `clone` learned from episodes of `gap_follower` alone. In the further rounds the last policy "
-        "drove, the rule took over before collisions and said in every frame what it would do; the others learned "
-        "that, from all episodes so far."
+        f"{counted(len(made), 'seed')} of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. "
+        "`clone` learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule "
+        "took over before collisions and said in every frame what it would do; the others learned that, from all "
+        "episodes so far."
     )
 
 

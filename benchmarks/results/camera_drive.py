@@ -68,10 +68,10 @@ def camera_drive(run: Runner, section: Section) -> None:
     rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in seeds]
     section.remarks.append(
         f"`bhd_cnn`, {counted(len(seeds), 'seed')} of recording and training; success from {min(rates):.1%} to "
-        f"{max(rates):.1%}. It sees images of 64 x 48 pixels from the front camera, and the wheels' odometry. The lidar's ranges taught "
-        "it how far away things are; they are no input, and neither is what ground it has visited. `clone` learned "
-        f"from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further rounds, corrected by the "
-        "rule. `blind` is seed 0 with black images."
+        f"{max(rates):.1%}. It sees images of 64 x 48 pixels from the front camera, and the wheels' odometry. The "
+        "lidar's ranges taught it how far away things are; they are no input, and neither is what ground it has "
+        f"visited. `clone` learned from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further "
+        "rounds, corrected by the rule. `blind` is seed 0 with black images."
     )
 
 

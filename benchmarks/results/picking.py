@@ -39,11 +39,11 @@ def pick(run: Runner, section: Section) -> None:
     section.rows.append(seeds_row(results, [f"seed_{seed}" for seed in seeds]))
     section.rows.append(Row("time from nothing to the first seed's policy", f"{seconds[0]:.0f} s"))
     section.remarks.append(
-        f"Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
-        f"says which is meant; none has seen an image or read a word. {counted(len(seeds), 'seed')} of recording "
-        f"and training. `clone` learned from episodes of `pick_servo` alone. In {run.size(ROUNDS, 1)} further rounds the last policy "
-        "drove, and the rule said in every frame what it would do. A `fault` is a stop by the cerebellum; the report "
-        "gives its reason."
+        "Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
+        f"says which is meant; none has seen an image or read a word. {counted(len(seeds), 'seed')} of recording and "
+        f"training. `clone` learned from episodes of `pick_servo` alone. In {run.size(ROUNDS, 1)} further rounds the "
+        "last policy drove, and the rule said in every frame what it would do. A `fault` is a stop by the cerebellum; "
+        "the report gives its reason."
     )
 
 

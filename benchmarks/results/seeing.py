@@ -56,9 +56,9 @@ def see(run: Runner, section: Section) -> None:
     )
     section.remarks.append(
         f"{counted(len(seeds), 'seed')} of the training. The brain `language` sees with the checkpoint and gets "
-        "nothing else of the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind one black "
-        "images: both refuse, and say why. What was learned from has no object of the style of those that it has not "
-        "seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
+        "nothing else of the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind "
+        "one black images: both refuse, and say why. What was learned from has no object of the style of those that "
+        "it has not seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
     )
 
 
@@ -136,11 +136,12 @@ def pixels(run: Runner, section: Section) -> None:
     section.rows += [success_row(results, name) for name in ("deaf", "blind")]
     section.rows.append(Row("time from nothing to the first seed", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"`bhd_pixels` after {counted(last, 'round')} of aggregation, {counted(len(folders), 'seed')} of "
-        "recordings and trainings: from an episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's state to tool poses. True "
-        "poses taught it where to look; none is an input. A deaf policy gets an empty instruction, a blind one black "
-        "images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from every frame of the "
-        "rule's episodes; they have no input for words, and can do no better than to pick any one of the objects."
+        f"`bhd_pixels` after {counted(last, 'round')} of aggregation, {counted(len(folders), 'seed')} of recordings "
+        "and trainings: from an episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's "
+        "state to tool poses. True poses taught it where to look; none is an input. A deaf policy gets an empty "
+        "instruction, a blind one black images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from "
+        "nothing, learn from every frame of the rule's episodes; they have no input for words, and can do no better "
+        "than to pick any one of the objects."
     )
 
 
