@@ -80,7 +80,7 @@ def _evaluate(run: Runner, name: str, brains: list[str], only: tuple[str, ...], 
     command = ["bhd-eval", config, *brains, f"--only=[{','.join(only)}]", "--baseline=avoidance", "--videos=0"]
     command += [f"--n_episodes={run.size(episodes, 8)}", f"--output_dir={run.path(name)}"]
     command += SHORTER if run.is_short else ()
-    run.run(name, command)
+    run.run(name, command, makes=(name,))
     return run.read(name, "results.json")
 
 

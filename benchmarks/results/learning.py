@@ -149,6 +149,7 @@ def record(run: Runner, name: str, config: str, root: str, *, episodes: int, opt
             *(f"--dataset.num_episodes={episodes}", "--n_envs=32", "--preview_video=false"),
             *(f"--output_dir={run.path(root + '_run')}", *options),
         ],
+        makes=(root, f"{root}_run"),
     )
 
 
@@ -165,7 +166,7 @@ def train(
     """Train, with further options in a short run; return how long that took, start-up included [s]."""
     data = options if root is None else (f"--dataset.root={run.path(root)}", *options)
     command = ["bhd-train", f"--config_path=configs/train/{config}.yaml", *data, f"--output_dir={run.path(output)}"]
-    return run.run(name, [*command, *(short if run.is_short else ())]).seconds
+    return run.run(name, [*command, *(short if run.is_short else ())], makes=(output,)).seconds
 
 
 def aggregation(
@@ -242,6 +243,7 @@ def evaluate(
             "--videos=0",
             *options,
         ],
+        makes=(name,),
     )
     return run.read(name, "results.json")
 

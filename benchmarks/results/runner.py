@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -77,13 +78,17 @@ class Runner:
         path.parent.mkdir(parents=True, exist_ok=True)
         return path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path
 
-    def run(self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,)) -> Ran:
+    def run(
+        self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,), *, makes: Sequence[str] = ()
+    ) -> Ran:
         """Run a command, or find that it was run.
 
         Args:
             name: what its note and its log are called.
             arguments: the command line: `bhd-…`, or `python -m …`.
             allowed: exit statuses that are no failure.
+            makes: paths in the folder of what it makes and would not make anew; what is left there of a run that was
+                stopped, or of another command, is removed.
 
         Raises:
             FailedError: it failed; the message names its log.
@@ -98,6 +103,10 @@ class Runner:
                 print(f"== {command}\n-- {name}: was run before, {kept.seconds:.0f} s", flush=True)
                 self.commands.append(kept)
                 return kept
+        note.unlink(missing_ok=True)  # it tells of what is about to be made anew
+        for made in makes:
+            if (left := REPOSITORY / self.path(made)).exists():
+                shutil.rmtree(left)
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
         started = time.perf_counter()

@@ -168,7 +168,7 @@ def _evaluate(
     only = ",".join(names or _names(run))
     command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
     command += [f"--only=[{only}]", f"--n_episodes={run.size(episodes, 12)}", "--videos=0"]
-    run.run(name, [*command, f"--output_dir={run.path(name)}"])
+    run.run(name, [*command, f"--output_dir={run.path(name)}"], makes=(name,))
     return run.read(name, "results.json")
 
 

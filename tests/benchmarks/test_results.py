@@ -186,6 +186,22 @@ def test_a_command_is_run_once_and_again_when_it_changed(tmp_path: Path) -> None
         run.run("note", ["python", "-c", "print('out of order'); raise SystemExit(3)"])
 
 
+def test_what_a_stopped_command_left_is_in_nobodys_way(tmp_path: Path) -> None:
+    run = Runner(tmp_path, is_short=True)
+    # As our commands do: they refuse a folder that is there.
+    refuses = ["python", "-c", f"import os; os.mkdir({str(tmp_path / 'made')!r})"]
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "half").write_text("")
+    with pytest.raises(FailedError, match="exists"):
+        run.run("note", refuses)
+    first = run.run("note", refuses, makes=("made", "never_made"))
+    assert run.run("note", refuses, makes=("made", "never_made")) == first
+    assert not list((tmp_path / "made").iterdir())
+    (tmp_path / "made" / "whole").write_text("")
+    run.run("note", [*refuses[:2], f"{refuses[2]} # changed"], makes=("made",))
+    assert not list((tmp_path / "made").iterdir())
+
+
 def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
