@@ -1,7 +1,7 @@
 """`make results`: everything that is claimed about learning, made again, into `docs/reference/results.md`.
 
 It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew. With `--only`, the
-other sections of the page stay as they are.
+other sections of the page stay as they are; with `--seeds`, what was measured of other training seeds does.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
+from benchmarks.results.trainings import SEEDS
 
 Measure = Callable[[Runner, Section], None]
 
@@ -60,6 +61,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--page", type=Path, help=f"what is written: {_PAGE}, or results.md in the folder of --short")
     parser.add_argument("--short", action="store_true", help="a short run, which shows in which direction numbers go")
     parser.add_argument("--jobs", type=int, help="sections side by side, each on one core: 1, or 2 with --short")
+    parser.add_argument(
+        "--seeds",
+        nargs="+",
+        type=int,
+        choices=SEEDS,
+        help="training seeds to make; the others stay as they were measured before, which lies beside the page",
+    )
     parser.add_argument("--fresh", action="store_true", help="begin anew")
     options = parser.parse_args(arguments)
     jobs = (2 if options.short else 1) if options.jobs is None else options.jobs
@@ -76,7 +84,10 @@ def main(arguments: list[str] | None = None) -> int:
         for name, title, measure in group:
             if name not in options.only:
                 continue
-            section, run = Section(name, title), Runner(folder, is_short=options.short, stopped=stopped)
+            section = Section(name, title)
+            run = Runner(
+                folder, is_short=options.short, stopped=stopped, chosen=options.seeds, kept=page.with_suffix("")
+            )
             try:
                 measure(run, section)
             except FailedError as error:

@@ -1,13 +1,24 @@
 """The sections about fine-tuning: how much of what a shifted world costs do a few episodes of it bring back?"""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
-from benchmarks.results.learning import TOOL, evaluate, reach, record, train, values
+from benchmarks.results.learning import (
+    TOOL,
+    evaluate,
+    reach_folder,
+    record,
+    summary,
+    train,
+    train_reach,
+    values,
+)
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
-from benchmarks.results.seeing import record_tables, train_perception
+from benchmarks.results.seeing import perception_folder, record_tables, train_perception
+from benchmarks.results.trainings import SEEDS, each
 
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
@@ -20,7 +31,7 @@ SHIFT = (
     f"--task.randomisation.{_ERROR}",
     *(f"--task.randomisation.{name}=0" for name in ("sensor_noise_rad", "latency_s")),
 )
-_SHIFTED = "camera 18 mm off"
+_ORIGINAL, _SHIFTED, _ELSEWHERE = "as it was", "camera 18 mm off", "camera moved by 3 cm and 5 deg"
 TABLES, _CAMERA_GOAL = 20, 0.8
 # Light, colours and sizes vary; the camera stands still in all episodes: where it was, or elsewhere.
 _STILL = ("--task.randomisation.enabled=true", *(f"--task.randomisation.camera_{name}=0" for name in ("m", "rad")))
@@ -31,49 +42,33 @@ _MOVED = (
 
 
 def fine_tune(run: Runner, section: Section) -> None:
-    """Adapt the policy of the reach section, which is made if it was not yet, to a camera that is off.
+    """Adapt a policy of the reach section to a camera that is off.
 
     The policy gets the target from that camera. The rule that shows the episodes knows by how much it is off.
     """
-    reach(run, Section("reach", ""))
-    record(
-        run,
-        "fine_tune_record",
-        "ur5_reach",
-        "fine_tune/data",
-        episodes=SHOWN,
-        options=(*TOOL, "--seed=7", *SHIFT, "--task.hold_s=1.0", f"--brain.{_ERROR}"),
-    )
-    base = f"--fine_tune={run.path('reach/bc')}"
-    seconds = train(run, "fine_tune_train", "fine_tune_ur5_reach", "fine_tune/bc", "fine_tune/data", options=(base,))
-    brains = {"base": "reach/bc", "tuned": "fine_tune/bc"}
-    original, shifted = (
-        evaluate(run, f"fine_tune_{world}", "ur5_reach", brains, baseline="base", options=(*TOOL, *shift))
-        for world, shift in (("original", ()), ("shifted", SHIFT))
-    )
-    before, lost, found = (
-        values(results, name, "success")
-        for results, name in ((original, "base"), (shifted, "base"), (shifted, "tuned"))
-    )
-    share, low, high = recovered(before, lost, found)
-    for results, name, where in (
-        (original, "base", "original world"),
-        (shifted, "base", _SHIFTED),
-        (shifted, "tuned", _SHIFTED),
-        (original, "tuned", "original world"),
-    ):
-        brain = results["brains"][name]
-        what = f"{name}, {where}: success in {len(before)}"
-        section.rows.append(Row(what, rate(brain["success"], brain["outcomes"])))
-    section.rows += [
-        Row(
-            f"recovered by {SHOWN} episodes, share of what the shift cost",
-            f"{share:.0%} ({low:.0%} to {high:.0%})",
-            f"at least {GOAL:.0%}",
-            share >= GOAL,
-        ),
-        Row("time of fine-tuning", f"{seconds:.0f} s"),
-    ]
+    episodes = run.size(1500, 120)
+    data, held = f"reach/data_{episodes}", "--task.hold_s=1.0"
+    options = (*TOOL, held, "--seed=100")
+    record(run, f"reach_record_{episodes}", "ur5_reach", data, episodes=episodes, options=options)
+    shown, options = "fine_tune/data", (*TOOL, "--seed=7", *SHIFT, held, f"--brain.{_ERROR}")
+    record(run, "fine_tune_record", "ur5_reach", shown, episodes=SHOWN, options=options)
+
+    def learn(seed: int) -> dict[str, Any]:
+        train_reach(run, seed, episodes, data)
+        base, tuned = reach_folder(seed, episodes), f"fine_tune/seed_{seed}"
+        start = (f"--fine_tune={run.path(base)}", f"--seed={seed}")
+        seconds = train(run, f"fine_tune_train_{seed}", "fine_tune_ur5_reach", tuned, shown, options=start)
+        brains = {"base": base, "tuned": tuned}
+        found: dict[str, Any] = {"seconds": seconds}
+        for world, shift in ((_ORIGINAL, ()), (_SHIFTED, SHIFT)):
+            output = f"fine_tune_eval/seed_{seed}/{'shifted' if shift else 'original'}"
+            results = evaluate(run, output, "ur5_reach", brains, baseline="base", options=(*TOOL, *shift))
+            found[world] = {**summary(results, *brains), **_successes(results, brains)}
+        return found
+
+    made = each(run, section, "fine_tune", SEEDS, learn)
+    for seed, results in made.items():
+        section.rows += _recovery_rows(results, seed, f"{SHOWN} episodes", _SHIFTED, GOAL)
     section.remarks.append(
         "The share is (tuned, shifted - base, shifted) / (base, original - base, shifted) over the same seeds; its "
         "interval is a bootstrap over them, which draws all three outcomes of a seed together."
@@ -81,50 +76,61 @@ def fine_tune(run: Runner, section: Section) -> None:
 
 
 def move_camera(run: Runner, section: Section) -> None:
-    """Adapt the first perception of the section `see`, which is made if it was not yet, to a camera that was moved."""
+    """Adapt a perception of the section `see` to a camera that was moved."""
     record_tables(run)
-    base = train_perception(run, 0)
-    moved = "camera/tables"
-    options = ("--seed=31", *_STILL, *_MOVED)
+    moved, options = "camera/tables", ("--seed=31", *_STILL, *_MOVED)
     record(run, "camera_record", "ur5_look", moved, episodes=TABLES, options=options)
-    start = (f"--fine_tune={run.path(base)}",)
-    seconds = train(run, "camera_train", "fine_tune_perception", "camera/perception", moved, options=start)
-    brains = []
-    for name, folder in (("base", base), ("tuned", "camera/perception")):
-        brains += [f"--brains.{name}.type=language", f"--brains.{name}.perception.path={run.path(folder)}"]
-    brains += ["--robot.camera=true", "--task.language=any", "--videos=0"]
-    original, elsewhere = (
-        evaluate(run, f"camera_{world}", "ur5_pick", {}, rules=("base", "tuned"), baseline="base", options=options)
-        for world, options in (("original", (*brains, *_STILL)), ("moved", (*brains, *_STILL, *_MOVED)))
-    )
-    before, lost, found = (
-        values(results, name, "success")
-        for results, name in ((original, "base"), (elsewhere, "base"), (elsewhere, "tuned"))
-    )
-    share, low, high = recovered(before, lost, found)
-    for results, name, where in (
-        (original, "base", "camera where it was"),
-        (elsewhere, "base", "camera moved by 3 cm and 5 deg"),
-        (elsewhere, "tuned", "camera moved by 3 cm and 5 deg"),
-    ):
-        brain = results["brains"][name]
-        section.rows.append(
-            Row(f"{name}, {where}: success in {len(before)}", rate(brain["success"], brain["outcomes"]))
-        )
-    section.rows += [
-        Row(
-            f"recovered by {TABLES} tables, share of what the move cost",
-            f"{share:.0%} ({low:.0%} to {high:.0%})",
-            f"at least {_CAMERA_GOAL:.0%}",
-            share >= _CAMERA_GOAL,
-        ),
-        Row("time of fine-tuning", f"{seconds:.0f} s"),
-    ]
+
+    def learn(seed: int) -> dict[str, Any]:
+        train_perception(run, seed)
+        folders = {"base": perception_folder(seed), "tuned": f"camera/seed_{seed}"}
+        start = (f"--fine_tune={run.path(folders['base'])}", f"--seed={seed}")
+        name = f"camera_train_{seed}"
+        seconds = train(run, name, "fine_tune_perception", folders["tuned"], moved, options=start)
+        brains = []
+        for name, folder in folders.items():
+            brains += [f"--brains.{name}.type=language", f"--brains.{name}.perception.path={run.path(folder)}"]
+        brains += ["--robot.camera=true", "--task.language=any"]
+        found: dict[str, Any] = {"seconds": seconds}
+        for world, shift in ((_ORIGINAL, ()), (_ELSEWHERE, _MOVED)):
+            output = f"camera_eval/seed_{seed}/{'moved' if shift else 'original'}"
+            rules, options = tuple(folders), (*brains, *_STILL, *shift)
+            results = evaluate(run, output, "ur5_pick", {}, rules=rules, baseline="base", options=options)
+            found[world] = {**summary(results, *folders), **_successes(results, folders)}
+        return found
+
+    made = each(run, section, "move_camera", SEEDS, learn)
+    for seed, results in made.items():
+        section.rows += _recovery_rows(results, seed, f"{TABLES} tables", _ELSEWHERE, _CAMERA_GOAL)
     section.remarks.append(
         f"A table is one image with the true poses of what stands there; {TABLES} were seen through the camera where "
         "it is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "
         "tuned perception looks from where the camera was moved to, and is not meant for where it was before."
     )
+
+
+def _successes(results: Any, names: Iterable[str]) -> dict[str, dict[str, list[bool]]]:
+    return {"successes": {name: values(results, name, "success") for name in names}}
+
+
+def _recovery_rows(results: Any, seed: int, shown: str, shifted: str, goal: float) -> list[Row]:
+    """Return the rows of a training seed: each policy in each world, and the share that was recovered."""
+    found, rows = results[shifted]["successes"], []
+    share, low, high = recovered(results[_ORIGINAL]["successes"]["base"], found["base"], found["tuned"])
+    for world, name in ((_ORIGINAL, "base"), (shifted, "base"), (shifted, "tuned"), (_ORIGINAL, "tuned")):
+        brain = results[world]["brains"][name]
+        what = f"{name}_{seed}, {world}: success in {brain['episodes']}"
+        rows.append(Row(what, rate(brain["success"], brain["outcomes"])))
+    return [
+        *rows,
+        Row(
+            f"seed {seed}: recovered by {shown}, share of what was lost",
+            f"{share:.0%} ({low:.0%} to {high:.0%})",
+            f"at least {goal:.0%}",
+            share >= goal,
+        ),
+        Row(f"seed {seed}: time of fine-tuning", f"{results['seconds']:.0f} s"),
+    ]
 
 
 def recovered(before: Sequence[bool], lost: Sequence[bool], found: Sequence[bool]) -> tuple[float, float, float]:

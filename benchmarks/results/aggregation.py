@@ -1,50 +1,58 @@
 """The section about aggregation: what its rounds make of a driver that was cloned, from three seeds."""
 
 from dataclasses import asdict
+from typing import Any
 
-import numpy as np
-
-from benchmarks.results.learning import SHORTER, aggregation, evaluate, roaming, success_row, values
+from benchmarks.results.learning import (
+    SHORTER,
+    aggregation,
+    evaluate,
+    roaming,
+    scores,
+    seeds_row,
+    success_row,
+    summary,
+)
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
-from bhd_lerobot.errors import counted
+from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
-EPISODES, SEEDS, ROUNDS = 1000, (0, 1, 2), 2
+EPISODES, ROUNDS = 1000, 2
 _SHORT, _STEPS = (40, 20, 8), 800
 _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
+_RULE = "gap_follower"
 
 
 def aggregate(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
-    made = {seed: aggregated(run, seed) for seed in run.seeds(SEEDS)}
-    brains = {"clone": f"{_folder(0)}/round_0/policy"}
-    brains |= {f"seed_{seed}": policy for seed, (policy, _) in made.items()}
-    results = evaluate(
-        run,
-        "aggregate_eval",
-        "turtlebot3_avoid",
-        brains,
-        rules=("gap_follower",),
-        baseline="gap_follower",
-        options=roaming(run),
-        episodes=EPISODES,
-    )
-    section.rows += [success_row(results, name) for name in ("gap_follower", "clone")]
-    scores = {name: np.array(values(results, name, "score"), float) for name in ("gap_follower", *brains)}
-    for seed in made:
+
+    def learn(seed: int) -> dict[str, Any]:
+        policy, seconds = aggregated(run, seed)
+        return {**_evaluate(run, f"seed_{seed}", policy), "seconds": seconds}
+
+    def clone(seed: int) -> dict[str, Any]:
+        return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy")
+
+    made = each(run, section, "aggregate", SEEDS, learn)
+    clones = each(run, section, "aggregate_clone", SEEDS[:1], clone)
+    first, *_ = made.values()
+    section.rows.append(success_row(first, _RULE))
+    section.rows += [success_row(one, "clone") for one in clones.values()]
+    for seed, results in made.items():
         name = f"seed_{seed}"
-        success = results["brains"][name]["success"]
-        row = success_row(results, name)
+        row, success = success_row(results, name), results["brains"][name]["success"]
         is_met = success["low"] >= _SUCCESS_GOAL
         section.rows.append(Row(row.what, row.value, f"lower end at least {_SUCCESS_GOAL:.1%}", is_met))
-        ratio = ratio_of_means(scores[name], scores["gap_follower"])
-        what = f"{name} / gap_follower: mean score, paired"
+        ratio = ratio_of_means(scores(results, name), scores(results, _RULE))
+        what = f"{name} / {_RULE}: mean score, paired"
         section.rows.append(Row(what, mean(asdict(ratio)), f"at least {_SCORE_GOAL}", ratio.value >= _SCORE_GOAL))
-    rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in made]
-    section.rows.append(Row("time from nothing to the first seed's policy", f"{made[0][1]:.0f} s"))
+    section.rows.append(seeds_row(made))
+    section.rows += [
+        Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
+    ]
     section.remarks.append(
-        f"{counted(len(made), 'seed')} of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. "
+        "Each seed is one of recording and training. "
         "`clone` learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule "
         "took over before collisions and said in every frame what it would do; the others learned that, from all "
         "episodes so far."
@@ -57,6 +65,20 @@ def aggregated(run: Runner, seed: int) -> tuple[str, float]:
     return aggregation(
         run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS, options=SHORTER
     )
+
+
+def _evaluate(run: Runner, name: str, policy: str) -> dict[str, Any]:
+    results = evaluate(
+        run,
+        f"aggregate_eval/{name}",
+        "turtlebot3_avoid",
+        {name: policy},
+        rules=(_RULE,),
+        baseline=_RULE,
+        options=roaming(run),
+        episodes=EPISODES,
+    )
+    return summary(results, _RULE, name)
 
 
 def _folder(seed: int) -> str:

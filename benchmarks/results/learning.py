@@ -1,22 +1,21 @@
 """The sections about what is learned: recorded, trained and evaluated by the commands that a user has."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-import numpy as np
 import yaml
 
-from benchmarks.results.runner import REPOSITORY, FailedError, Runner
+from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds, rate
+from benchmarks.results.trainings import SEEDS, each
+from bhd_lerobot.errors import counted
 from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
-_TEACHER = "gap_follower"
-_ROAMING = (_TEACHER, "avoidance")
-# What learned from that teacher.
-_STUDENTS = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
+_RULE, _TEACHER = "avoidance", "gap_follower"
 _REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
 _FEW = ("--steps=800", "--eval_steps=800")
 # Too few to learn anything by: they show that the commands work.
@@ -34,102 +33,152 @@ def avoid(run: Runner, section: Section) -> None:
     shorter = SHORTER if run.is_short else ()
     options = ("--seed=100", *shorter)
     record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 20), options=options)
-    seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data", short=_FEW)
-    gap = ("--seed=100", "--brain.type=gap_follower", *roaming(run))
+    gap = ("--seed=100", f"--brain.type={_TEACHER}", *roaming(run))
     record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 40), options=gap)
-    train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data", short=_FEW)
-    start = (
-        *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
-        *("--critic_warmup=65536", "--ppo.log_std_init=-1.0"),
-    )
-    ppo_seconds = train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start, short=FEW_PPO)
 
-    config, rule = "turtlebot3_avoid", "avoidance"
-    results = evaluate(run, "avoid_eval", config, {"bc": "avoid/bc"}, rules=_ROAMING, baseline=rule, options=shorter)
-    with_trail, monitored = (
-        evaluate(run, name, config, _STUDENTS, rules=(_TEACHER,), baseline=_TEACHER, options=(*roaming(run), *more))
-        for name, more in (("avoid_trail_eval", ()), ("avoid_monitor_eval", ("--robot.collision_monitor=true",)))
-    )
-    # The task reports more to these two; the episodes are the same.
-    if _scores(with_trail, _TEACHER) != _scores(results, _TEACHER):
-        raise FailedError("A rule that does not use the trail did something else where the task reports it.")
-    for name in _STUDENTS:
-        results["brains"][name] = with_trail["brains"][name]
-    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in _STUDENTS]
+    def learn(seed: int) -> dict[str, Any]:
+        names = {name: f"{name}_{seed}" for name in ("bc", "gap_bc", "ppo")}
+        own, folder, seconds = (f"--seed={seed}",), f"avoid/seed_{seed}", {}
+        for name, data in (("bc", "avoid/data"), ("gap_bc", "avoid/gap_data")):
+            seconds[name] = train(
+                run, f"avoid_{names[name]}", "bc_turtlebot3_avoid", f"{folder}/{name}", data, options=own, short=_FEW
+            )
+        start = (
+            *(f"--start_from={run.path(folder, 'gap_bc')}", "--see_ignored=true"),
+            *("--critic_warmup=65536", "--ppo.log_std_init=-1.0", *own),
+        )
+        seconds["ppo"] = train(
+            run, f"avoid_{names['ppo']}", "ppo_turtlebot3", f"{folder}/ppo", options=start, short=FEW_PPO
+        )
+        brains = {"gap_bc": f"{folder}/gap_bc", "ppo": f"{folder}/ppo/checkpoints/best"}
+        found: dict[str, Any] = {}
+        # The task reports more to the second ones; the episodes are the same.
+        for part, learned, rule, more in (
+            ("bc", {"bc": f"{folder}/bc"}, _RULE, shorter),
+            ("trail", brains, _TEACHER, roaming(run)),
+        ):
+            results = evaluate(
+                run,
+                f"avoid_eval/seed_{seed}/{part}",
+                "turtlebot3_avoid",
+                learned,
+                rules=(rule,),
+                baseline=rule,
+                options=more,
+            )
+            found |= summary(results, rule, *learned)["brains"]
+        return {"brains": found, "seconds": seconds}
 
-    section.rows += _levels(results, monitored)
-    difference = mean_difference(_scores(results, "bc"), _scores(results, rule))
-    more = _failures(results, "bc") - _failures(results, rule)
-    section.rows += [
-        Row("bc: time of training", f"{seconds:.0f} s", f"at most {_AVOID_TRAIN_S} s", seconds <= _AVOID_TRAIN_S),
+    made = each(run, section, "avoid", SEEDS, learn)
+    first, *_ = made.values()
+    for name in (_TEACHER, _RULE):
+        section.rows += [success_row(first, name), _score_row(first, name, name)]
+    for seed, results in made.items():
+        section.rows += _driving_rows(results, seed)
+    section.remarks.append(
+        "Each seed N is one of the training. `bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule "
+        "remembers where it has been; a network does not, so the task reports to `gap_bc` and `ppo`, which starts "
+        "from it, what ground around them they have visited (`task.trail`)."
+    )
+
+
+def _driving_rows(results: Any, seed: int) -> list[Row]:
+    """Return the rows of a seed of the section `avoid`."""
+    rows, seconds = [], results["seconds"]
+    for name in ("bc", "gap_bc", "ppo"):
+        row = success_row(results, name)
+        rows += [
+            replace(row, what=row.what.replace(name, f"{name}_{seed}", 1)),
+            _score_row(results, name, f"{name}_{seed}"),
+        ]
+    teacher, rule, bc, ppo = (scores(results, name) for name in (_TEACHER, _RULE, "bc", "ppo"))
+    lost = {name: int(brain["episodes"] - brain["successes"]) for name, brain in results["brains"].items()}
+    difference, more = mean_difference(bc, rule), lost["bc"] - lost[_RULE]
+    ratio, over = ratio_of_means(ppo, teacher), ratio_of_means(ppo, rule)
+    return [
+        *rows,
         Row(
-            "bc - avoidance, its teacher: mean score, paired",
+            f"bc_{seed}: time of training",
+            f"{seconds['bc']:.0f} s",
+            f"at most {_AVOID_TRAIN_S} s",
+            seconds["bc"] <= _AVOID_TRAIN_S,
+        ),
+        Row(
+            f"bc_{seed} - avoidance, its teacher: mean score, paired",
             mean(asdict(difference), "+"),
             "not below 0 for certain",
-            difference.high >= 0,
+            math.isnan(difference.high) or difference.high >= 0,
         ),
-        Row("bc: failures beyond its teacher's", str(more), "at most 0", more <= 0),
-        Row("ppo: time of training", f"{ppo_seconds:.0f} s", f"at most {_PPO_TRAIN_S} s", ppo_seconds <= _PPO_TRAIN_S),
-    ]
-    failures = {name: _failures(results, name) for name in (_TEACHER, "bc", "ppo")}
-    least = min(failures[_TEACHER], failures["bc"])
-    best = max((_TEACHER, "bc"), key=lambda name: float(np.mean(_scores(results, name))))
-    ratio = ratio_of_means(_scores(results, "ppo"), _scores(results, best))
-    over = ratio_of_means(_scores(results, "ppo"), _scores(results, rule))
-    section.rows += [
-        Row("ppo: failures", str(failures["ppo"]), f"at most {least}", failures["ppo"] <= least),
+        Row(f"bc_{seed}: failures beyond its teacher's", str(more), "at most 0", more <= 0),
         Row(
-            f"ppo / {best}: mean score, paired",
+            f"ppo_{seed}: time of training",
+            f"{seconds['ppo']:.0f} s",
+            f"at most {_PPO_TRAIN_S} s",
+            seconds["ppo"] <= _PPO_TRAIN_S,
+        ),
+        Row(f"ppo_{seed}: failures", str(lost["ppo"]), f"at most {lost[_TEACHER]}", lost["ppo"] <= lost[_TEACHER]),
+        Row(
+            f"ppo_{seed} / {_TEACHER}: mean score, paired",
             mean(asdict(ratio)),
             f"at least {_PPO_GOAL}, its interval above 1",
             ratio.value >= _PPO_GOAL and ratio.low > 1,
         ),
-        Row("ppo / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))),
-    ]
-    section.remarks += [
-        "`bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule remembers where it has been; a network "
-        "does not, so the task reports to `gap_bc` and `ppo`, which starts from it, what ground around them "
-        "they have visited (`task.trail`).",
-        "With the collision monitor (`robot.collision_monitor`) no brain touches anything; it takes speed away and "
-        "does not steer, so one that would have driven into something stands before it, and is stuck.",
+        Row(f"ppo_{seed} / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))),
     ]
 
 
-def _levels(results: Any, monitored: Any) -> list[Row]:
-    """Return the rows of success and score on the avoid task, without and with the collision monitor."""
-    rows = []
-    for found, names, where in (
-        (results, (*_ROAMING, "bc", *_STUDENTS), ""),
-        (monitored, (_TEACHER, *_STUDENTS), "with the collision monitor, "),
-    ):
-        for name in names:
-            success = success_row(found, name)
-            rows.append(replace(success, what=f"{where}{success.what}"))
-            rows.append(Row(f"{where}{name}: mean score", mean(found["brains"][name]["means"]["score"])))
-    return rows
+def _score_row(results: Any, name: str, shown: str) -> Row:
+    return Row(f"{shown}: mean score", mean(results["brains"][name]["means"]["score"]))
 
 
 def reach(run: Runner, section: Section) -> None:
-    """Cloning a rule on the reach task, from few to many episodes; the last is the policy that others start from."""
+    """Cloning a rule on the reach task, from few to many episodes."""
     options = (*TOOL, "--task.hold_s=1.0", "--seed=100")
-    seconds, folders = {}, {}
-    numbers = _FEW_EPISODES if run.is_short else _REACH_EPISODES
+    recorded, numbers = {}, _FEW_EPISODES if run.is_short else _REACH_EPISODES
     for episodes in numbers:
-        data, folder = (
+        recorded[episodes] = record(
+            run,
+            f"reach_record_{episodes}",
+            "ur5_reach",
             f"reach/data_{episodes}",
-            "reach/bc" if episodes == numbers[-1] else f"reach/bc_{episodes}",
+            episodes=episodes,
+            options=options,
         )
-        record(run, f"reach_record_{episodes}", "ur5_reach", data, episodes=episodes, options=options)
-        before = run.commands[-1].seconds
-        seconds[episodes] = before + train(run, f"reach_bc_{episodes}", "bc_ur5_reach", folder, data, short=_FEW)
-        folders[f"bc_{episodes}"] = folder
-    results = evaluate(run, "reach_eval", "ur5_reach", folders, rules=("reach",), baseline="reach", options=TOOL)
-    section.rows.append(success_row(results, "reach"))
+
+    def learn(seed: int) -> dict[str, Any]:
+        seconds = {
+            f"bc_{episodes}": recorded[episodes] + train_reach(run, seed, episodes, f"reach/data_{episodes}")
+            for episodes in numbers
+        }
+        folders = {f"bc_{episodes}": reach_folder(seed, episodes) for episodes in numbers}
+        results = evaluate(run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=TOOL)
+        return {**summary(results, "reach", *folders), "seconds": seconds}
+
+    made = each(run, section, "reach", SEEDS, learn)
+    first, *_ = made.values()
+    section.rows.append(success_row(first, "reach"))
     for episodes in numbers:
-        is_last = episodes == numbers[-1]
-        section.rows.append(success_row(results, f"bc_{episodes}", _REACH_GOAL if is_last else None))
-        section.rows.append(Row(f"bc_{episodes}: time from nothing", f"{seconds[episodes]:.0f} s"))
-    section.remarks.append("`bc_N` learned from N episodes, all with the same number of steps.")
+        name, goal = f"bc_{episodes}", _REACH_GOAL if episodes == numbers[-1] else None
+        for seed, results in made.items():
+            row = success_row(results, name, goal)
+            section.rows.append(replace(row, what=f"seed {seed}, {row.what}"))
+        section.rows.append(seeds_row(made, name, name))
+        seconds = ", ".join(f"{results['seconds'][name]:.0f} s" for results in made.values())
+        section.rows.append(Row(f"{name}: time from nothing", seconds))
+    section.remarks.append(
+        "`bc_N` learned from N episodes, all with the same number of steps; each seed is one of the training."
+    )
+
+
+def reach_folder(seed: int, episodes: int) -> str:
+    """Return where what learned from so many episodes is."""
+    return f"reach/seed_{seed}/bc_{episodes}"
+
+
+def train_reach(run: Runner, seed: int, episodes: int, data: str) -> float:
+    """Clone the rule of the reach task; return how long the training took [s]."""
+    name, own = f"reach_bc_{episodes}_{seed}", (f"--seed={seed}",)
+    return train(run, name, "bc_ur5_reach", reach_folder(seed, episodes), data, options=own, short=_FEW)
 
 
 def roaming(run: Runner) -> tuple[str, ...]:
@@ -140,9 +189,9 @@ def roaming(run: Runner) -> tuple[str, ...]:
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
-def record(run: Runner, name: str, config: str, root: str, *, episodes: int, options: Sequence[str] = ()) -> None:
-    """Record episodes of the rule that the configuration names."""
-    run.run(
+def record(run: Runner, name: str, config: str, root: str, *, episodes: int, options: Sequence[str] = ()) -> float:
+    """Record episodes of the rule that the configuration names; return how long that took, start-up included [s]."""
+    ran = run.run(
         name,
         [
             *("bhd-record", f"--config_path=configs/record/{config}.yaml", f"--dataset.root={run.path(root)}"),
@@ -151,6 +200,7 @@ def record(run: Runner, name: str, config: str, root: str, *, episodes: int, opt
         ],
         makes=(root, f"{root}_run"),
     )
+    return ran.seconds
 
 
 def train(
@@ -222,7 +272,7 @@ def evaluate(
     config: str,
     brains: Mapping[str, str],
     *,
-    baseline: str,
+    baseline: str = "",
     rules: Sequence[str] = (),
     options: Sequence[str] = (),
     episodes: int = EPISODES,
@@ -239,8 +289,8 @@ def evaluate(
         name,
         [
             *("bhd-eval", f"--config_path=configs/eval/{config}.yaml", f"--n_episodes={episodes}", *learned),
-            *(f"--only=[{only}]", f"--baseline={baseline}", f"--output_dir={run.path(name)}", "--n_envs=32"),
-            "--videos=0",
+            *(f"--only=[{only}]", *((f"--baseline={baseline}",) if baseline else ())),
+            *(f"--output_dir={run.path(name)}", "--n_envs=32", "--videos=0"),
             *options,
         ],
         makes=(name,),
@@ -257,13 +307,19 @@ def values(results: Any, brain: str, key: str) -> list[Any]:
     return [one[key] for one in sorted(own, key=lambda one: int(one["episode"]))]
 
 
+def summary(results: Any, *names: str) -> dict[str, Any]:
+    """Return of some brains what rows need: what the report sums up, and the score of every episode."""
+    brains = {name: {**results["brains"][name], "scores": _scores(results, name)} for name in names}
+    return {"brains": brains}
+
+
+def scores(kept: Any, name: str) -> list[float]:
+    """Return the score of each episode of a brain, of what `summary` returned."""
+    return list(kept["brains"][name]["scores"])
+
+
 def _scores(results: Any, name: str) -> list[float]:
-    return [float(one) for one in values(results, name, "score")]
-
-
-def _failures(results: Any, name: str) -> int:
-    brain = results["brains"][name]
-    return int(brain["episodes"] - brain["successes"])
+    return [round(float(one), 6) for one in values(results, name, "score")]
 
 
 def success_row(results: Any, name: str, goal: float | None = None) -> Row:
@@ -274,7 +330,13 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
 
 
-def seeds_row(results: Any, names: Sequence[str], what: str = "all seeds") -> Row:
-    """Return the row of the mean success of policies that differ in their training seeds only."""
-    rates = [float(results["brains"][name]["success"]["value"]) for name in names]
-    return Row(f"{what}: mean success, interval over {len(names)} trainings", over_seeds(rates))
+def seeds_row(made: Mapping[int, Any], what: str = "all seeds", name: str = "") -> Row:
+    """Return the row of the mean success of policies that differ in their training seeds only.
+
+    Args:
+        made: what `summary` returned, by seed.
+        what: what they have in common, in words.
+        name: of the brain in each; ``seed_N`` if nothing.
+    """
+    rates = [float(results["brains"][name or f"seed_{seed}"]["success"]["value"]) for seed, results in made.items()]
+    return Row(f"{what}: mean success, its interval over {counted(len(rates), 'training')}", over_seeds(rates))

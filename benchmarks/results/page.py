@@ -1,18 +1,12 @@
 """The page that the results are written to."""
 
-import os
-import platform
 from collections.abc import Sequence
-from datetime import datetime
-from importlib.metadata import version
 from pathlib import Path
 
-import torch
-
+from benchmarks.results.provenance import provenance
 from benchmarks.results.section import Section
 from bhd_lerobot.datasets.storage.disk import Disk
 
-_PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
 _HEAD = (
     "# Results",
     "",
@@ -36,7 +30,7 @@ def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *
     texts = {} if not path.exists() else _kept(path.read_text(encoding="utf-8"))
     for section in sections:
         first, *rest = section.markdown()
-        texts[section.title] = "\n".join([first, "", _made(), *rest])
+        texts[section.title] = "\n".join([first, "", f"Made {provenance()}.", *rest])
     lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
     lines += ["\n" + texts[title].strip() for title in titles if title in texts]
     # What other sessions took hours for is on it: it is never half written.
@@ -47,21 +41,3 @@ def _kept(page: str) -> dict[str, str]:
     """Return the sections of a page by their titles."""
     texts = page.split("\n## ")[1:]
     return {text.partition("\n")[0]: f"## {text}" for text in texts}
-
-
-def _made() -> str:
-    versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
-    return f"Made on {datetime.now():%Y-%m-%d}, on {_machine()}, with {versions}."
-
-
-def _machine() -> str:
-    model = "an unknown processor"
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    except OSError:
-        pass
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
-    return f"{os.cpu_count()} processors ({model}, {platform.system()}), {gpu}"

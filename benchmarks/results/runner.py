@@ -53,24 +53,33 @@ class Runner:
     Attributes:
         folder: where everything goes; one folder for each section.
         commands: what the present section ran, or had run before.
+        chosen: the training seeds that are made; None for all.
+        kept: folder of what was measured of each training seed.
 
     Args:
         folder: where everything goes.
         is_short: a short run, whose numbers are not to be quoted.
         stopped: once it is set, no further command is begun.
+        chosen: as above.
+        kept: as above; one in `folder` if nothing.
     """
 
-    def __init__(self, folder: Path, *, is_short: bool, stopped: Event | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        is_short: bool,
+        stopped: Event | None = None,
+        chosen: Sequence[int] | None = None,
+        kept: Path | None = None,
+    ) -> None:
         self.folder, self.is_short, self._stopped = folder, is_short, stopped
+        self.chosen, self.kept = chosen, folder / "trainings" if kept is None else kept
         self.commands: list[Ran] = []
 
     def size(self, full: int, short: int) -> int:
         """Return how much of something there is to be: in a full run, or in a short one."""
         return short if self.is_short else full
-
-    def seeds(self, seeds: Sequence[int]) -> Sequence[int]:
-        """Return the training seeds: of a short run only the first."""
-        return seeds[:1] if self.is_short else seeds
 
     def path(self, *parts: str) -> Path:
         """Return a path in the folder, relative to the repository if it lies there; its parent exists."""

@@ -1,5 +1,6 @@
 """What a section of the results consists of: commands, numbers with their goals, and an image or two."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -72,12 +73,17 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
 
 
 def over_seeds(rates: Sequence[float]) -> str:
-    """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds."""
+    """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds.
+
+    Where all are the same, or there is one, there is no interval.
+    """
     one = statistics.mean(rates, within=(0.0, 1.0))
-    low, high = max(0.0, one.low), min(1.0, one.high)
-    return f"{one.value:.1%} ({low:.1%} to {high:.1%}); {', '.join(f'{rate:.1%}' for rate in rates)}"
+    interval = "" if math.isnan(one.low) else f" ({max(0.0, one.low):.1%} to {min(1.0, one.high):.1%})"
+    return f"{one.value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
 
 
 def mean(estimate: Mapping[str, float], sign: str = "") -> str:
-    """Return a mean, a difference (with ``sign`` "+") or a ratio, with its interval."""
+    """Return a mean, a difference (with ``sign`` "+") or a ratio, with its interval if it has one."""
+    if math.isnan(estimate["low"]):
+        return f"{estimate['value']:{sign}.3f} (no interval: all values are the same, or there is one)"
     return f"{estimate['value']:{sign}.3f} ({estimate['low']:{sign}.3f} to {estimate['high']:{sign}.3f})"

@@ -1,16 +1,17 @@
 """The section about seeing: an instruction carried out with nothing but the scene camera, from three training seeds."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.results.learning import aggregation, record, seeds_row, success_row, train
+from benchmarks.results.learning import aggregation, record, seeds_row, success_row, summary, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
+from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.errors import counted
 
-EPISODES, SEEDS = 500, (0, 1, 2)
+EPISODES = 500
 _ANY = "--task.language=any"
 _VARIED = "--task.randomisation.enabled=true"
 # Name, options of the task, and the success that is to be reached with 95 % confidence.
@@ -26,123 +27,152 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
 _PIXELS_GOAL, _ROUNDS = 0.6, 2
 _FEW = ("--steps=300", "--eval_steps=300")
 _OTHERS = ("act", "diffusion")
+_SENSES = {"deaf": "instruction", "blind": "images"}
 _BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
 
 
 def see(run: Runner, section: Section) -> None:
     """Learn to see tables, and pick what an instruction names from what is seen."""
-    record_tables(run)
-    seeds = run.seeds(SEEDS)
-    for seed in seeds:
+    recorded = record_tables(run)
+
+    def learn(seed: int) -> dict[str, Any]:
+        seconds, name = train_perception(run, seed), f"seed_{seed}"
+        brain = (f"--brains.{name}.type=language", f"--brains.{name}.perception.path={_path(run, seed)}")
+        look = _evaluate(run, f"see_eval/{name}/look", "ur5_look", brain, (), names=(name,))
+        worlds = _in_worlds(run, "see_eval", "ur5_pick", brain, name)
+        return {"look": look["brains"][name]["perception"], "worlds": worlds, "seconds": recorded + seconds}
+
+    def others(seed: int) -> dict[str, Any]:
         train_perception(run, seed)
-    looks = _evaluate(run, "see_look", "ur5_look", _seeing(run), ())
-    for name in _names(run):
-        _perceived(section, name, looks["brains"][name]["perception"])
-    for number, (what, options, goal) in _worlds(run):
-        results = _evaluate(run, f"see_{number}", "ur5_pick", _seeing(run), options)
-        for name in _names(run):
-            row, low = success_row(results, name), results["brains"][name]["success"]["low"]
-            words = "" if goal is None else f"lower end at least {goal:.0%}"
-            section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
-        section.rows.append(seeds_row(results, _names(run), what))
-    blanked = []
-    for name, sense in (("deaf", "instruction"), ("blind", "images")):
-        inner = (f"--brains.{name}.brain.type=language", f"--brains.{name}.brain.perception.path={_path(run, 0)}")
-        blanked += [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true", *inner]
-    results = _evaluate(run, "see_blanked", "ur5_pick", blanked, (_ANY,), names=("deaf", "blind"), episodes=_BLANKED)
-    section.rows += [success_row(results, name) for name in ("deaf", "blind")]
-    section.rows.append(
-        Row("time from nothing to the first seed", f"{sum(one.seconds for one in run.commands[:2]):.0f} s")
-    )
+        inner = {"type": "language", "perception.path": _path(run, seed)}
+        return _blanked(run, "see_eval/others", "ur5_pick", inner)
+
+    made = each(run, section, "see", SEEDS, learn)
+    beside = each(run, section, "see_others", SEEDS[:1], others)
+    for seed, results in made.items():
+        _perceived(section, f"seed_{seed}", results["look"])
+    _rows(run, section, made, [goal for _, _, goal in WORLDS])
+    section.rows += [success_row(one, name) for one in beside.values() for name in _SENSES]
+    section.rows += [
+        Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
+    ]
     section.remarks.append(
-        f"{counted(len(seeds), 'seed')} of the training. The brain `language` sees with the checkpoint and gets "
+        "Each seed is one of the training. The brain `language` sees with the checkpoint and gets "
         "nothing else of the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind "
         "one black images: both refuse, and say why. What was learned from has no object of the style of those that "
         "it has not seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
     )
 
 
-def record_tables(run: Runner) -> None:
-    """Record the tables that are learned to be seen."""
-    record(run, "see_record", "ur5_look", "see/tables", episodes=run.size(12_000, 800), options=("--seed=11",))
+def record_tables(run: Runner) -> float:
+    """Record the tables that are learned to be seen; return how long that took [s]."""
+    episodes = run.size(12_000, 800)
+    return record(run, "see_record", "ur5_look", "see/tables", episodes=episodes, options=("--seed=11",))
 
 
-def train_perception(run: Runner, seed: int) -> str:
-    """Train a perception on them; return its folder."""
-    options = (f"--seed={seed}",)
-    train(run, f"see_train_{seed}", "perception_ur5", _folder(seed), "see/tables", options=options, short=_FEW)
-    return _folder(seed)
+def train_perception(run: Runner, seed: int) -> float:
+    """Train a perception on them; return how long that took [s]."""
+    name, options = f"see_train_{seed}", (f"--seed={seed}",)
+    return train(run, name, "perception_ur5", perception_folder(seed), "see/tables", options=options, short=_FEW)
 
 
 def pixels(run: Runner, section: Section) -> None:
     """Learn to pick what an instruction names from images, end to end."""
     size = ("--robot.camera_width=160", "--robot.camera_height=120")
-    record(
-        run, "pixels_tables", "ur5_look", "pixels/tables", episodes=run.size(12_000, 800), options=("--seed=11", *size)
-    )
+    tables, options = run.size(12_000, 800), ("--seed=11", *size)
+    recorded = record(run, "pixels_tables", "ur5_look", "pixels/tables", episodes=tables, options=options)
     # Of these only the first frame: what is meant is learned from many tables, and picking from fewer.
     firsts, options = "pixels/firsts", ("--seed=500", "--task.duration_s=0.1")
-    record(run, "pixels_firsts", "ur5_pick_pixels", firsts, episodes=run.size(6_000, 400), options=options)
-    last, folders = run.size(_ROUNDS, 1), {}
-    for seed in run.seeds(SEEDS):
-        eyes, folder = f"pixels/perception_{seed}", f"pixels/seed_{seed}"
+    recorded += record(run, "pixels_firsts", "ur5_pick_pixels", firsts, episodes=run.size(6_000, 400), options=options)
+
+    def end_to_end(seed: int) -> tuple[str, float]:
+        eyes = f"pixels/eyes/seed_{seed}"
         options = (f"--seed={seed}", "--steps=6000")
-        train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
-        name, config, learn = f"pixels_train_{seed}", "dagger_ur5_pixels", [f"--policy.perception={run.path(eyes)}"]
-        folders[f"seed_{seed}"], _ = aggregation(
+        seeing = train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
+        policy, seconds = aggregation(
             run,
-            name,
-            config,
-            folder,
+            f"pixels_train_{seed}",
+            "dagger_ur5_pixels",
+            f"pixels/seed_{seed}",
             seed=seed,
             rounds=_ROUNDS,
             short=(60, 30, 8),
             steps=800,
-            policy=learn,
+            policy=[f"--policy.perception={run.path(eyes)}"],
             data=[str(run.path(firsts))],
         )
-    seconds = sum(one.seconds for one in run.commands[:4])
-    brains = [
-        option
-        for name, folder in folders.items()
-        for option in (f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}")
-    ]
-    for number, (what, options, _) in _worlds(run):
-        results = _evaluate(run, f"pixels_{number}", "ur5_pick_pixels", brains, options)
-        goal = _PIXELS_GOAL if number == 0 else None
-        for name in _names(run):
-            row, low = success_row(results, name), results["brains"][name]["success"]["low"]
-            words = "" if goal is None else f"lower end at least {goal:.0%}"
-            section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
-        section.rows.append(seeds_row(results, _names(run), what))
-    others, picks = [], f"pixels/seed_{SEEDS[0]}/round_0/data"
-    for name in _OTHERS:
-        folder = f"pixels/{name}"
-        train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, picks, short=("--steps=4", "--batch_size=8"))
-        others += [f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}"]
-    results = _evaluate(run, "pixels_others", "ur5_pick_pixels", others, (_ANY,), names=_OTHERS, episodes=_BLANKED)
+        return policy, recorded + seeing + seconds
+
+    def learn(seed: int) -> dict[str, Any]:
+        policy, seconds = end_to_end(seed)
+        name = f"seed_{seed}"
+        brain = (f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(policy)}")
+        return {"worlds": _in_worlds(run, "pixels_eval", "ur5_pick_pixels", brain, name), "seconds": seconds}
+
+    def others(seed: int) -> dict[str, Any]:
+        policy, _ = end_to_end(seed)
+        brains, picks = [], f"pixels/seed_{seed}/round_0/data"
+        for name in _OTHERS:
+            folder = f"pixels/{name}"
+            train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, picks, short=("--steps=4", "--batch_size=8"))
+            brains += [f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}"]
+        results = _evaluate(
+            run, "pixels_eval/others", "ur5_pick_pixels", brains, (_ANY,), names=_OTHERS, episodes=_BLANKED
+        )
+        inner = {"type": "learned", "path": str(run.path(policy))}
+        return {**_blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner), "others": summary(results, *_OTHERS)}
+
+    made = each(run, section, "pixels", SEEDS, learn)
+    beside = each(run, section, "pixels_others", SEEDS[:1], others)
+    _rows(run, section, made, [_PIXELS_GOAL, *[None] * len(WORLDS[1:])])
+    for one in beside.values():
+        section.rows += [
+            replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}")
+            for row in (success_row(one["others"], name) for name in _OTHERS)
+        ]
+        section.rows += [success_row(one, name) for name in _SENSES]
     section.rows += [
-        replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}")
-        for row in (success_row(results, name) for name in _OTHERS)
+        Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]
-    blanked = []
-    for name, sense in (("deaf", "instruction"), ("blind", "images")):
-        inner = (f"--brains.{name}.brain.type=learned", f"--brains.{name}.brain.path={run.path(folders['seed_0'])}")
-        blanked += [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true", *inner]
-    options = (_ANY,)
-    results = _evaluate(
-        run, "pixels_blanked", "ur5_pick_pixels", blanked, options, names=("deaf", "blind"), episodes=_BLANKED
-    )
-    section.rows += [success_row(results, name) for name in ("deaf", "blind")]
-    section.rows.append(Row("time from nothing to the first seed", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"`bhd_pixels` after {counted(last, 'round')} of aggregation, {counted(len(folders), 'seed')} of recordings "
+        f"`bhd_pixels` after {counted(run.size(_ROUNDS, 1), 'round')} of aggregation; each seed is one of recordings "
         "and trainings: from an episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's "
         "state to tool poses. True poses taught it where to look; none is an input. A deaf policy gets an empty "
         "instruction, a blind one black images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from "
         "nothing, learn from every frame of the rule's episodes; they have no input for words, and can do no better "
         "than to pick any one of the objects."
     )
+
+
+def _in_worlds(run: Runner, output: str, config: str, brain: Sequence[str], name: str) -> dict[str, Any]:
+    """Evaluate a brain in each world; return what `summary` does, by the number of the world."""
+    found = {}
+    for number, (_, options, _) in _worlds(run):
+        results = _evaluate(run, f"{output}/{name}/world_{number}", config, brain, options, names=(name,))
+        found[str(number)] = summary(results, name)
+    return found
+
+
+def _rows(run: Runner, section: Section, made: Mapping[int, Any], goals: Sequence[float | None]) -> None:
+    """Add the rows of each world: of every seed, and of all together."""
+    for number, (what, _, _) in _worlds(run):
+        results = {seed: one["worlds"][str(number)] for seed, one in made.items()}
+        for seed, one in results.items():
+            name, goal = f"seed_{seed}", goals[number]
+            row, low = success_row(one, name), one["brains"][name]["success"]["low"]
+            words = "" if goal is None else f"lower end at least {goal:.0%}"
+            section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
+        section.rows.append(seeds_row(results, what))
+
+
+def _blanked(run: Runner, output: str, config: str, inner: Mapping[str, str]) -> dict[str, Any]:
+    """Evaluate a brain that gets no instruction, or no images."""
+    brains = []
+    for name, sense in _SENSES.items():
+        brains += [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true"]
+        brains += [f"--brains.{name}.brain.{key}={value}" for key, value in inner.items()]
+    results = _evaluate(run, output, config, brains, (_ANY,), names=tuple(_SENSES), episodes=_BLANKED)
+    return summary(results, *_SENSES)
 
 
 def _perceived(section: Section, name: str, saw: Any) -> None:
@@ -157,19 +187,18 @@ def _perceived(section: Section, name: str, saw: Any) -> None:
 
 def _evaluate(
     run: Runner,
-    name: str,
+    output: str,
     config: str,
     brains: Sequence[str],
     options: Sequence[str],
     *,
-    names: Sequence[str] = (),
+    names: Sequence[str],
     episodes: int = EPISODES,
 ) -> Any:
-    only = ",".join(names or _names(run))
     command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
-    command += [f"--only=[{only}]", f"--n_episodes={run.size(episodes, 12)}", "--videos=0"]
-    run.run(name, [*command, f"--output_dir={run.path(name)}"], makes=(name,))
-    return run.read(name, "results.json")
+    command += [f"--only=[{','.join(names)}]", f"--n_episodes={run.size(episodes, 12)}", "--videos=0"]
+    run.run(output, [*command, f"--output_dir={run.path(output)}"], makes=(output,))
+    return run.read(output, "results.json")
 
 
 def _worlds(run: Runner) -> Sequence[tuple[int, tuple[str, tuple[str, ...], float | None]]]:
@@ -178,21 +207,10 @@ def _worlds(run: Runner) -> Sequence[tuple[int, tuple[str, tuple[str, ...], floa
     return [worlds[0], worlds[-1]] if run.is_short else worlds
 
 
-def _names(run: Runner) -> list[str]:
-    return [f"seed_{seed}" for seed in run.seeds(SEEDS)]
-
-
-def _seeing(run: Runner) -> list[str]:
-    return [
-        option
-        for seed, name in zip(run.seeds(SEEDS), _names(run), strict=True)
-        for option in (f"--brains.{name}.type=language", f"--brains.{name}.perception.path={_path(run, seed)}")
-    ]
-
-
 def _path(run: Runner, seed: int) -> str:
-    return str(run.path(_folder(seed)))
+    return str(run.path(perception_folder(seed)))
 
 
-def _folder(seed: int) -> str:
+def perception_folder(seed: int) -> str:
+    """Return where the perception of a training seed is."""
     return f"see/seed_{seed}"

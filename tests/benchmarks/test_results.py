@@ -15,13 +15,14 @@ import pytest
 from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results import __main__ as program
+from benchmarks.results import trainings
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import FailedError, Runner
-from benchmarks.results.section import Row, Section, over_seeds
+from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
 from tests.cases import each_case
 from tests.waiting import until
@@ -105,6 +106,8 @@ def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
 
 def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
     assert over_seeds([0.9, 0.9, 0.9]).startswith("90.0%")
+    assert over_seeds([0.9]) == "90.0%; 90.0%"
+    assert "no interval" in mean({"value": 1.0, "low": math.nan, "high": math.nan})
     low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98]))[1:3])
     assert low < 90
     assert 98 < high <= 100  # three seeds say little
@@ -155,19 +158,61 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
     failures: int, score: float, met: list[bool]
 ) -> None:
     def results(scores: dict[str, float], failed: int = 0) -> dict[str, Any]:
-        episodes = [
-            {"brain": name, "episode": i, "score": value + 0.01 * (-1) ** i}
-            for name, value in scores.items()
-            for i in range(10)
-        ]
         rate = {"value": 0.9, "low": 0.8, "high": 1.0}
         brain = {"episodes": 10, "successes": 10 - failed, "success": rate, "outcomes": {"success": 10 - failed}}
-        return {"episodes": episodes, "brains": dict.fromkeys(scores, brain)}
+        around = {name: [value + 0.01 * (-1) ** i for i in range(10)] for name, value in scores.items()}
+        return {"brains": {name: {**brain, "scores": values} for name, values in around.items()}}
 
-    alone = results({"avoidance": 0.126, "clone_7": 0.2})
-    rows = monitored_rows(alone, results({"clone_7": 0.15, "ppo_7": score}, failures), (7,))
-    assert [row.met for row in rows] == [None, None, *met]
-    assert rows[2].value == str(failures)
+    alone = results({"avoidance": 0.126, "clone": 0.2})
+    rows = monitored_rows(alone, results({"clone": 0.15, "ppo": score}, failures), 7)
+    assert [row.met for row in rows] == [None, None, None, *met]
+    assert [row.what.partition(":")[0] for row in rows[:3]] == [
+        "clone_7",
+        "with the collision monitor, clone_7",
+        "with the collision monitor, ppo_7",
+    ]
+    assert rows[3].value == str(failures)
+
+
+# --- training seeds ---------------------------------------------------------------------------------------------------
+
+
+def test_training_seeds_are_made_in_any_sittings_and_shown_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(trainings, "REPOSITORY", tmp_path)
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs/inner.yaml").write_text("steps: 1")
+    (tmp_path / "configs/outer.yaml").write_text("config: configs/inner.yaml")
+
+    def sitting(*chosen: int, option: str = "", short: bool = False) -> tuple[dict[int, Any], Section, Runner]:
+        section = Section("s", "S")
+        run = Runner(
+            tmp_path / f"sitting_{chosen}{option}{short}", is_short=short, chosen=chosen, kept=tmp_path / "kept"
+        )
+
+        def measure(seed: int) -> dict[str, Any]:
+            run.run(f"train_{seed}", ["python", "-c", f"'configs/outer.yaml {option} --seed={seed} seed_{seed}/x'"])
+            return {"rate": seed / 10, "series": (1.5, None)}
+
+        return trainings.each(run, section, "part", (0, 1, 12), measure), section, run
+
+    made, section, run = sitting(1)
+    assert made == {1: {"rate": 0.1, "series": [1.5, None]}}
+    assert section.remarks == []
+    made, section, run = sitting(0, 12)
+    assert list(made) == [0, 1, 12]
+    assert made[1] == {"rate": 0.1, "series": [1.5, None]}
+    assert [re.findall(r"seed=(\d+)", one.command) for one in run.commands] == [["0"], ["1"], ["12"]]
+    assert len(section.remarks) == 1
+    assert section.remarks[0].startswith("Seed 1 was made on ")
+    # What is short, or was made in another way, is not mixed with what was made before.
+    assert list(sitting(0, 1, 12, short=True)[0]) == [0]
+    assert list(sitting(1, option="--steps=2")[0]) == [1]
+    assert "seed 12 was made by another recipe and is left out; make it with --seeds 12" in capsys.readouterr().out
+    assert list(sitting(1)[0]) == [0, 1, 12]
+    (tmp_path / "configs/inner.yaml").write_text("steps: 2")
+    assert list(sitting(12)[0]) == [12]
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------

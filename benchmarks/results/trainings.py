@@ -1,0 +1,109 @@
+"""What is measured of each training seed, in one sitting or in several.
+
+Three trainings of a policy take longer than many a machine is free. With `--seeds 1` one of them is made, and the table
+has it beside those that were made before: what was measured of each lies beside the page, in a file of its own.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.results.provenance import provenance
+from benchmarks.results.runner import REPOSITORY, Ran, Runner
+from benchmarks.results.section import Section
+from bhd_lerobot.datasets.storage.disk import Disk
+
+SEEDS = (0, 1, 2)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What was measured of one training seed.
+
+    Attributes:
+        made: when, where and with what, in words.
+        commands: what was run for it alone.
+        configs: SHA-256 of the configurations that these name, and that those name, by their paths.
+        measured: what the rows need, as JSON has it.
+    """
+
+    made: str
+    commands: list[Ran]
+    configs: dict[str, str]
+    measured: Any
+
+    def is_like(self, other: "Training", own: int, others: int) -> bool:
+        """Whether two trainings, of these seeds, differ in nothing else."""
+        return self.configs == other.configs and _recipe(self.commands, own) == _recipe(other.commands, others)
+
+
+def each(
+    run: Runner, section: Section, name: str, seeds: Sequence[int], measure: Callable[[int], Any]
+) -> dict[int, Any]:
+    """Measure something for each training seed that is asked for; take the others from earlier runs.
+
+    Of a short run only the first seed is made. A seed that was made by another recipe, or never, is left out.
+
+    Args:
+        run: runs the commands, and knows which seeds are asked for.
+        section: is told when the others were made.
+        name: of the files that keep what was measured.
+        seeds: all seeds that there are.
+        measure: runs the commands of a seed and returns what the rows need, which JSON can hold.
+
+    Returns:
+        what was measured, by seed, in the order of the seeds.
+    """
+    trainings, before = {}, len(run.commands)
+    asked = [seed for seed in seeds[: 1 if run.is_short else None] if run.chosen is None or seed in run.chosen]
+    for seed in asked:
+        first = len(run.commands)
+        measured = json.loads(json.dumps(measure(seed)))
+        commands = run.commands[first:]
+        trainings[seed] = Training(provenance(), commands, _digests(commands), measured)
+        if not run.is_short:
+            text = json.dumps(asdict(trainings[seed]), indent=1)
+            run.kept.mkdir(parents=True, exist_ok=True)
+            Disk().publish(run.kept / f"{name}_{seed}.json", text.encode())
+    for seed in () if run.is_short else set(seeds).difference(asked):
+        kept = _read(run.kept / f"{name}_{seed}.json")
+        if kept is None:
+            continue
+        if kept.configs != _digests(kept.commands) or any(not kept.is_like(trainings[one], seed, one) for one in asked):
+            print(f"-- {name}: seed {seed} was made by another recipe and is left out; make it with --seeds {seed}")
+            continue
+        trainings[seed] = kept
+        remark = f"Seed {seed} was made {kept.made}."
+        section.remarks += () if remark in section.remarks else (remark,)
+    order = sorted(trainings)
+    run.commands[before:] = [command for seed in order for command in trainings[seed].commands]
+    return {seed: trainings[seed].measured for seed in order}
+
+
+def _read(path: Path) -> Training | None:
+    if not path.exists():
+        return None
+    fields = json.loads(path.read_text(encoding="utf-8"))
+    return Training(**fields | {"commands": [Ran(**one) for one in fields["commands"]]})
+
+
+def _recipe(commands: Sequence[Ran], seed: int) -> list[str]:
+    """Return commands without what tells one seed from another."""
+    return [re.sub(rf"\b(seed[_=]){seed}\b", r"\1N", one.command) for one in commands]
+
+
+def _digests(commands: Sequence[Ran]) -> dict[str, str]:
+    """Return the SHA-256 of every configuration that is named in commands or in such a configuration."""
+    found: dict[str, str] = {}
+    texts = [one.command for one in commands]
+    while texts:
+        for path in re.findall(r"configs/[\w/]+\.yaml", texts.pop()):
+            if path not in found:
+                content = (REPOSITORY / path).read_bytes() if (REPOSITORY / path).exists() else b""
+                found[path] = hashlib.sha256(content).hexdigest()
+                texts.append(content.decode())
+    return found
