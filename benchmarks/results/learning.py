@@ -262,7 +262,7 @@ def aggregation(
         command.append(f"--data=[{', '.join(data)}]")
     if policy:
         command.append(f"--policy.options=[{', '.join(policy)}]")
-    ran = run.run(name, [*command, f"--output_dir={run.path(output)}"])
+    ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
     return f"{output}/round_{rounds}/policy", ran.seconds
 
 

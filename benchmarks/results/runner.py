@@ -2,13 +2,14 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -37,18 +38,21 @@ class Ran:
         seconds: how long it took [s].
         status: its exit status.
         cpu_seconds: processor time, of all its processes and threads together [s].
+        makes: what it made, as commands name it.
     """
 
     command: str
     seconds: float
     status: int
     cpu_seconds: float = 0.0
+    makes: list[str] = field(default_factory=list)
 
 
 class Runner:
     """Runs commands in the repository and keeps a note of each that succeeded.
 
     A command that a note in the folder tells of is not run again: a run of hours that was stopped goes on where it was.
+    It is run again if what it reads was made anew since.
 
     Attributes:
         folder: where everything goes; one folder for each section.
@@ -88,7 +92,13 @@ class Runner:
         return path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path
 
     def run(
-        self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,), *, makes: Sequence[str] = ()
+        self,
+        name: str,
+        arguments: Sequence[str],
+        allowed: Sequence[int] = (0,),
+        *,
+        makes: Sequence[str] = (),
+        resumes: Sequence[str] = (),
     ) -> Ran:
         """Run a command, or find that it was run.
 
@@ -98,6 +108,7 @@ class Runner:
             allowed: exit statuses that are no failure.
             makes: paths in the folder of what it makes and would not make anew; what is left there of a run that was
                 stopped, or of another command, is removed.
+            resumes: likewise of what it goes on with if it was stopped; removed only if what it reads was made anew.
 
         Raises:
             FailedError: it failed; the message names its log.
@@ -106,14 +117,15 @@ class Runner:
         if self._stopped is not None and self._stopped.is_set():
             raise FailedError(f"{command}\nwas not begun: the run was stopped.")
         note = REPOSITORY / self.path("notes", f"{name}.json")
-        if note.exists():
-            kept = Ran(**json.loads(note.read_text(encoding="utf-8")))
+        is_outdated = note.exists() and self._is_outdated(note)
+        if note.exists() and not is_outdated:
+            kept = _read(note)
             if kept.command == command:
                 print(f"== {command}\n-- {name}: was run before, {kept.seconds:.0f} s", flush=True)
                 self.commands.append(kept)
                 return kept
         note.unlink(missing_ok=True)  # it tells of what is about to be made anew
-        for made in makes:
+        for made in (*makes, *(resumes if is_outdated else ())):
             if (left := REPOSITORY / self.path(made)).exists():
                 shutil.rmtree(left)
         log = note.with_suffix(".log")
@@ -124,7 +136,8 @@ class Runner:
             # Its own processor time, and that of the processes that it waited for: others may run beside it.
             _, ended, used = os.wait4(process.pid, 0)
         status = process.returncode = os.waitstatus_to_exitcode(ended)
-        ran = Ran(command, time.perf_counter() - started, status, used.ru_utime + used.ru_stime)
+        made = [str(self.path(one)) for one in (*makes, *resumes)]
+        ran = Ran(command, time.perf_counter() - started, status, used.ru_utime + used.ru_stime, made)
         if status not in allowed:
             tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
             raise FailedError(f"{command}\nended with status {status}. The end of {log}:\n{tail}")
@@ -133,9 +146,19 @@ class Runner:
         self.commands.append(ran)
         return ran
 
+    def _is_outdated(self, note: Path) -> bool:
+        """Whether something that the command of a note names was made after it had ended."""
+        command, ended = _read(note).command, note.stat().st_mtime_ns
+        newer = (one for one in (REPOSITORY / self.path("notes")).rglob("*.json") if one.stat().st_mtime_ns > ended)
+        return any(re.search(rf"{re.escape(path)}(?![\w-])", command) for one in newer for path in _read(one).makes)
+
     def read(self, *parts: str) -> Any:
         """Return what a JSON file in the folder holds."""
         return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
+
+
+def _read(note: Path) -> Ran:
+    return Ran(**json.loads(note.read_text(encoding="utf-8")))
 
 
 def _executable(arguments: Sequence[str]) -> list[str]:

@@ -247,6 +247,40 @@ def test_what_a_stopped_command_left_is_in_nobodys_way(tmp_path: Path) -> None:
     assert not list((tmp_path / "made").iterdir())
 
 
+def test_what_reads_something_that_was_made_anew_is_made_anew(tmp_path: Path) -> None:
+    def script(text: str, *paths: Path) -> list[str]:
+        return ["python", "-c", text, *map(str, paths)]
+
+    write = "import sys, pathlib as p; d = p.Path(sys.argv[1]); d.mkdir(exist_ok=True); (d / 'x').write_text({!r})"
+    copy = (
+        "import sys, pathlib as p; d = p.Path(sys.argv[2]); d.mkdir(exist_ok=True); "
+        "(d / 'x').write_text((p.Path(sys.argv[1]) / 'x').read_text()); (d / 'times').open('a').write('1')"
+    )
+
+    def make(text: str) -> tuple[str, str]:
+        run = Runner(tmp_path, is_short=True)  # as in another sitting
+        run.run("data", script(write.format(text), tmp_path / "data"), makes=("data",))
+        run.run("other", script(write.format("o"), tmp_path / "data-2"), makes=("data-2",))
+        run.run("read", script(copy, tmp_path / "data", tmp_path / "read"), resumes=("read",))
+        run.run("last", script(copy, tmp_path / "read", tmp_path / "last"), makes=("last",))
+        return tuple((tmp_path / "last" / name).read_text() for name in ("x", "times"))
+
+    assert make("a") == ("a", "1")
+    ended = {path: path.stat().st_mtime_ns for path in (tmp_path / "notes").iterdir()}
+    assert make("a") == ("a", "1")
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "notes").iterdir()} == ended
+    # Stopped after the data were made: the next sitting knows.
+    run = Runner(tmp_path, is_short=True)
+    run.run("data", script(write.format("b"), tmp_path / "data"), makes=("data",))
+    assert make("b") == ("b", "1")
+    assert (tmp_path / "read" / "times").read_text() == "1"
+    # What is called much the same is something else.
+    (tmp_path / "notes" / "other.json").unlink()
+    ended = {name: (tmp_path / "notes" / f"{name}.json").stat().st_mtime_ns for name in ("read", "last")}
+    make("b")
+    assert {name: (tmp_path / "notes" / f"{name}.json").stat().st_mtime_ns for name in ended} == ended
+
+
 def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
