@@ -1,5 +1,6 @@
 """The sections about fine-tuning: how much of what a shifted world costs do a few episodes of it bring back?"""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -125,7 +126,7 @@ def _recovery_rows(results: Any, seed: int, shown: str, shifted: str, goal: floa
         *rows,
         Row(
             f"seed {seed}: recovered by {shown}, share of what was lost",
-            f"{share:.0%} ({low:.0%} to {high:.0%})",
+            "not defined: nothing was lost" if math.isnan(share) else f"{share:.0%} ({low:.0%} to {high:.0%})",
             f"at least {goal:.0%}",
             share >= goal,
         ),

@@ -82,8 +82,10 @@ def over_seeds(rates: Sequence[float]) -> str:
     return f"{one.value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
 
 
-def mean(estimate: Mapping[str, float], sign: str = "") -> str:
+def mean(estimate: Mapping[str, float | None], sign: str = "") -> str:
     """Return a mean, a difference (with ``sign`` "+") or a ratio, with its interval if it has one."""
-    if math.isnan(estimate["low"]):
+    if estimate["value"] is None:
+        return "–"
+    if estimate["low"] is None or math.isnan(estimate["low"]):
         return f"{estimate['value']:{sign}.3f} (no interval: all values are the same, or there is one)"
     return f"{estimate['value']:{sign}.3f} ({estimate['low']:{sign}.3f} to {estimate['high']:{sign}.3f})"

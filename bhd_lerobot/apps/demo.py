@@ -189,13 +189,14 @@ REACH = Lesson(
     policy=(
         "--policy.chunk_size=16",
         "--policy.n_action_steps=8",
-        "--policy.hidden_dims=[512,512,512]",
+        "--policy.hidden_dims=[256,256,256]",
         "--policy.activation=gelu",
+        "--policy.optimizer_lr=2e-3",
         "--selection.outcome=[success]",
     ),
-    steps=2500,
+    steps=1500,
     # `random` and `noop` drive joints, not tool poses.
-    early_steps=500,
+    early_steps=300,
     score="share of the way to the target that was covered",
     recipe="configs/train/bc_ur5_reach.yaml",
 )

@@ -3,9 +3,11 @@
 import json
 import math
 import re
+import shlex
 import signal
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,9 +23,12 @@ from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
-from benchmarks.results.runner import FailedError, Runner
+from benchmarks.results.runner import FailedError, Ran, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
 from tests.cases import each_case
 from tests.waiting import until
 
@@ -107,7 +112,9 @@ def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
 def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
     assert over_seeds([0.9, 0.9, 0.9]).startswith("90.0%")
     assert over_seeds([0.9]) == "90.0%; 90.0%"
-    assert "no interval" in mean({"value": 1.0, "low": math.nan, "high": math.nan})
+    for nothing in (math.nan, None):
+        assert "1.000 (no interval" in mean({"value": 1.0, "low": nothing, "high": nothing})
+    assert mean({"value": None, "low": None, "high": None}) == "–"
     low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98]))[1:3])
     assert low < 90
     assert 98 < high <= 100  # three seeds say little
@@ -172,6 +179,74 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
         "with the collision monitor, ppo_7",
     ]
     assert rows[3].value == str(failures)
+
+
+# --- sections ---------------------------------------------------------------------------------------------------------
+
+
+class Pretended(Runner):
+    """Reads the options of every command, and makes up what it would have written."""
+
+    def run(self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,), **_: Any) -> Ran:
+        program, *options = arguments
+        if program == "bhd-record":
+            parse(RecordConfig, options)
+        elif program == "bhd-eval":
+            self._results[name] = self._evaluated(parse(EvalConfig, options))
+        elif program == "bhd-train":
+            values = {one.partition("=")[0] for one in options}
+            assert "--output_dir" in values
+            assert Path(options[0].partition("=")[2]).is_file()
+        self.commands.append(Ran(shlex.join(arguments), 12.0, 0, 10.0))
+        return self.commands[-1]
+
+    def read(self, *parts: str) -> Any:
+        return self._results["/".join(parts[:-1])]
+
+    _results: dict[str, Any]
+
+    @staticmethod
+    def _evaluated(config: EvalConfig) -> dict[str, Any]:
+        names = config.only or list(config.brains)
+        assert set(names) <= set(config.brains)
+        rng, episodes, brains = np.random.default_rng(len(names)), [], {}
+        for name in names:
+            good = rng.random(config.n_episodes) < 0.9
+            episodes += [
+                {"brain": name, "episode": i, "success": bool(one), "score": float(0.1 + rng.random())}
+                for i, one in enumerate(good)
+            ]
+            lost = int((~good).sum())
+            rate = {"value": float(good.mean()), "low": 0.8, "high": 0.99}
+            saw = {"episodes": config.n_episodes, "error_m": [0.002, 0.005, None], "wrong": rate, "in_90": rate}
+            brains[name] = {
+                **{"episodes": config.n_episodes, "successes": config.n_episodes - lost, "success": rate},
+                **{"outcomes": {"success": config.n_episodes - lost, "timeout": lost}, "perception": saw},
+                **{"means": {"score": {"value": 0.6, "low": None, "high": None}}},
+            }
+        return {"brains": brains, "episodes": episodes}
+
+
+@pytest.mark.parametrize("is_short", [False, True])
+def test_every_section_fills_its_table_from_what_its_commands_write(tmp_path: Path, is_short: bool) -> None:
+    for name, title, measure in MEASURES:
+        if name in {"navigate", "speed"}:  # benchmarks with files of their own
+            continue
+        sittings = (None,) if is_short else ((1,), (0, 2), None)
+        for chosen in sittings:
+            section, run = Section(name, title), Pretended(tmp_path, is_short=is_short, chosen=chosen)
+            run._results = {}
+            measure(run, section)
+            text = "\n".join(section.markdown())
+            assert "nan" not in text, name
+            assert section.rows, name
+            assert len({row.what for row in section.rows}) == len(section.rows), name
+            commands = [one.command for one in run.commands]
+            made = {int(seed) for command in commands for seed in re.findall(r"--seed=([012])\b", command)}
+            wanted = {0} if is_short else ({1} if chosen == (1,) else {0, 1, 2})
+            assert made == wanted, (name, chosen, made)
+            outputs = [one for command in set(commands) for one in re.findall(r"--output_dir=(\S+)", command)]
+            assert len(outputs) == len(set(outputs)), name
 
 
 # --- training seeds ---------------------------------------------------------------------------------------------------
