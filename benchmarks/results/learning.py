@@ -262,8 +262,9 @@ def aggregation(
         command.append(f"--data=[{', '.join(data)}]")
     if policy:
         command.append(f"--policy.options=[{', '.join(policy)}]")
-    ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
-    return f"{output}/round_{rounds}/policy", ran.seconds
+    run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
+    # Of all rounds, also of those that an earlier command made before it was stopped.
+    return f"{output}/round_{rounds}/policy", float(run.read(output, "rounds.json")["rounds"][-1]["seconds"])
 
 
 def evaluate(

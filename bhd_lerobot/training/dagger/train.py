@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -120,16 +121,24 @@ class _Rounds:
         self._config, self._stages, self._folder, self._console = config, stages, folder, console
         self._rows: list[dict[str, Any]] = []
         self._expert: dict[str, Any] = {}
+        self._seconds = 0.0
 
     def go(self, number: int) -> None:
         """Do what is not done yet of a round."""
         folder = self._folder / f"round_{number}"
-        done = self._done(folder)
+        done, seconds = self._done(folder)
         for name, step in (("record", self._record), ("train", self._train), ("evaluate", self._evaluate)):
-            if name not in done:
+            if name in done:
+                continue
+            started = time.perf_counter()
+            try:
                 step(number, folder)
                 done.append(name)
-                Disk().publish(folder / _DONE, json.dumps(done).encode())
+            finally:
+                # What took time counts, even if it was stopped and is done again.
+                seconds += time.perf_counter() - started
+                Disk().publish(folder / _DONE, json.dumps({"done": done, "seconds": seconds}).encode())
+        self._seconds += seconds
         self._rows.append(self._row(number, folder))
         rows = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": self._rows}
         Disk().publish(self._folder / ROUNDS, (json.dumps(rows, indent=2) + "\n").encode())
@@ -138,14 +147,14 @@ class _Rounds:
     def conclude(self) -> None:
         """Show the rounds, and how to judge the last policy."""
         table = Table(title=None, box=None, pad_edge=False)
-        for column in ("round", "episodes", "expert drove", "success, 95 %", "score, 95 %"):
+        for column in ("round", "episodes", "expert drove", "success, 95 %", "score, 95 %", "time so far"):
             table.add_column(column)
         for row in self._rows:
             share = "all" if row["expert_share"] is None else f"{row['expert_share']:.1%}"
-            table.add_row(
-                str(row["round"]), str(row["episodes"]), share, _interval(row["success"]), _interval(row["score"])
-            )
-        table.add_row("", "", self._stages.expert, _interval(self._expert["success"]), _interval(self._expert["score"]))
+            level = _interval(row["success"]), _interval(row["score"])
+            table.add_row(str(row["round"]), str(row["episodes"]), share, *level, f"{row['seconds'] / 60:.1f} min")
+        level = _interval(self._expert["success"]), _interval(self._expert["score"])
+        table.add_row("", "", self._stages.expert, *level, "")
         self._console.print(table)
         policy = self._policy(self._config.rounds)
         evaluation = " ".join([self._config.evaluation.config, *self._config.evaluation.options])
@@ -251,12 +260,16 @@ class _Rounds:
     # --- results -----------------------------------------------------------------------------------------------------
 
     @staticmethod
-    def _done(folder: Path) -> list[str]:
+    def _done(folder: Path) -> tuple[list[str], float]:
+        """Return which steps of a round are done, and how long it took so far [s]."""
         folder.mkdir(exist_ok=True)
         file = folder / _DONE
+        values: dict[str, Any] = {"done": [], "seconds": 0.0}
         try:
-            return list(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
-        except (ValueError, TypeError) as error:
+            if file.exists():
+                values = json.loads(file.read_text(encoding="utf-8"))
+            return list(values["done"]), float(values["seconds"])
+        except (ValueError, TypeError, KeyError) as error:
             raise BhdError(
                 f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is done anew."
             ) from error
@@ -274,6 +287,7 @@ class _Rounds:
             "episodes": before["episodes"] + len(summary.episodes),
             "frames": before["frames"] + summary.frames,
             "expert_share": share,
+            "seconds": self._seconds,
             **_level(results["policy"]),
         }
 

@@ -72,6 +72,9 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert [name for name, _ in called] == ["bhd-record", "bhd-train", "bhd-eval", "bhd-record", "bhd-train"]
     assert "the same command goes on there" in " ".join(capsys.readouterr().err.split())
     assert [row["round"] for row in results(tmp_path)["rounds"]] == [0]
+    # The time of what was stopped counts.
+    spent = [json.loads((tmp_path / "run" / f"round_{one}" / "done.json").read_text())["seconds"] for one in (0, 1)]
+    assert results(tmp_path)["rounds"][0]["seconds"] == spent[0]
     called.clear()
     assert main([argument]) == 0
     assert [name for name, _ in called] == ["bhd-train", "bhd-eval"]
@@ -91,6 +94,8 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert found["expert"]["type"] == "gap_follower"
     assert [row["episodes"] for row in found["rounds"]] == [2, 4]
     assert [row["expert_share"] is None for row in found["rounds"]] == [True, False]
+    assert found["rounds"][0]["seconds"] == spent[0]
+    assert found["rounds"][1]["seconds"] > sum(spent) > spent[0] > 0
     for one in (found["expert"], *found["rounds"]):
         assert 0 <= one["success"]["low"] <= one["success"]["value"] <= one["success"]["high"] <= 1
     assert (run / "rounds.png").exists()
@@ -106,6 +111,7 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     kept.write_text(yaml.safe_dump(values))
     assert main([argument]) == 0
     assert called == []
+    assert results(tmp_path) == found
     assert main([argument, "--seed=1"]) == 2
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
 
