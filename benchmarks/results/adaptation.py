@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.learning import (
-    TOOL,
     evaluate,
     reach_folder,
+    reach_numbers,
+    reaching,
     record,
+    record_reach,
     summary,
     train,
     train_reach,
@@ -47,15 +49,13 @@ def fine_tune(run: Runner, section: Section) -> None:
 
     The policy gets the target from that camera. The rule that shows the episodes knows by how much it is off.
     """
-    episodes = run.size(1500, 120)
-    data, held = f"reach/data_{episodes}", "--task.hold_s=1.0"
-    options = (*TOOL, held, "--seed=100")
-    record(run, f"reach_record_{episodes}", "ur5_reach", data, episodes=episodes, options=options)
-    shown, options = "fine_tune/data", (*TOOL, "--seed=7", *SHIFT, held, f"--brain.{_ERROR}")
+    episodes, driving = reach_numbers(run)[-1], reaching(run)
+    record_reach(run, episodes)
+    shown, options = "fine_tune/data", (*driving, "--seed=7", *SHIFT, "--task.hold_s=1.0", f"--brain.{_ERROR}")
     record(run, "fine_tune_record", "ur5_reach", shown, episodes=SHOWN, options=options)
 
     def learn(seed: int) -> dict[str, Any]:
-        train_reach(run, seed, episodes, data)
+        train_reach(run, seed, episodes)
         base, tuned = reach_folder(seed, episodes), f"fine_tune/seed_{seed}"
         start = (f"--fine_tune={run.path(base)}", f"--seed={seed}")
         seconds = train(run, f"fine_tune_train_{seed}", "fine_tune_ur5_reach", tuned, shown, options=start)
@@ -63,7 +63,7 @@ def fine_tune(run: Runner, section: Section) -> None:
         found: dict[str, Any] = {"seconds": seconds}
         for world, shift in ((_ORIGINAL, ()), (_SHIFTED, SHIFT)):
             output = f"fine_tune_eval/seed_{seed}/{'shifted' if shift else 'original'}"
-            results = evaluate(run, output, "ur5_reach", brains, baseline="base", options=(*TOOL, *shift))
+            results = evaluate(run, output, "ur5_reach", brains, baseline="base", options=(*driving, *shift))
             found[world] = {**summary(results, *brains), **_successes(results, brains)}
         return found
 

@@ -16,7 +16,13 @@ from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 _RULE, _TEACHER = "avoidance", "gap_follower"
-_REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (30, 120)
+_REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (60, 240)
+# A short run learns less exactly, and is asked for less.
+_COARSE = ("--task.tolerance_m=0.02", "--task.tolerance_deg=10")
+_FEW_REACH = (
+    *("--steps=1500", "--eval_steps=1500", "--batch_size=256"),
+    *("--policy.hidden_dims=[256,256,256]", "--policy.optimizer_lr=2e-3"),
+)
 _FEW = ("--steps=800", "--eval_steps=800")
 # Too few to learn anything by: they show that the commands work.
 FEW_PPO = (
@@ -133,25 +139,15 @@ def _score_row(results: Any, name: str, shown: str) -> Row:
 
 def reach(run: Runner, section: Section) -> None:
     """Cloning a rule on the reach task, from few to many episodes."""
-    options = (*TOOL, "--task.hold_s=1.0", "--seed=100")
-    recorded, numbers = {}, _FEW_EPISODES if run.is_short else _REACH_EPISODES
-    for episodes in numbers:
-        recorded[episodes] = record(
-            run,
-            f"reach_record_{episodes}",
-            "ur5_reach",
-            f"reach/data_{episodes}",
-            episodes=episodes,
-            options=options,
-        )
+    numbers = reach_numbers(run)
+    recorded = {episodes: record_reach(run, episodes) for episodes in numbers}
 
     def learn(seed: int) -> dict[str, Any]:
-        seconds = {
-            f"bc_{episodes}": recorded[episodes] + train_reach(run, seed, episodes, f"reach/data_{episodes}")
-            for episodes in numbers
-        }
+        seconds = {f"bc_{episodes}": recorded[episodes] + train_reach(run, seed, episodes) for episodes in numbers}
         folders = {f"bc_{episodes}": reach_folder(seed, episodes) for episodes in numbers}
-        results = evaluate(run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=TOOL)
+        results = evaluate(
+            run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run)
+        )
         return {**summary(results, "reach", *folders), "seconds": seconds}
 
     made = each(run, section, "reach", SEEDS, learn)
@@ -175,10 +171,27 @@ def reach_folder(seed: int, episodes: int) -> str:
     return f"reach/seed_{seed}/bc_{episodes}"
 
 
-def train_reach(run: Runner, seed: int, episodes: int, data: str) -> float:
-    """Clone the rule of the reach task; return how long the training took [s]."""
-    name, own = f"reach_bc_{episodes}_{seed}", (f"--seed={seed}",)
-    return train(run, name, "bc_ur5_reach", reach_folder(seed, episodes), data, options=own, short=_FEW)
+def reach_numbers(run: Runner) -> Sequence[int]:
+    """Return from how many episodes it is learned to reach; the last number is the recipe's."""
+    return _FEW_EPISODES if run.is_short else _REACH_EPISODES
+
+
+def reaching(run: Runner) -> tuple[str, ...]:
+    """Return the options of episodes of the reach task."""
+    return *TOOL, *(_COARSE if run.is_short else ())
+
+
+def record_reach(run: Runner, episodes: int) -> float:
+    """Record episodes of the rule of the reach task; return how long that took [s]."""
+    options = (*reaching(run), "--task.hold_s=1.0", "--seed=100")
+    name, data = f"reach_record_{episodes}", f"reach/data_{episodes}"
+    return record(run, name, "ur5_reach", data, episodes=episodes, options=options)
+
+
+def train_reach(run: Runner, seed: int, episodes: int) -> float:
+    """Clone that rule from them; return how long the training took [s]."""
+    name, own, data = f"reach_bc_{episodes}_{seed}", (f"--seed={seed}",), f"reach/data_{episodes}"
+    return train(run, name, "bc_ur5_reach", reach_folder(seed, episodes), data, options=own, short=_FEW_REACH)
 
 
 def roaming(run: Runner) -> tuple[str, ...]:
