@@ -13,7 +13,7 @@ from bhd_lerobot.evaluation.statistics import mean_difference
 EPISODES, ROUNDS = 500, 2
 _SHORT, _STEPS = (24, 12, 8), 400
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
-_RULE = "avoidance"
+_RULE, _TEACHER = "avoidance", "gap_follower"
 _BLANKED = 100  # episodes of the driver that is blind
 
 
@@ -21,24 +21,21 @@ def camera_drive(run: Runner, section: Section) -> None:
     """Let a rule that reads the lidar correct a driver that sees with a camera."""
 
     def learn(seed: int) -> dict[str, Any]:
-        policy, seconds = learned(run, seed)
-        return {**_evaluate(run, f"seed_{seed}", _brain(run, f"seed_{seed}", policy), EPISODES), "seconds": seconds}
+        (policy, seconds), name = learned(run, seed), f"seed_{seed}"
+        return {**_evaluate(run, name, _brain(run, name, policy), (_RULE, name)), "seconds": seconds}
 
     def others(seed: int) -> dict[str, Any]:
         policy, _ = learned(run, seed)
         inner = _brain(run, "blind.brain", policy)
         blind = ("--brains.blind.type=blanked", "--brains.blind.images=true", *inner)
         clone = _brain(run, "clone", f"{_folder(seed)}/round_0/policy")
-        return {
-            "clone": _evaluate(run, "clone", clone, EPISODES),
-            "gap_follower": _evaluate(run, "gap_follower", (), EPISODES),
-            "blind": _evaluate(run, "blind", blind, _BLANKED),
-        }
+        beside = _evaluate(run, "clone", clone, (_TEACHER, "clone"))
+        return {"brains": beside["brains"] | _evaluate(run, "blind", blind, ("blind",), _BLANKED)["brains"]}
 
     made = each(run, section, "camera_drive", SEEDS, learn)
     beside = each(run, section, "camera_drive_others", SEEDS[:1], others)
     first, *_ = made.values()
-    levels = [(first, _RULE), *((results, name) for one in beside.values() for name, results in one.items())]
+    levels = [(first, _RULE), *((one, name) for one in beside.values() for name in one["brains"])]
     for results, name in (*levels, *((results, f"seed_{seed}") for seed, results in made.items())):
         row, brain = success_row(results, name), results["brains"][name]
         score = Row(f"{name}: mean score", mean(brain["means"]["score"]))
@@ -84,15 +81,15 @@ def learned(run: Runner, seed: int) -> tuple[str, float]:
     )
 
 
-def _evaluate(run: Runner, name: str, brain: Sequence[str], episodes: int) -> dict[str, Any]:
-    """Evaluate a brain beside the rule."""
+def _evaluate(
+    run: Runner, name: str, brain: Sequence[str], names: Sequence[str], episodes: int = EPISODES
+) -> dict[str, Any]:
     output = f"camera_drive_eval/{name}"
     command = ["bhd-eval", "--config_path=configs/eval/turtlebot3_avoid_camera.yaml", *brain]
-    command += [f"--only=[{_RULE},{name}]", f"--baseline={_RULE}", "--videos=0"]
-    command += [f"--n_episodes={run.size(episodes, 8)}", f"--output_dir={run.path(output)}"]
-    command += SHORTER if run.is_short else ()
+    command += [f"--only=[{','.join(names)}]", "--videos=0", f"--n_episodes={run.size(episodes, 8)}"]
+    command += [f"--output_dir={run.path(output)}", *(SHORTER if run.is_short else ())]
     run.run(output, command, makes=(output,))
-    return summary(run.read(output, "results.json"), _RULE, name)
+    return summary(run.read(output, "results.json"), *names)
 
 
 def _brain(run: Runner, name: str, policy: str) -> tuple[str, str]:
