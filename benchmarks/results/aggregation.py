@@ -9,7 +9,7 @@ from benchmarks.results.learning import (
     evaluate,
     roaming,
     scores,
-    seeds_row,
+    seeds_rows,
     success_row,
     summary,
 )
@@ -47,7 +47,7 @@ def aggregate(run: Runner, section: Section) -> None:
         ratio = ratio_of_means(scores(results, name), scores(results, _RULE))
         what = f"{name} / {_RULE}: mean score, paired"
         section.rows.append(Row(what, mean(asdict(ratio)), f"at least {_SCORE_GOAL}", ratio.value >= _SCORE_GOAL))
-    section.rows.append(seeds_row(made))
+    section.rows += seeds_rows(made)
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]

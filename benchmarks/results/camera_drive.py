@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from benchmarks.results.learning import SHORTER, aggregation, scores, seeds_row, success_row, summary
+from benchmarks.results.learning import SHORTER, aggregation, scores, seeds_rows, success_row, summary
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from benchmarks.results.trainings import SEEDS, each
@@ -54,7 +54,7 @@ def camera_drive(run: Runner, section: Section) -> None:
                 more.low > 0,
             ),
         ]
-    section.rows.append(seeds_row(made))
+    section.rows += seeds_rows(made)
     section.rows += [
         Row(
             f"seed_{seed}: time from nothing",

@@ -10,7 +10,6 @@ import yaml
 from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds, rate
 from benchmarks.results.trainings import SEEDS, each
-from bhd_lerobot.errors import counted
 from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
@@ -158,7 +157,7 @@ def reach(run: Runner, section: Section) -> None:
         for seed, results in made.items():
             row = success_row(results, name, goal)
             section.rows.append(replace(row, what=f"seed {seed}, {row.what}"))
-        section.rows.append(seeds_row(made, name, name))
+        section.rows += seeds_rows(made, name, name)
         seconds = ", ".join(f"{results['seconds'][name]:.0f} s" for results in made.values())
         section.rows.append(Row(f"{name}: time from nothing", seconds))
     section.remarks.append(
@@ -344,8 +343,8 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
 
 
-def seeds_row(made: Mapping[int, Any], what: str = "all seeds", name: str = "") -> Row:
-    """Return the row of the mean success of policies that differ in their training seeds only.
+def seeds_rows(made: Mapping[int, Any], what: str = "all seeds", name: str = "") -> list[Row]:
+    """Return the row of the mean success of policies that differ in their training seeds only; none if there is one.
 
     Args:
         made: what `summary` returned, by seed.
@@ -353,4 +352,5 @@ def seeds_row(made: Mapping[int, Any], what: str = "all seeds", name: str = "") 
         name: of the brain in each; ``seed_N`` if nothing.
     """
     rates = [float(results["brains"][name or f"seed_{seed}"]["success"]["value"]) for seed, results in made.items()]
-    return Row(f"{what}: mean success, its interval over {counted(len(rates), 'training')}", over_seeds(rates))
+    what = f"{what}: mean success, its interval over {len(rates)} trainings"
+    return [Row(what, over_seeds(rates))] if len(rates) > 1 else []

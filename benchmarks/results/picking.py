@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from benchmarks.results.learning import TOOL, aggregation, evaluate, seeds_row, success_row, summary
+from benchmarks.results.learning import TOOL, aggregation, evaluate, seeds_rows, success_row, summary
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
 from benchmarks.results.trainings import SEEDS, each
@@ -44,7 +44,7 @@ def pick(run: Runner, section: Section) -> None:
     for seed, results in made.items():
         row, low = success_row(results, f"seed_{seed}"), results["brains"][f"seed_{seed}"]["success"]["low"]
         section.rows.append(Row(row.what, row.value, f"lower end at least {_GOAL:.0%}", low >= _GOAL))
-    section.rows.append(seeds_row(made))
+    section.rows += seeds_rows(made)
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.results.learning import aggregation, record, seeds_row, success_row, summary, train
+from benchmarks.results.learning import aggregation, record, seeds_rows, success_row, summary, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each
@@ -162,7 +162,7 @@ def _rows(run: Runner, section: Section, made: Mapping[int, Any], goals: Sequenc
             row, low = success_row(one, name), one["brains"][name]["success"]["low"]
             words = "" if goal is None else f"lower end at least {goal:.0%}"
             section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
-        section.rows.append(seeds_row(results, what))
+        section.rows += seeds_rows(results, what)
 
 
 def _blanked(run: Runner, output: str, config: str, inner: Mapping[str, str]) -> dict[str, Any]:
