@@ -26,15 +26,10 @@ from benchmarks.results.trainings import SEEDS, each
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
 _RESAMPLES, _SEED = 10_000, 0
-# The camera that locates the target is not where it is taken to be: 18 mm off, the same way in every episode.
-# Nothing else differs.
-_ERROR = "camera_error_m=[0.012,-0.009,0.01]"
-SHIFT = (
-    "--task.randomisation.enabled=true",
-    f"--task.randomisation.{_ERROR}",
-    *(f"--task.randomisation.{name}=0" for name in ("sensor_noise_rad", "latency_s")),
-)
-_ORIGINAL, _SHIFTED, _ELSEWHERE = "as it was", "camera 18 mm off", "camera moved by 3 cm and 5 deg"
+# The camera that locates the target is not where it is taken to be [m]: the same way in every episode. Nothing else
+# differs. In a short run, which asks for less exactness, by twice as much.
+_ERROR = (0.012, -0.009, 0.01)
+_ORIGINAL, _ELSEWHERE = "as it was", "camera moved by 3 cm and 5 deg"
 TABLES, _CAMERA_GOAL = 20, 0.8
 # Light, colours and sizes vary; the camera stands still in all episodes: where it was, or elsewhere.
 _STILL = ("--task.randomisation.enabled=true", *(f"--task.randomisation.camera_{name}=0" for name in ("m", "rad")))
@@ -51,7 +46,14 @@ def fine_tune(run: Runner, section: Section) -> None:
     """
     episodes, driving = reach_numbers(run)[-1], reaching(run)
     record_reach(run, episodes)
-    shown, options = "fine_tune/data", (*driving, "--seed=7", *SHIFT, "--task.hold_s=1.0", f"--brain.{_ERROR}")
+    off = [run.size(1, 2) * one for one in _ERROR]
+    error = f"camera_error_m=[{','.join(f'{one:g}' for one in off)}]"
+    shifted = f"camera {1000 * math.hypot(*off):.0f} mm off"
+    shift = (
+        *("--task.randomisation.enabled=true", f"--task.randomisation.{error}"),
+        *(f"--task.randomisation.{name}=0" for name in ("sensor_noise_rad", "latency_s")),
+    )
+    shown, options = "fine_tune/data", (*driving, "--seed=7", *shift, "--task.hold_s=1.0", f"--brain.{error}")
     record(run, "fine_tune_record", "ur5_reach", shown, episodes=SHOWN, options=options)
 
     def learn(seed: int) -> dict[str, Any]:
@@ -61,15 +63,15 @@ def fine_tune(run: Runner, section: Section) -> None:
         seconds = train(run, f"fine_tune_train_{seed}", "fine_tune_ur5_reach", tuned, shown, options=start)
         brains = {"base": base, "tuned": tuned}
         found: dict[str, Any] = {"seconds": seconds}
-        for world, shift in ((_ORIGINAL, ()), (_SHIFTED, SHIFT)):
-            output = f"fine_tune_eval/seed_{seed}/{'shifted' if shift else 'original'}"
-            results = evaluate(run, output, "ur5_reach", brains, baseline="base", options=(*driving, *shift))
+        for world, more in ((_ORIGINAL, ()), (shifted, shift)):
+            output = f"fine_tune_eval/seed_{seed}/{'shifted' if more else 'original'}"
+            results = evaluate(run, output, "ur5_reach", brains, baseline="base", options=(*driving, *more))
             found[world] = {**summary(results, *brains), **_successes(results, brains)}
         return found
 
     made = each(run, section, "fine_tune", SEEDS, learn)
     for seed, results in made.items():
-        section.rows += _recovery_rows(results, seed, f"{SHOWN} episodes", _SHIFTED, GOAL)
+        section.rows += _recovery_rows(results, seed, f"{SHOWN} episodes", shifted, GOAL)
     section.remarks.append(
         "The share is (tuned, shifted - base, shifted) / (base, original - base, shifted) over the same seeds; its "
         "interval is a bootstrap over them, which draws all three outcomes of a seed together."
