@@ -32,6 +32,7 @@ _LOG_ERROR = (-4.0, 3.0)
 _DISTINCT = 0.025  # [m] what is found nearer to something surer is that
 _TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
 _RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
+_SHADES = 24  # numbers that tell the colour of a cell
 _FITS = 6  # rounds: what is seen depends a little on where the camera is taken to be
 _LEAST_SEEN = 12  # objects; each gives two numbers, and six are to be found from what may in part be wrong
 _OUTPUTS = {
@@ -322,12 +323,11 @@ class PerceptionPolicy(PreTrainedPolicy):
             (batch, h, w) or (batch, h, w, numbers): logits of `presence`, `is_box` and `colour`; `shift`, `log_error`,
             `size` and `yaw` as the loss takes them.
         """
-        features = self.network(image)
-        values = self.network.answer(features).movedim(1, -1).split(list(_OUTPUTS.values()), dim=-1)
-        one = {name for name, width in _OUTPUTS.items() if width == 1}
-        return features, {
-            name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)
-        }
+        features, colour = self.network(image)
+        widths = {name: width for name, width in _OUTPUTS.items() if name != "colour"}
+        values = self.network.answer(features).movedim(1, -1).split(list(widths.values()), dim=-1)
+        answers = {name: part[..., 0] if widths[name] == 1 else part for name, part in zip(widths, values, strict=True)}
+        return features, {**answers, "colour": colour.movedim(1, -1)}
 
     def places(self, answers: Mapping[str, Tensor]) -> Tensor:
         """Return where every cell says that the object near it is, in the base frame [m], shape (batch, h, w, 3)."""
@@ -371,7 +371,7 @@ def _distinct(found: Detections) -> Detections:
 
 
 class _Network(nn.Module):
-    """From an image to features of the cells of a region, shape (batch, channels, h, w), and from those to answers."""
+    """From an image to features of the cells of a region, shape (batch, channels, h, w), and logits of colours."""
 
     _region: Region
     _place: Tensor
@@ -396,7 +396,11 @@ class _Network(nn.Module):
             nn.ReLU(),
         )
         self.to_coarse, self.to_fine = nn.Linear(context, 2 * coarse), nn.Linear(context, 2 * fine)
-        outputs = sum(_OUTPUTS.values())
+        # What colour something has is told by what is seen of it close by, not by the features that tell its kind: a
+        # network that has seen no blue box would else say that what is blue is no box, or what is a box not blue.
+        self.shade, self.to_shade = nn.Conv2d(3, _SHADES, 5, padding=2), nn.Linear(context, 2 * _SHADES)
+        self.colour = nn.Sequential(nn.ReLU(inplace=True), nn.Conv2d(_SHADES, len(COLOURS), 1))
+        outputs = sum(_OUTPUTS.values()) - _OUTPUTS["colour"]
         self.answer = nn.Sequential(nn.Conv2d(fine, 64, 1), nn.ReLU(inplace=True), nn.Conv2d(64, outputs, 1))
 
     def aim(self, region: Region) -> None:
@@ -407,15 +411,17 @@ class _Network(nn.Module):
         place = torch.stack(torch.meshgrid(x, y, indexing="xy"))[None]
         self.register_buffer("_place", place, persistent=False)
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         left, top, right, bottom = self._region
-        whole = self.overview(image)
-        fine = self.stem(image[:, :, top:bottom, left:right])
+        whole, region = self.overview(image), image[:, :, top:bottom, left:right]
+        shade = self.shade(functional.avg_pool2d(region, STRIDE))
+        colour = self.colour(_modulated(shade, self.to_shade(whole.detach())))
+        fine = self.stem(region)
         coarse = self.down(torch.cat([fine, self._place.expand(len(image), -1, -1, -1)], dim=1))
         coarse = self.up(self.middle(_modulated(coarse, self.to_coarse(whole))))
         coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
         joined = self.join(torch.cat([fine, coarse], dim=1))
-        return _modulated(joined, self.to_fine(whole))
+        return _modulated(joined, self.to_fine(whole)), colour
 
 
 def _modulated(values: Tensor, by: Tensor) -> Tensor:

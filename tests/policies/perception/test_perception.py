@@ -241,6 +241,20 @@ def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> No
     assert 0.3 < half.float().mean() < 0.7
 
 
+def test_what_is_learned_of_colours_is_nothing_of_kinds_and_the_other_way_round() -> None:
+    policy, samples = PerceptionPolicy(config()).train(), batch()
+    _, answers = policy.look(samples[IMAGE])
+    moved = {}
+    for name, part in answers.items():
+        grads = torch.autograd.grad(part.sum(), list(policy.parameters()), retain_graph=True, allow_unused=True)
+        named = zip(policy.named_parameters(), grads, strict=True)
+        moved[name] = {one for (one, _), grad in named if grad is not None and grad.abs().sum() > 0}
+    others = set().union(*(moved[name] for name in answers if name != "colour"))
+    assert moved["colour"]
+    assert others
+    assert not moved["colour"] & others
+
+
 # --- a camera that was moved ------------------------------------------------------------------------------------------
 
 MOVED = CameraView((1.24, -0.63, 0.80), (0.42, -0.03, 0.12), SCENE_CAMERA.fovy, 0.04)
