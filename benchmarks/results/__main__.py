@@ -43,8 +43,8 @@ GROUPS: tuple[tuple[tuple[str, str, Measure], ...], ...] = (
     (
         ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
         ("move_camera", "Fine-tune: 20 tables before a camera that was moved", move_camera),
+        ("pixels", "Pick, from pixels: the same end to end", pixels),
     ),
-    (("pixels", "Pick, from pixels: the same end to end", pixels),),
     (("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),),
 )
 LAST = ("speed", "Speed", speed)  # alone, whatever else runs side by side

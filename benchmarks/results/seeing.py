@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.results.learning import aggregation, record, seeds_rows, success_row, summary, train
+from benchmarks.results.learning import record, seeds_rows, success_row, summary, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each
-from bhd_lerobot.errors import counted
 
 EPISODES = 500
 _ANY = "--task.language=any"
@@ -24,7 +23,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("the same scenes, two or more objects", (_ANY, "--task.min_objects=2"), None),
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )
-_PIXELS_GOAL, _ROUNDS = 0.6, 2
+_PIXELS_GOAL = 0.6
 _FEW = ("--steps=300", "--eval_steps=300")
 _OTHERS = ("act", "diffusion")
 _SENSES = {"deaf": "instruction", "blind": "images"}
@@ -78,29 +77,24 @@ def train_perception(run: Runner, seed: int) -> float:
 
 def pixels(run: Runner, section: Section) -> None:
     """Learn to pick what an instruction names from images, end to end."""
-    size = ("--robot.camera_width=160", "--robot.camera_height=120")
-    tables, options = run.size(12_000, 800), ("--seed=11", *size)
-    recorded = record(run, "pixels_tables", "ur5_look", "pixels/tables", episodes=tables, options=options)
-    # Of these only the first frame: what is meant is learned from many tables, and picking from fewer.
-    firsts, options = "pixels/firsts", ("--seed=500", "--task.duration_s=0.1")
-    recorded += record(run, "pixels_firsts", "ur5_pick_pixels", firsts, episodes=run.size(6_000, 400), options=options)
+    recorded = record_tables(run)
+    # Of most only the first frame: what is meant is learned from many tables, and picking from fewer.
+    parts = {
+        "picks": (run.size(800, 60), ("--seed=21",)),
+        "firsts": (run.size(6_000, 400), ("--seed=500", "--task.duration_s=0.1")),
+    }
+    for name, (episodes, options) in parts.items():
+        data = f"pixels/{name}"
+        recorded += record(run, f"pixels_{name}", "ur5_pick_pixels", data, episodes=episodes, options=options)
+    merge = ["bhd-data", "merge", *(str(run.path(f"pixels/{name}")) for name in parts)]
+    merged = run.run("pixels_merge", [*merge, "--output", str(run.path("pixels/all"))], makes=("pixels/all",))
+    recorded += merged.seconds
 
     def end_to_end(seed: int) -> tuple[str, float]:
-        eyes = f"pixels/eyes/seed_{seed}"
-        options = (f"--seed={seed}", "--steps=6000")
-        seeing = train(run, f"pixels_see_{seed}", "perception_ur5", eyes, "pixels/tables", options=options, short=_FEW)
-        policy, seconds = aggregation(
-            run,
-            f"pixels_train_{seed}",
-            "dagger_ur5_pixels",
-            f"pixels/seed_{seed}",
-            seed=seed,
-            rounds=_ROUNDS,
-            short=(60, 30, 8),
-            steps=800,
-            policy=[f"--policy.perception={run.path(eyes)}"],
-            data=[str(run.path(firsts))],
-        )
+        seeing, policy = train_perception(run, seed), f"pixels/seed_{seed}"
+        options = (f"--seed={seed}", f"--policy.perception={run.path(perception_folder(seed))}")
+        name, short = f"pixels_train_{seed}", ("--steps=800", "--eval_steps=800")
+        seconds = train(run, name, "pixels_ur5_pick", policy, "pixels/all", options=options, short=short)
         return policy, recorded + seeing + seconds
 
     def learn(seed: int) -> dict[str, Any]:
@@ -111,16 +105,19 @@ def pixels(run: Runner, section: Section) -> None:
 
     def others(seed: int) -> dict[str, Any]:
         policy, _ = end_to_end(seed)
-        brains, picks = [], f"pixels/seed_{seed}/round_0/data"
+        inner = {"type": "learned", "path": str(run.path(policy))}
+        blanked = _blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner)
+        small = ("--robot.camera_width=160", "--robot.camera_height=120")
+        episodes, options = run.size(800, 60), ("--seed=21", *small)
+        data, brains = "pixels/small", []
+        record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
         for name in _OTHERS:
             folder = f"pixels/{name}"
-            train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, picks, short=("--steps=4", "--batch_size=8"))
+            train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, data, short=("--steps=4", "--batch_size=8"))
             brains += [f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}"]
-        results = _evaluate(
-            run, "pixels_eval/others", "ur5_pick_pixels", brains, (_ANY,), names=_OTHERS, episodes=_BLANKED
-        )
-        inner = {"type": "learned", "path": str(run.path(policy))}
-        return {**_blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner), "others": summary(results, *_OTHERS)}
+        output, options = "pixels_eval/others", (_ANY, *small)
+        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=_OTHERS, episodes=_BLANKED)
+        return {**blanked, "others": summary(results, *_OTHERS)}
 
     made = each(run, section, "pixels", SEEDS, learn)
     beside = each(run, section, "pixels_others", SEEDS[:1], others)
@@ -135,12 +132,12 @@ def pixels(run: Runner, section: Section) -> None:
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]
     section.remarks.append(
-        f"`bhd_pixels` after {counted(run.size(_ROUNDS, 1), 'round')} of aggregation; each seed is one of recordings "
-        "and trainings: from an episode's first image of 160 x 120 pixels, the instruction as bytes and the robot's "
-        "state to tool poses. True poses taught it where to look; none is an input. A deaf policy gets an empty "
+        "`bhd_pixels`; each seed is one of the trainings: from an episode's first image, the instruction as bytes and "
+        "the robot's state to tool poses. It begins with the perception of the same seed of the section `see`; "
+        "`pick_servo` showed it how. True poses taught it where to look; none is an input. A deaf policy gets an empty "
         "instruction, a blind one black images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from "
-        "nothing, learn from every frame of the rule's episodes; they have no input for words, and can do no better "
-        "than to pick any one of the objects."
+        "nothing, learn from every frame of the rule's episodes, of 160 x 120 pixels; they have no input for words, "
+        "and can do no better than to pick any one of the objects."
     )
 
 
