@@ -212,7 +212,7 @@ SEE = Lesson(
     video=False,
     network="bhd_perception",
     policy=("--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=50"),
-    batch=32,
+    batch=16,
     steps=600,
     trials=12,
     recipe="configs/train/perception_ur5.yaml",
