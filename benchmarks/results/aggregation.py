@@ -29,7 +29,7 @@ def aggregate(run: Runner, section: Section) -> None:
 
     def learn(seed: int) -> dict[str, Any]:
         policy, seconds = aggregated(run, seed)
-        return {**_evaluate(run, f"seed_{seed}", policy), "seconds": seconds}
+        return {**_evaluate(run, f"seed_{seed}", policy, _RULE), "seconds": seconds}
 
     def clone(seed: int) -> dict[str, Any]:
         return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy")
@@ -67,18 +67,18 @@ def aggregated(run: Runner, seed: int) -> tuple[str, float]:
     )
 
 
-def _evaluate(run: Runner, name: str, policy: str) -> dict[str, Any]:
+def _evaluate(run: Runner, name: str, policy: str, *rules: str) -> dict[str, Any]:
     results = evaluate(
         run,
         f"aggregate_eval/{name}",
         "turtlebot3_avoid",
         {name: policy},
-        rules=(_RULE,),
-        baseline=_RULE,
+        rules=rules,
+        baseline=next(iter(rules), name),
         options=roaming(run),
         episodes=EPISODES,
     )
-    return summary(results, _RULE, name)
+    return summary(results, *rules, name)
 
 
 def _folder(seed: int) -> str:

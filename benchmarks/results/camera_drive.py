@@ -21,11 +21,11 @@ def camera_drive(run: Runner, section: Section) -> None:
     """Let a rule that reads the lidar correct a driver that sees with a camera."""
 
     def learn(seed: int) -> dict[str, Any]:
-        (policy, seconds), name = learned(run, seed), f"seed_{seed}"
+        (policy, seconds), name = _learned(run, seed), f"seed_{seed}"
         return {**_evaluate(run, name, _brain(run, name, policy), (_RULE, name)), "seconds": seconds}
 
     def others(seed: int) -> dict[str, Any]:
-        policy, _ = learned(run, seed)
+        policy, _ = _learned(run, seed)
         inner = _brain(run, "blind.brain", policy)
         blind = ("--brains.blind.type=blanked", "--brains.blind.images=true", *inner)
         clone = _brain(run, "clone", f"{_folder(seed)}/round_0/policy")
@@ -73,7 +73,7 @@ def camera_drive(run: Runner, section: Section) -> None:
     )
 
 
-def learned(run: Runner, seed: int) -> tuple[str, float]:
+def _learned(run: Runner, seed: int) -> tuple[str, float]:
     """Learn by aggregation, and return the folder of the policy and how long that took [s]."""
     name, config = f"camera_drive_train_{seed}", "dagger_turtlebot3_camera"
     return aggregation(

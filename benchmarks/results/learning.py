@@ -274,9 +274,11 @@ def aggregation(
         command.append(f"--data=[{', '.join(data)}]")
     if policy:
         command.append(f"--policy.options=[{', '.join(policy)}]")
-    run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
-    # Of all rounds, also of those that an earlier command made before it was stopped.
-    return f"{output}/round_{rounds}/policy", float(run.read(output, "rounds.json")["rounds"][-1]["seconds"])
+    ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
+    # Of all rounds, also of those that an earlier command made before it was stopped; rounds of an older version have
+    # no time.
+    seconds = run.read(output, "rounds.json")["rounds"][-1].get("seconds") or ran.seconds
+    return f"{output}/round_{rounds}/policy", float(seconds)
 
 
 def evaluate(

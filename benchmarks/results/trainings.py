@@ -66,8 +66,8 @@ def each(
         commands = run.commands[first:]
         trainings[seed] = Training(provenance(), commands, _digests(commands), measured)
         if not run.is_short:
-            text = json.dumps(asdict(trainings[seed]), indent=1)
             run.kept.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(asdict(trainings[seed])) + "\n"
             Disk().publish(run.kept / f"{name}_{seed}.json", text.encode())
     for seed in () if run.is_short else set(seeds).difference(asked):
         kept = _read(run.kept / f"{name}_{seed}.json")

@@ -1,6 +1,8 @@
 """`bhd-train` with `algorithm: dagger`: a policy drives, an expert corrects it, and it learns from that, in rounds."""
 
+import contextlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -133,11 +135,15 @@ class _Rounds:
             started = time.perf_counter()
             try:
                 step(number, folder)
-                done.append(name)
-            finally:
-                # What took time counts, even if it was stopped and is done again.
-                seconds += time.perf_counter() - started
-                Disk().publish(folder / _DONE, json.dumps({"done": done, "seconds": seconds}).encode())
+            except BaseException:
+                # What took time counts, even if it was stopped and is done again. The reason for the stop is what is
+                # to be said, also where nothing more can be written.
+                with contextlib.suppress(OSError):
+                    self._note(folder, done, seconds + time.perf_counter() - started)
+                raise
+            done.append(name)
+            seconds += time.perf_counter() - started
+            self._note(folder, done, seconds)
         self._seconds += seconds
         self._rows.append(self._row(number, folder))
         rows = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": self._rows}
@@ -152,7 +158,8 @@ class _Rounds:
         for row in self._rows:
             share = "all" if row["expert_share"] is None else f"{row['expert_share']:.1%}"
             level = _interval(row["success"]), _interval(row["score"])
-            table.add_row(str(row["round"]), str(row["episodes"]), share, *level, f"{row['seconds'] / 60:.1f} min")
+            spent = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f} min"
+            table.add_row(str(row["round"]), str(row["episodes"]), share, *level, spent)
         level = _interval(self._expert["success"]), _interval(self._expert["score"])
         table.add_row("", "", self._stages.expert, *level, "")
         self._console.print(table)
@@ -260,15 +267,22 @@ class _Rounds:
     # --- results -----------------------------------------------------------------------------------------------------
 
     @staticmethod
+    def _note(folder: Path, done: Sequence[str], seconds: float) -> None:
+        values = {"done": done, "seconds": None if math.isnan(seconds) else seconds}
+        Disk().publish(folder / _DONE, json.dumps(values).encode())
+
+    @staticmethod
     def _done(folder: Path) -> tuple[list[str], float]:
-        """Return which steps of a round are done, and how long it took so far [s]."""
+        """Return which steps of a round are done, and how long it took so far [s]; NaN if that is not known."""
         folder.mkdir(exist_ok=True)
         file = folder / _DONE
-        values: dict[str, Any] = {"done": [], "seconds": 0.0}
+        if not file.exists():
+            return [], 0.0
         try:
-            if file.exists():
-                values = json.loads(file.read_text(encoding="utf-8"))
-            return list(values["done"]), float(values["seconds"])
+            values = json.loads(file.read_text(encoding="utf-8"))
+            if isinstance(values, list):  # of a version that did not note the time
+                return values, math.nan
+            return list(values["done"]), math.nan if values["seconds"] is None else float(values["seconds"])
         except (ValueError, TypeError, KeyError) as error:
             raise BhdError(
                 f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is done anew."
@@ -287,7 +301,7 @@ class _Rounds:
             "episodes": before["episodes"] + len(summary.episodes),
             "frames": before["frames"] + summary.frames,
             "expert_share": share,
-            "seconds": self._seconds,
+            "seconds": None if math.isnan(self._seconds) else self._seconds,
             **_level(results["policy"]),
         }
 

@@ -10,6 +10,7 @@ import yaml
 
 from bhd_lerobot.cli.train import algorithm_of, main
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import BhdError
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.dagger import train as dagger
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
@@ -107,13 +108,31 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     called.clear()
     kept = run / "config.yaml"
     values = yaml.safe_load(kept.read_text())
+    assert main([argument]) == 0
+    assert results(tmp_path) == found
     assert values.pop("data") == []
     kept.write_text(yaml.safe_dump(values))
+    (run / "round_0" / "done.json").write_text(json.dumps(["record", "train", "evaluate"]))
     assert main([argument]) == 0
     assert called == []
-    assert results(tmp_path) == found
+    assert results(tmp_path)["rounds"] == [{**row, "seconds": None} for row in found["rounds"]]
     assert main([argument, "--seed=1"]) == 2
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    def fails(_: list[str]) -> int:
+        monkeypatch.setattr(dagger._Rounds, "_note", full)
+        raise BhdError("The folder is full.")
+
+    monkeypatch.setattr(dagger, "_PROGRAMS", {**dagger._PROGRAMS, "bhd-record": fails})
+    assert main([f"--config_path={settings(tmp_path)}"]) == 2
+    assert "The folder is full." in capsys.readouterr().err
 
 
 def test_every_round_learns_from_data_that_was_recorded_before_as_well(
