@@ -15,6 +15,9 @@ Region = tuple[int, int, int, int]
 class Projection:
     """A pinhole camera and its image size.
 
+    Attributes:
+        position: of its centre in the base frame [m].
+
     Args:
         view: where the camera stands.
         width: of its images [px].
@@ -24,7 +27,7 @@ class Projection:
     def __init__(self, view: CameraView, width: int, height: int) -> None:
         self.width, self.height = width, height
         self._focal = height / 2 / math.tan(math.radians(view.fovy) / 2)
-        self._position = np.asarray(view.position, np.float64)
+        self.position = np.asarray(view.position, np.float64)
         ahead = np.subtract(view.target, view.position)
         self._ahead = ahead / np.linalg.norm(ahead)
         right = np.array([ahead[1], -ahead[0], 0.0])
@@ -39,10 +42,18 @@ class Projection:
         Args:
             points: in the base frame [m], shape (…, 3).
         """
-        ray = points - self._position
+        ray = points - self.position
         depth = ray @ self._ahead
         column = self.width / 2 + self._focal * (ray @ self._right) / depth
         return np.stack([column, self.height / 2 - self._focal * (ray @ self._up) / depth], axis=-1)
+
+    def depth(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far points are from the camera along its line of sight [m], shape (…,).
+
+        Args:
+            points: in the base frame [m], shape (…, 3).
+        """
+        return (points - self.position) @ self._ahead
 
     def on_plane(self, pixels: NDArray[np.float64], z: float) -> NDArray[np.float64]:
         """Return the points of a horizontal plane that pixels show, in the base frame [m], shape (…, 3).
@@ -54,7 +65,7 @@ class Projection:
         column = (pixels[..., :1] - self.width / 2) / self._focal
         row = (self.height / 2 - pixels[..., 1:]) / self._focal
         ray = column * self._right + row * self._up + self._ahead
-        return self._position + ray * ((z - self._position[2]) / ray[..., 2:])
+        return self.position + ray * ((z - self.position[2]) / ray[..., 2:])
 
     def region(self, low: tuple[float, ...], high: tuple[float, ...], margin: float, multiple: int) -> Region:
         """Return the part of the image in which a box of the base frame is seen.

@@ -39,6 +39,8 @@ class PerceptionConfig(PreTrainedConfig):
         context: numbers that describe the whole image: where the camera stands, and the light.
         brightness: images are made brighter and darker by up to this share in training.
         recolour: share of the images that have other colours in training, of which no colours are learned.
+        zoom: in training half of the images are made larger or smaller by up to this share, so that objects of other
+            sizes than those that were recorded are understood.
         least_presence: probability from which on something counts as an object.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: of weights.
@@ -59,6 +61,7 @@ class PerceptionConfig(PreTrainedConfig):
     context: int = 64
     brightness: float = 0.2
     recolour: float = 0.5
+    zoom: float = 0.35
     least_presence: float = 0.3
 
     n_obs_steps: int = 1
@@ -99,7 +102,7 @@ class PerceptionConfig(PreTrainedConfig):
         ):
             if not low < getattr(self, name) < high:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be between {low:g} and {high:g}.")
-        for name in ("margin", "brightness", "recolour"):
+        for name in ("margin", "brightness", "recolour", "zoom"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be from 0 to below 1.")
         for name in ("channels", "hidden", "context"):

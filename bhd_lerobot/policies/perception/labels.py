@@ -1,11 +1,14 @@
 """What is true of the objects on a table, from what the task says: what perception learns to see."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.policies.perception.camera import Projection
 
 _COLUMN = {name: OBJECT_FIELDS.index(name) for name in OBJECT_FIELDS}
 
@@ -61,6 +64,34 @@ class Labels:
             colour=torch.cdist(table[..., _COLOUR].flatten(0, 1), palette).argmin(-1).reshape(table.shape[:2]),
             size=table[..., _SIZE],
             yaw=torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        )
+
+    def zoomed(self, projection: Projection, about: NDArray[np.float32], factor: NDArray[np.float32]) -> "Labels":
+        """Return what is true of images that were made larger: objects stand elsewhere, and have another size.
+
+        Args:
+            projection: the camera.
+            about: the point of each image that stays where it is [px], shape (batch, 2).
+            factor: by which each was made larger about it, shape (batch,).
+        """
+        places = self.position.detach().cpu().numpy().astype(np.float64)
+        by = factor.astype(np.float64)[:, None]
+        feet = np.concatenate([places[..., :2], np.zeros_like(places[..., :1])], axis=-1)
+        seen, fixed = projection.pixels(feet), about.astype(np.float64)[:, None]
+        moved = projection.on_plane(fixed + (seen - fixed) * by[..., None], 0.0)
+        # What is twice as large in the image and twice as far away is four times as large.
+        by = by * projection.depth(moved) / projection.depth(feet)
+        before, after = (np.arctan2(*np.moveaxis(one - projection.position, -1, 0)[1::-1]) for one in (feet, moved))
+        moved[..., 2] = places[..., 2] * by
+
+        def tensor(values: NDArray[np.float64], like: Tensor) -> Tensor:
+            return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+
+        return replace(
+            self,
+            position=tensor(moved, self.position),
+            size=self.size * tensor(by, self.size)[..., None],
+            yaw=self.yaw + tensor(after - before, self.yaw),
         )
 
     def at(self, places: Tensor) -> "Labels":

@@ -32,6 +32,7 @@ _LOG_ERROR = (-4.0, 3.0)
 _DISTINCT = 0.025  # [m] what is found nearer to something surer is that
 _TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
 _RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
+_ZOOMED = 0.5  # share of the images that are learned from larger or smaller
 _SHADES = 24  # numbers that tell the colour of a cell
 _FITS = 6  # rounds: what is seen depends a little on where the camera is taken to be
 _LEAST_SEEN = 12  # objects; each gives two numbers, and six are to be found from what may in part be wrong
@@ -133,10 +134,12 @@ class PerceptionPolicy(PreTrainedPolicy):
         image = self.checked(batch)
         labels = Labels.of(batch[OBS_ENV_STATE])
         is_true = torch.ones(len(image), dtype=torch.bool, device=image.device)
+        close = None
         if self.training:
             self._ratios.clear()
             image, is_true = self._varied(image)
-        _, answers = self.look(image)
+            close, labels = self._zoomed(image, labels)
+        _, answers = self.look(image, close)
         if not self.training:
             self._calibrate(answers, labels)
         heat, place = self.nearness(labels)
@@ -173,6 +176,35 @@ class PerceptionPolicy(PreTrainedPolicy):
             image = image.clone()
             image[others] = torch.einsum("bij,bjhw->bihw", mixture, image[others])
         return image, is_true
+
+    def _zoomed(self, image: Tensor, labels: Labels) -> tuple[Tensor, Labels]:
+        """Return the region of the images, in some of them larger or smaller about a point; and what is true of it.
+
+        In a part of an image that is twice as large, an object looks like one of twice the size: so objects of other
+        sizes than those that there were are understood, too. Where the camera stands is still seen in the whole image.
+        """
+        config, device = self.config, image.device
+        left, top, right, bottom = config.region
+        close = image[:, :, top:bottom, left:right]
+        if not config.zoom:
+            return close, labels
+        factor, about = torch.ones(len(image), device=device), torch.zeros(len(image), 2, device=device)
+        rows = (torch.rand(len(image), device=device) < _ZOOMED).nonzero()[:, 0]
+        if len(rows):
+            uniform = torch.rand(3, len(rows), device=device)
+            factor[rows] = torch.exp((2 * uniform[0] - 1) * math.log1p(config.zoom))
+            about[rows, 0], about[rows, 1] = left + uniform[1] * (right - left), top + uniform[2] * (bottom - top)
+            x, y = (torch.arange(*ends, device=device) + 0.5 for ends in ((left, right), (top, bottom)))
+            pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+            fixed = about[rows, None, None]
+            source = fixed + (pixels - fixed) / factor[rows, None, None, None]
+            size = torch.tensor(config.image_size, device=device)
+            # `grid_sample` takes places in units of half the image, from its middle.
+            samples = functional.grid_sample(
+                image[rows], 2 * source / size - 1, padding_mode="reflection", align_corners=False
+            )
+            close = close.index_copy(0, rows, samples)
+        return close, labels.zoomed(config.projection, about.cpu().numpy(), factor.cpu().numpy())
 
     def nearness(self, labels: Labels) -> tuple[Tensor, Tensor]:
         """Return how near every cell is to an object's centre, 0 to 1, and which object's, shape (batch, h, w)."""
@@ -312,18 +344,19 @@ class PerceptionPolicy(PreTrainedPolicy):
             )
         return image
 
-    def look(self, image: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def look(self, image: Tensor, close: Tensor | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the network makes of images, cell by cell.
 
         Args:
             image: shape (batch, 3, height, width), 0 to 1.
+            close: what is looked at closely; the region of the image, if nothing.
 
         Returns:
             features that it answers from, shape (batch, `config.channels`, h, w); and its answers by name, shape
             (batch, h, w) or (batch, h, w, numbers): logits of `presence`, `is_box` and `colour`; `shift`, `log_error`,
             `size` and `yaw` as the loss takes them.
         """
-        features, colour = self.network(image)
+        features, colour = self.network(image, close)
         widths = {name: width for name, width in _OUTPUTS.items() if name != "colour"}
         values = self.network.answer(features).movedim(1, -1).split(list(widths.values()), dim=-1)
         answers = {name: part[..., 0] if widths[name] == 1 else part for name, part in zip(widths, values, strict=True)}
@@ -411,9 +444,9 @@ class _Network(nn.Module):
         place = torch.stack(torch.meshgrid(x, y, indexing="xy"))[None]
         self.register_buffer("_place", place, persistent=False)
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, close: Tensor | None = None) -> tuple[Tensor, Tensor]:
         left, top, right, bottom = self._region
-        whole, region = self.overview(image), image[:, :, top:bottom, left:right]
+        whole, region = self.overview(image), image[:, :, top:bottom, left:right] if close is None else close
         shade = self.shade(functional.avg_pool2d(region, STRIDE))
         colour = self.colour(_modulated(shade, self.to_shade(whole.detach())))
         fine = self.stem(region)

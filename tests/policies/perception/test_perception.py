@@ -241,6 +241,32 @@ def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> No
     assert 0.3 < half.float().mean() < 0.7
 
 
+def test_larger_images_show_objects_where_their_labels_say() -> None:
+    policy = PerceptionPolicy(config(zoom=0.5))
+    left, top, right, bottom = policy.config.region
+    labels = Labels.of(torch.from_numpy(states(64, max_objects=1, min_objects=1)).float())
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+
+    def spots(pixels: np.ndarray) -> Tensor:
+        apart = (column - pixels[:, :1, None]) ** 2 + (row - pixels[:, 1:, None]) ** 2
+        return torch.from_numpy(np.exp(-apart / 8)).float()[:, None].expand(-1, 3, -1, -1)
+
+    def shown(of: Labels) -> np.ndarray:
+        at: np.ndarray = policy.config.projection.pixels(of.position[:, 0].numpy().astype(np.float64))
+        return at
+
+    close, zoomed = policy._zoomed(spots(shown(labels)), labels)
+    where = close[:, 0].flatten(1).argmax(1).numpy()
+    found = np.stack([left + where % (right - left), top + where // (right - left)], axis=-1) + 0.5
+    wanted = shown(zoomed)
+    inside = ((wanted > (left + 2, top + 2)) & (wanted < (right - 2, bottom - 2))).all(1)
+    assert inside.sum() > 40
+    assert np.linalg.norm(found - wanted, axis=1)[inside].max() < 2.5
+    larger = zoomed.size[:, 0, 0] / labels.size[:, 0, 0]
+    assert 0.3 < float((larger != 1).float().mean()) < 0.7  # half of them
+    assert float(larger.min()) < 0.8 and float(larger.max()) > 1.25
+
+
 def test_what_is_learned_of_colours_is_nothing_of_kinds_and_the_other_way_round() -> None:
     policy, samples = PerceptionPolicy(config()).train(), batch()
     _, answers = policy.look(samples[IMAGE])
