@@ -100,7 +100,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     failures = []
     try:
-        for stage, width in ((GROUPS, jobs), (([LAST],), 1)):
+        # The largest first, so that none of them is left to run alone at the end.
+        for stage, width in ((sorted(GROUPS, key=len, reverse=True), jobs), ([(LAST,)], 1)):
             with ThreadPoolExecutor(width) as pool:
                 running = [pool.submit(make, group) for group in stage]
                 try:

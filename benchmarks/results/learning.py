@@ -48,9 +48,10 @@ def avoid(run: Runner, section: Section) -> None:
             seconds[name] = train(
                 run, f"avoid_{names[name]}", "bc_turtlebot3_avoid", f"{folder}/{name}", data, options=own, short=_FEW
             )
+        warmup = () if run.is_short else ("--critic_warmup=65536",)
         start = (
             *(f"--start_from={run.path(folder, 'gap_bc')}", "--see_ignored=true"),
-            *("--critic_warmup=65536", "--ppo.log_std_init=-1.0", *own),
+            *(*warmup, "--ppo.log_std_init=-1.0", *own),
         )
         seconds["ppo"] = train(
             run, f"avoid_{names['ppo']}", "ppo_turtlebot3", f"{folder}/ppo", options=start, short=FEW_PPO

@@ -189,13 +189,14 @@ class Pretended(Runner):
 
     def run(self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,), **_: Any) -> Ran:
         program, *options = arguments
+        keys = [one.partition("=")[0] for one in options]
+        assert len(set(keys)) == len(keys), f"{name} is given an option twice: {options}"
         if program == "bhd-record":
             parse(RecordConfig, options)
         elif program == "bhd-eval":
             self._results[name] = self._evaluated(parse(EvalConfig, options))
         elif program == "bhd-train":
-            values = {one.partition("=")[0] for one in options}
-            assert "--output_dir" in values
+            assert "--output_dir" in keys
             assert Path(options[0].partition("=")[2]).is_file()
         self.commands.append(Ran(shlex.join(arguments), 12.0, 0, 10.0))
         return self.commands[-1]
