@@ -188,6 +188,7 @@ def test_an_image_without_objects_is_learned_from_and_nothing_is_found_twice(tra
         ({"object_height": 0.0}, "policy.object_height is 0"),
         ({"least_presence": 1.0}, "policy.least_presence is 1"),
         ({"brightness": math.nan}, "policy.brightness is nan"),
+        ({"zoom": -0.1}, "policy.zoom is -0.1; it must be from 0 to below 1"),
         ({"channels": 0}, "policy.channels is 0"),
     ],
 )
