@@ -415,7 +415,7 @@ class _Network(nn.Module):
         self.stem = nn.Sequential(_convolution(3, 16, 5, stride=2), _convolution(16, fine, 3, stride=2))
         self.down = _convolution(fine + 2, coarse, 3, stride=2)
         self.middle = nn.Sequential(_Residual(coarse, 1), _Residual(coarse, 2))
-        self.up = nn.Conv2d(coarse, fine, 1)
+        self.up = _Convolution(coarse, fine, 1)
         self.join = _convolution(2 * fine, fine, 3)
         width, height = (math.ceil(size / 32) for size in config.image_size)
         self.overview = nn.Sequential(
@@ -431,10 +431,10 @@ class _Network(nn.Module):
         self.to_coarse, self.to_fine = nn.Linear(context, 2 * coarse), nn.Linear(context, 2 * fine)
         # What colour something has is told by what is seen of it close by, not by the features that tell its kind: a
         # network that has seen no blue box would else say that what is blue is no box, or what is a box not blue.
-        self.shade, self.to_shade = nn.Conv2d(3, _SHADES, 5, padding=2), nn.Linear(context, 2 * _SHADES)
-        self.colour = nn.Sequential(nn.ReLU(inplace=True), nn.Conv2d(_SHADES, len(COLOURS), 1))
+        self.shade, self.to_shade = _Convolution(3, _SHADES, 5, padding=2), nn.Linear(context, 2 * _SHADES)
+        self.colour = nn.Sequential(nn.ReLU(inplace=True), _Convolution(_SHADES, len(COLOURS), 1))
         outputs = sum(_OUTPUTS.values()) - _OUTPUTS["colour"]
-        self.answer = nn.Sequential(nn.Conv2d(fine, 64, 1), nn.ReLU(inplace=True), nn.Conv2d(64, outputs, 1))
+        self.answer = nn.Sequential(_Convolution(fine, 64, 1), nn.ReLU(inplace=True), _Convolution(64, outputs, 1))
 
     def aim(self, region: Region) -> None:
         """Look at a region of the images."""
@@ -465,17 +465,30 @@ def _modulated(values: Tensor, by: Tensor) -> Tensor:
 
 def _convolution(inputs: int, outputs: int, size: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, size, stride, dilation * (size // 2), dilation, bias=False),
+        _Convolution(inputs, outputs, size, stride, dilation * (size // 2), dilation, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU(inplace=True),
     )
+
+
+class _Convolution(nn.Conv2d):
+    """One that computes with the channels side by side in memory: on a CPU, a step of training is a fifth faster.
+
+    Its parameters are not stored that way: LeRobot does not save an optimizer's state that is.
+    """
+
+    def forward(self, values: Tensor) -> Tensor:
+        weight = self.weight.contiguous(memory_format=torch.channels_last)
+        return self._conv_forward(values, weight, self.bias)
 
 
 class _Residual(nn.Module):
     def __init__(self, channels: int, dilation: int) -> None:
         super().__init__()
         self.first = _convolution(channels, channels, 3, dilation=dilation)
-        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+        self.second = nn.Sequential(
+            _Convolution(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
+        )
 
     def forward(self, values: Tensor) -> Tensor:
         return functional.relu(values + self.second(self.first(values)))

@@ -72,6 +72,7 @@ def one_thread() -> Iterator[None]:
 def test_it_learns_to_look_at_what_is_named() -> None:
     policy = PixelsPolicy(made(freeze=False, pointing_weight=1.0, n_cells=10_000))
     optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 90)
     task = {"min_objects": 2, "max_objects": 2}
     samples = batch(10, **task)
     other = batch(10, **task, swap=True)  # the same tables, and it is asked for the other object
@@ -83,6 +84,7 @@ def test_it_learns_to_look_at_what_is_named() -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        scheduler.step()
     assert set(parts) == {"perception", "pointing", "action"}
     policy.eval()
     for asked in (samples, other):
