@@ -71,8 +71,8 @@ _EXPLANATIONS = {
     Reason.FIFO_FULL: "the command queue is full; send later or make it longer",
     Reason.NOT_ACTIVE: "the robot is not active; call activate() first, after a deactivation reset() and activate()",
     Reason.ESTOP: "the emergency stop is latched; clear its cause, then call reset() and activate()",
-    Reason.FAULT: "a fault is latched: something was in the arm's way (protective stop), or the plant reported a "
-    "fault, fell silent or was too late; clear the cause, then call reset() and activate()",
+    Reason.FAULT: "a fault is latched: the robot ran into something (an arm: protective stop), or the plant reported "
+    "a fault, fell silent or was too late; clear the cause, then call reset() and activate()",
     Reason.WRONG_MODE: "the request does not apply in the present mode",
     Reason.NO_POSTURE: "no admissible posture of the arm puts the tool there",
     Reason.BEYOND_HORIZON: f"the command is due more than {HORIZON_NS // NANOSECONDS} s from now; send shorter action "
