@@ -61,7 +61,7 @@ class PerceptionConfig(PreTrainedConfig):
     context: int = 64
     brightness: float = 0.2
     recolour: float = 0.5
-    zoom: float = 0.35
+    zoom: float = 0.5
     least_presence: float = 0.3
 
     n_obs_steps: int = 1
