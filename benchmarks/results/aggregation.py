@@ -18,7 +18,7 @@ from benchmarks.results.section import Row, Section, mean
 from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
-EPISODES, ROUNDS = 1000, 2
+EPISODES, ROUNDS = 1000, 3
 _SHORT, _STEPS = (40, 20, 8), 800
 _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
 _RULE = "gap_follower"
