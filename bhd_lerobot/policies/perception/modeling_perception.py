@@ -199,9 +199,10 @@ class PerceptionPolicy(PreTrainedPolicy):
             fixed = about[rows, None, None]
             source = fixed + (pixels - fixed) / factor[rows, None, None, None]
             size = torch.tensor(config.image_size, device=device)
-            # `grid_sample` takes places in units of half the image, from its middle.
+            # `grid_sample` takes places in units of half the image, from its middle. What lies outside of it must not
+            # be a mirror image: that would show objects where none are said to be.
             samples = functional.grid_sample(
-                image[rows], 2 * source / size - 1, padding_mode="reflection", align_corners=False
+                image[rows], 2 * source / size - 1, padding_mode="border", align_corners=False
             )
             close = close.index_copy(0, rows, samples)
         return close, labels.zoomed(config.projection, about.cpu().numpy(), factor.cpu().numpy())
