@@ -39,8 +39,8 @@ class PerceptionConfig(PreTrainedConfig):
         context: numbers that describe the whole image: where the camera stands, and the light.
         brightness: images are made brighter and darker by up to this share in training.
         recolour: share of the images that have other colours in training, of which no colours are learned.
-        zoom: in training half of the images are made larger or smaller by up to this share, so that objects of other
-            sizes than those that were recorded are understood.
+        zoom: in training, in half of the images what is looked at closely is made larger by up to 1 + this, or smaller
+            by as much, so that objects of other sizes than those that were recorded are understood.
         least_presence: probability from which on something counts as an object.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: of weights.

@@ -133,12 +133,14 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         image = self.checked(batch)
         labels = Labels.of(batch[OBS_ENV_STATE])
-        is_true = torch.ones(len(image), dtype=torch.bool, device=image.device)
+        is_true = is_placed = torch.ones(len(image), dtype=torch.bool, device=image.device)
         close = None
         if self.training:
+            # What was found out of errors was of other weights.
             self._ratios.clear()
+            self.factor.fill_(math.nan)
             image, is_true = self._varied(image)
-            close, labels = self._zoomed(image, labels)
+            close, labels, is_placed = self._zoomed(image, labels)
         _, answers = self.look(image, close)
         if not self.training:
             self._calibrate(answers, labels)
@@ -148,15 +150,18 @@ class PerceptionPolicy(PreTrainedPolicy):
         presence = functional.binary_cross_entropy_with_logits(answers["presence"], heat, reduction="none")
         presence = (presence * certain.abs()).sum((1, 2)).mean()
         near = heat * (heat > _NEAR)
-        parts = self._errors(answers, labels.at(place))
+        at = labels.at(place)
+        parts = self._errors(answers, at)
         parts["colour"] = parts["colour"] * is_true[:, None, None]
         means = {name: (part * near).sum() / near.sum().clamp_min(1.0) for name, part in parts.items()}
-        loss = 0.1 * presence + sum(_WEIGHTS[name] * value for name, value in means.items())
+        placed = near * is_placed[:, None, None]
+        across, error = (
+            (part * placed).sum() / placed.sum().clamp_min(1.0) for part in self._place_errors(answers, at)
+        )
+        loss = 0.1 * presence + across + sum(_WEIGHTS[name] * value for name, value in means.items())
         assert isinstance(loss, Tensor)
-        outputs = {name: float(value.detach()) for name, value in means.items() if name != "position"}
-        where = (self.places(answers) - labels.at(place).position)[..., :2].norm(dim=-1)
-        error = float(((where * near).sum() / near.sum().clamp_min(1.0)).detach())
-        return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * error}
+        outputs = {name: float(value.detach()) for name, value in means.items() if name != "above"}
+        return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * float(error.detach())}
 
     def _varied(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return images in other light, and some in other colours; and of which the colours are true, shape (batch,).
@@ -173,21 +178,27 @@ class PerceptionPolicy(PreTrainedPolicy):
             # A mixture of the three channels for each of the three: new hues, or nearly none.
             mixture = torch.rand(len(others), 3, 3, device=image.device)
             mixture = mixture.square() / mixture.square().sum(2, keepdim=True)
-            image = image.clone()
-            image[others] = torch.einsum("bij,bjhw->bihw", mixture, image[others])
+            image[others] = torch.einsum("bij,bjhw->bihw", mixture, image[others]).to(image.dtype)
         return image, is_true
 
-    def _zoomed(self, image: Tensor, labels: Labels) -> tuple[Tensor, Labels]:
-        """Return the region of the images, in some of them larger or smaller about a point; and what is true of it.
+    def _zoomed(self, image: Tensor, labels: Labels) -> tuple[Tensor, Labels, Tensor]:
+        """Return the region of the images, in half of them larger or smaller about a point; and what is true of it.
 
         In a part of an image that is twice as large, an object looks like one of twice the size: so objects of other
-        sizes than those that there were are understood, too. Where the camera stands is still seen in the whole image.
+        sizes than those that there were are understood, too. Where it stands is not learned from that. A camera that
+        stands elsewhere than it is taken to shows everything some pixels beside, twice as many in such a part, and the
+        network knows that number from the whole image, which stays as it is.
+
+        Returns:
+            the region, shape (batch, 3, height, width); the labels; and whether x and y in them are to be learned,
+            shape (batch,).
         """
         config, device = self.config, image.device
         left, top, right, bottom = config.region
         close = image[:, :, top:bottom, left:right]
+        is_placed = torch.ones(len(image), dtype=torch.bool, device=device)
         if not config.zoom:
-            return close, labels
+            return close, labels, is_placed
         factor, about = torch.ones(len(image), device=device), torch.zeros(len(image), 2, device=device)
         rows = (torch.rand(len(image), device=device) < _ZOOMED).nonzero()[:, 0]
         if len(rows):
@@ -205,7 +216,8 @@ class PerceptionPolicy(PreTrainedPolicy):
                 image[rows], 2 * source / size - 1, padding_mode="border", align_corners=False
             )
             close = close.index_copy(0, rows, samples)
-        return close, labels.zoomed(config.projection, about.cpu().numpy(), factor.cpu().numpy())
+            is_placed[rows] = False
+        return close, labels.zoomed(config.projection, about.cpu().numpy(), factor.cpu().numpy()), is_placed
 
     def nearness(self, labels: Labels) -> tuple[Tensor, Tensor]:
         """Return how near every cell is to an object's centre, 0 to 1, and which object's, shape (batch, h, w)."""
@@ -218,21 +230,25 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     def _errors(self, answers: Mapping[str, Tensor], true: Labels) -> dict[str, Tensor]:
         """Return the parts of the loss of every cell, as if each were near an object, shape (batch, h, w)."""
-        apart = self.places(answers) - true.position
-        scale = torch.exp(answers["log_error"].clamp(*_LOG_ERROR))
-        across = apart[..., :2].norm(dim=-1) / _ERROR
+        above = (self.places(answers) - true.position)[..., 2].abs() / _ERROR
         turn = torch.stack([torch.cos(2 * true.yaw), torch.sin(2 * true.yaw)], dim=-1)
         entropy = functional.cross_entropy(answers["colour"].movedim(-1, 1), true.colour, reduction="none")
         box = functional.binary_cross_entropy_with_logits(answers["is_box"], true.is_box, reduction="none")
         size = answers["size"] - torch.log(true.size.clamp_min(1e-3) / _SIZE)
         return {
-            "position": across / scale + 2 * scale.log() + 0.2 * apart[..., 2].abs() / _ERROR,
+            "above": above,
             "is_box": box,
             "colour": entropy,
             "size": size.abs().sum(-1),
             # A cup looks the same from all sides. With the absolute error nothing is learned for thousands of steps.
             "yaw": (answers["yaw"] - turn).square().sum(-1) * true.is_box,
         }
+
+    def _place_errors(self, answers: Mapping[str, Tensor], true: Labels) -> tuple[Tensor, Tensor]:
+        """Return the loss of x and y of every cell, and how far off they are [m], shape (batch, h, w)."""
+        apart = (self.places(answers) - true.position)[..., :2].norm(dim=-1)
+        scale = torch.exp(answers["log_error"].clamp(*_LOG_ERROR))
+        return apart / _ERROR / scale + 2 * scale.log(), apart
 
     @torch.no_grad()
     def _calibrate(self, answers: Mapping[str, Tensor], labels: Labels) -> None:
@@ -391,7 +407,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         return found
 
 
-_WEIGHTS = {"position": 1.0, "is_box": 1.0, "colour": 1.0, "size": 2.0, "yaw": 10.0}
+_WEIGHTS = {"above": 0.2, "is_box": 1.0, "colour": 1.0, "size": 2.0, "yaw": 10.0}
 
 
 def _distinct(found: Detections) -> Detections:

@@ -256,7 +256,7 @@ def test_larger_images_show_objects_where_their_labels_say() -> None:
         at: np.ndarray = policy.config.projection.pixels(of.position[:, 0].numpy().astype(np.float64))
         return at
 
-    close, zoomed = policy._zoomed(spots(shown(labels)), labels)
+    close, zoomed, is_placed = policy._zoomed(spots(shown(labels)), labels)
     where = close[:, 0].flatten(1).argmax(1).numpy()
     found = np.stack([left + where % (right - left), top + where // (right - left)], axis=-1) + 0.5
     wanted = shown(zoomed)
@@ -268,6 +268,7 @@ def test_larger_images_show_objects_where_their_labels_say() -> None:
     )
     assert close[:, 0][torch.from_numpy(elsewhere > 10)].max() < 0.5  # nothing is shown twice
     larger = zoomed.size[:, 0, 0] / labels.size[:, 0, 0]
+    assert torch.equal(is_placed, larger == 1)
     assert 0.3 < float((larger != 1).float().mean()) < 0.7  # half of them
     assert float(larger.min()) < 0.8
     assert float(larger.max()) > 1.25
