@@ -123,7 +123,11 @@ class LanguageBrain(PickBrain):
         """Return the next goal of the plan."""
         if self.perceiver is not None and result is not None:
             sight = self._sights[sim]
-            if sight.image is not None:
+            if not result.success and self._work[sim].stage == "home":
+                return self._give_up(
+                    sim, f"the arm, which is in the way of another look, stays there: {result.message}"
+                )
+            if result.success and sight.image is not None:
                 if np.array_equal(sight.image, seen.images[self.perceiver.camera][sim]):
                     camera = self.perceiver.camera
                     return self._give_up(sim, f"the camera {camera!r} shows the same image although the arm has moved")

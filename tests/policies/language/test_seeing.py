@@ -189,6 +189,31 @@ def test_with_a_camera_that_does_not_change_while_the_arm_moves_it_does_not_go_d
     assert "shows the same image although the arm has moved" in table.problem
 
 
+def test_an_arm_that_did_not_move_says_nothing_of_its_camera() -> None:
+    table = Table(BOTH, frozen=True)
+    table.frame()
+    assert table.end(success=False, message="No posture reaches the pose.") is not None
+    assert table.steps == ["above", "back"]
+    assert table.problem == "No posture reaches the pose."
+    assert table.end() is None  # it has moved now, and still the image is the same
+    assert "shows the same image although the arm has moved" in table.problem
+
+
+def test_an_arm_that_does_not_get_out_of_the_way_is_not_looked_past() -> None:
+    table = Table(BOTH, BOTH)
+    table.frame()
+    table.end()
+    table.end()
+    table.opening = 0.0
+    table.end()
+    table.end()
+    assert table.steps[-1] == "home"
+    assert table.end(success=False, message="The path is blocked.") is None
+    assert table.steps[-1] == "home"
+    assert table.problem.endswith("stays there: The path is blocked.")
+    assert table.eyes.count == 1
+
+
 def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     """The object stands elsewhere the second time, and under another number."""
     table = Table(BOTH, (seen(BOX, 0), seen(CUP, 1, off=0.05)))

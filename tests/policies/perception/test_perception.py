@@ -242,6 +242,17 @@ def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> No
     assert 0.3 < half.float().mean() < 0.7
 
 
+def test_a_step_of_training_forgets_how_large_errors_were_before(trained: PerceptionPolicy) -> None:
+    policy, samples = copy.deepcopy(trained), batch()
+    policy.detect(samples[IMAGE])
+    policy.train()
+    policy.config.recolour = policy.config.zoom = 0.5
+    with torch.autocast("cpu", torch.bfloat16):  # `policy.use_amp`
+        policy.forward(samples)[0].backward()
+    with pytest.raises(ConfigError, match="does not know how large its errors are"):
+        policy.detect(samples[IMAGE])
+
+
 def test_larger_images_show_objects_where_their_labels_say() -> None:
     policy = PerceptionPolicy(config(zoom=0.5))
     left, top, right, bottom = policy.config.region
