@@ -36,7 +36,7 @@ class Mode(IntEnum):
     ESTOP = 6
     """Emergency stop, latched."""
     FAULT = 7
-    """The plant reported something impossible, or something was in an arm's way; latched."""
+    """The plant reported something impossible, or the robot ran into something; latched."""
 
 
 class Reason(IntEnum):

@@ -43,7 +43,7 @@ class Projection:
             points: in the base frame [m], shape (…, 3).
         """
         ray = points - self.position
-        depth = ray @ self._ahead
+        depth = self.depth(points)
         column = self.width / 2 + self._focal * (ray @ self._right) / depth
         return np.stack([column, self.height / 2 - self._focal * (ray @ self._up) / depth], axis=-1)
 

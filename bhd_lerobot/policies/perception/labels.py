@@ -81,7 +81,11 @@ class Labels:
         moved = projection.on_plane(fixed + (seen - fixed) * by[..., None], 0.0)
         # What is twice as large in the image and twice as far away is four times as large.
         by = by * projection.depth(moved) / projection.depth(feet)
-        before, after = (np.arctan2(*np.moveaxis(one - projection.position, -1, 0)[1::-1]) for one in (feet, moved))
+        # It is seen from the same side; the side that it is seen from has turned.
+        before, after = (
+            np.arctan2(one[..., 1] - projection.position[1], one[..., 0] - projection.position[0])
+            for one in (feet, moved)
+        )
         moved[..., 2] = places[..., 2] * by
 
         def tensor(values: NDArray[np.float64], like: Tensor) -> Tensor:
