@@ -318,9 +318,10 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         if not bool(torch.isfinite(self.factor)):
             raise ConfigError(
-                "This bhd_perception does not know how large its errors are: in its training it looked at no held-out "
-                "images, or found nothing in them. Train it with --dataset.eval_split=0.05 and --eval_steps=2000, and "
-                "long enough."
+                "This bhd_perception does not know how large its errors are: since its last step of training it looked "
+                "at no held-out images, or found nothing in them. Train it with --dataset.eval_split=0.05 and "
+                "--eval_steps=2000, and long enough. Of a training that was stopped, use the checkpoint before, or go "
+                "on with it."
             )
         self.eval()
         return self._found(self.look(self.checked({self.config.image_key: images}))[1], float(self.factor))
