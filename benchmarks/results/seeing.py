@@ -19,7 +19,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("randomised light, colours, sizes, camera", (_ANY, _VARIED), 0.8),
     ("objects that it has not seen", (_ANY, _VARIED, "--task.objects=unseen"), 0.7),
     ("other sentences", (_ANY, "--task.wording=held_out"), None),
-    ("pairs of colour and kind", (_ANY, "--task.names=held_out"), None),
+    ("pairs of colour and kind that it has not seen", (_ANY, "--task.names=held_out"), None),
     ("the same scenes, two or more objects", (_ANY, "--task.min_objects=2"), None),
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )

@@ -22,10 +22,10 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 KINDS: tuple[Literal["cup", "box"], ...] = ("cup", "box")
 
-STYLES = ("usual", "plain", "marked", "other")
+STYLES = ("usual", "plain", "across", "marked", "other")
 """How objects look: ``usual``: a cup with a handle and a dark mouth, a box with a light tape along it; ``plain``:
-neither; ``marked``: instead a stripe around it and a patch on its top; ``other``: a cup with a lid and a knob, a box
-with a dark band across it."""
+neither; ``across``: the tape lies across, not along; ``marked``: instead a stripe around it and a patch on its top;
+``other``: a cup with a lid and a knob, a box with a dark band across it."""
 
 OBJECT_FIELDS = (
     *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),

@@ -167,8 +167,8 @@ class Tabletop:
             (self._marked if thing.style == "marked" else self._other)(sim, thing, geoms, colour)
             return
         if thing.kind == "box":
-            tape = _Form("box", (a + 0.0003, 0.2 * b, h + 0.0003))
-            self._geom(sim, geoms[1], tape, 0.55 + 0.45 * colour)
+            x, y = (0.2 * a, b + 0.0003) if thing.style == "across" else (a + 0.0003, 0.2 * b)
+            self._geom(sim, geoms[1], _Form("box", (x, y, h + 0.0003)), 0.55 + 0.45 * colour)
             return
         mouth = _Form("cylinder", (0.86 * a, 0.0004, 0), (0, 0, h))
         self._geom(sim, geoms[1], mouth, 0.22 * colour)

@@ -1,5 +1,6 @@
 """Domain randomisation: how much one episode's world may differ from the next, and from the nominal one."""
 
+import itertools
 import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -24,6 +25,7 @@ class RandomisationConfig:
         size: an object's measures are multiplied by 1 - this to 1 + this.
         colour: up to this is added to or taken from each of an object's red, green and blue.
         plain: probability that an object lacks what others of its kind have: a cup its handle, a box its tape.
+        across: probability that a box has its tape across, not along its length.
         marked: probability that it has neither of these, but a stripe around it and a patch on its top, light or dark.
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
@@ -46,6 +48,7 @@ class RandomisationConfig:
     size: float = 0.1
     colour: float = 0.08
     plain: float = 0.0
+    across: float = 0.0
     marked: float = 0.0
     light: float = 0.4
     light_direction: float = 0.3
@@ -80,10 +83,10 @@ class RandomisationConfig:
                 f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
                 f"which is {self.latency_s}."
             )
-        if self.plain + self.marked > 1:
+        if self.plain + self.across + self.marked > 1:
             raise ConfigError(
-                f"randomisation.plain is {self.plain} and randomisation.marked {self.marked}; they are probabilities, "
-                "together at most 1."
+                f"randomisation.plain is {self.plain}, randomisation.across {self.across} and randomisation.marked "
+                f"{self.marked}; they are probabilities, together at most 1."
             )
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
@@ -152,11 +155,10 @@ def draw_object_changes(config: RandomisationConfig, rng: np.random.Generator) -
         "shade": _floats(rng.uniform(-1, 1, 3) * config.colour),
     }
     # Where all look as usual, nothing is drawn: worlds stay what they were before these options.
-    if config.plain + config.marked > 0:
-        drawn = float(rng.random())
-        looks["style"] = (
-            "plain" if drawn < config.plain else "marked" if drawn < config.plain + config.marked else "usual"
-        )
+    shares = {"plain": config.plain, "marked": config.marked, "across": config.across}
+    if sum(shares.values()) > 0:
+        drawn, until = float(rng.random()), itertools.accumulate(shares.values())
+        looks["style"] = next((name for name, end in zip(shares, until, strict=True) if drawn < end), "usual")
     if looks["style"] == "marked":
         middle, broad, share = rng.uniform(0.2, 0.8), rng.uniform(0.05, 0.2), rng.uniform(0.3, 0.95)
         looks["marks"] = _floats((middle, broad, rng.uniform(-1, 1), share, rng.uniform(-1, 1)))

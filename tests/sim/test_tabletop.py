@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -299,6 +300,23 @@ def test_a_camera_sees_each_table_as_it_is_laid_now() -> None:
 
 
 # --- touch -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_differ() -> None:
+    box = TableObject("box", "blue", 0.045, 0.025, 0.08, 0.5, 0.0)
+    world = World(BODY, 2)
+    table = Tabletop(world)
+    table.place([TableScene("", (replace(box, style=style),), BODY.home) for style in ("usual", "across")])
+    along, across = (world.copy_model(sim) for sim in (0, 1))
+    body = along.body("object_0")
+    own = [number for number in range(along.ngeom) if along.geom_bodyid[number] == body.id]
+    (tape,) = [number for number in own if along.geom_size[number, 2] > 0.0401]  # higher than the box by a hair
+    for model, (long, wide) in ((along, (1, 0.2)), (across, (0.2, 1))):
+        np.testing.assert_allclose(model.geom_size[tape, :2], (0.045 * long, 0.025 * wide), atol=0.0004)
+    same = [number for number in range(along.ngeom) if number != tape]
+    for name in ("geom_size", "geom_rgba", "geom_friction"):
+        np.testing.assert_array_equal(getattr(along, name)[same], getattr(across, name)[same])
+    np.testing.assert_array_equal(along.body_inertia, across.body_inertia)
 
 
 def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, bool, list[bool]]:

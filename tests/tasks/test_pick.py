@@ -440,10 +440,13 @@ def test_sentences_that_are_held_out_are_others_and_the_rules_understand_them() 
 
 
 def test_objects_that_were_not_seen_are_of_no_size_style_or_shade_that_was() -> None:
-    varied = RandomisationConfig(enabled=True, plain=0.3, marked=0.3)
+    varied = RandomisationConfig(enabled=True, plain=0.3, across=0.1, marked=0.3)
     known = [one for scene in scenes(400, randomisation=varied) for one in scene.objects]
     unseen = [one for scene in scenes(100, randomisation=varied, objects="unseen") for one in scene.objects]
-    assert {one.style for one in known} == {"usual", "plain", "marked"}
+    styles = [one.style for one in known]
+    for style, share in {"usual": 0.3, "plain": 0.3, "across": 0.1, "marked": 0.3}.items():
+        assert abs(styles.count(style) / len(styles) - share) < 0.06
+    assert {*styles} == {"usual", "plain", "across", "marked"}
     assert {one.style for one in unseen} == {"other"}
     for kind in KINDS:
         heights = [one.height for one in known if one.kind == kind]

@@ -39,8 +39,10 @@ class PerceptionConfig(PreTrainedConfig):
         context: numbers that describe the whole image: where the camera stands, and the light.
         brightness: images are made brighter and darker by up to this share in training.
         recolour: share of the images that have other colours in training, of which no colours are learned.
-        zoom: in training, in half of the images what is looked at closely is made larger by up to 1 + this, or smaller
-            by as much, so that objects of other sizes than those that were recorded are understood.
+        tint: the colours of the others are mixed with one another in training by up to this share, so that other shades
+            of a colour are understood; grey stays grey.
+        zoom: in training, in most of the images what is looked at closely is made up to 1 + this times larger, or up to
+            1 + twice this times smaller, so that objects of other sizes than those that were recorded are understood.
         least_presence: probability from which on something counts as an object.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: of weights.
@@ -61,6 +63,7 @@ class PerceptionConfig(PreTrainedConfig):
     context: int = 64
     brightness: float = 0.2
     recolour: float = 0.5
+    tint: float = 0.3
     zoom: float = 0.5
     least_presence: float = 0.3
 
@@ -102,7 +105,7 @@ class PerceptionConfig(PreTrainedConfig):
         ):
             if not low < getattr(self, name) < high:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be between {low:g} and {high:g}.")
-        for name in ("margin", "brightness", "recolour", "zoom"):
+        for name in ("margin", "brightness", "recolour", "tint", "zoom"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be from 0 to below 1.")
         for name in ("channels", "hidden", "context"):

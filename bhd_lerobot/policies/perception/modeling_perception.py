@@ -32,7 +32,7 @@ _LOG_ERROR = (-4.0, 3.0)
 _DISTINCT = 0.025  # [m] what is found nearer to something surer is that
 _TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
 _RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
-_ZOOMED = 0.5  # share of the images that are learned from larger or smaller
+_ZOOMED = 0.6  # share of the images that are learned from larger or smaller
 _SHADES = 24  # numbers that tell the colour of a cell
 _FITS = 6  # rounds: what is seen depends a little on where the camera is taken to be
 _LEAST_SEEN = 12  # objects; each gives two numbers, and six are to be found from what may in part be wrong
@@ -164,25 +164,28 @@ class PerceptionPolicy(PreTrainedPolicy):
         return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * float(error.detach())}
 
     def _varied(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return images in other light, and some in other colours; and of which the colours are true, shape (batch,).
+        """Return images in other light and shades; some in other colours; and whose colours are true, shape (batch,).
 
         What has other colours teaches nothing about colours, and that shape and place do not depend on them: cups are
         found to be cups in colours in which no cup was seen.
         """
-        config, count = self.config, len(image)
-        factor = 1 + config.brightness * (2 * torch.rand(count, 1, 1, 1, device=image.device) - 1)
-        image = (image * factor).clamp(0, 1)
-        is_true = torch.rand(count, device=image.device) >= config.recolour
-        others = (~is_true).nonzero()[:, 0]
-        if len(others):
-            # A mixture of the three channels for each of the three: new hues, or nearly none.
-            mixture = torch.rand(len(others), 3, 3, device=image.device)
-            mixture = mixture.square() / mixture.square().sum(2, keepdim=True)
-            image[others] = torch.einsum("bij,bjhw->bihw", mixture, image[others]).to(image.dtype)
-        return image, is_true
+        config, count, device = self.config, len(image), image.device
+        if not (config.brightness or config.recolour or config.tint):
+            return image, torch.ones(count, dtype=torch.bool, device=device)
+        uniform = torch.rand(3, count, 1, 1, device=device)
+        is_true = uniform[0] >= config.recolour
+        # A mixture of the three channels for each of the three: new hues, or nearly none. A little of it, or of its
+        # opposite, makes another shade of what is coloured, which brightness does not: the table changes with that.
+        mixture = torch.rand(count, 3, 3, device=device).square()
+        mixture = mixture / mixture.sum(2, keepdim=True)
+        share = torch.where(is_true, config.tint * (2 * uniform[1] - 1), 1.0)
+        light = 1 + config.brightness * (2 * uniform[2] - 1)
+        channels = light * torch.lerp(torch.eye(3, device=device).expand_as(mixture), mixture, share)
+        image = torch.einsum("bij,bjhw->bihw", channels, image).to(image.dtype).clamp(0, 1)
+        return image, is_true[:, 0, 0]
 
     def _zoomed(self, image: Tensor, labels: Labels) -> tuple[Tensor, Labels, Tensor]:
-        """Return the region of the images, in half of them larger or smaller about a point; and what is true of it.
+        """Return the region of the images, in most of them larger or smaller about a point; and what is true of it.
 
         In a part of an image that is twice as large, an object looks like one of twice the size: so objects of other
         sizes than those that there were are understood, too. Where it stands is not learned from that. A camera that
@@ -203,7 +206,8 @@ class PerceptionPolicy(PreTrainedPolicy):
         rows = (torch.rand(len(image), device=device) < _ZOOMED).nonzero()[:, 0]
         if len(rows):
             uniform = torch.rand(3, len(rows), device=device)
-            factor[rows] = torch.exp((2 * uniform[0] - 1) * math.log1p(config.zoom))
+            largest, least = math.log1p(config.zoom), -math.log1p(2 * config.zoom)
+            factor[rows] = torch.exp(least + (largest - least) * uniform[0])
             about[rows, 0], about[rows, 1] = left + uniform[1] * (right - left), top + uniform[2] * (bottom - top)
             x, y = (torch.arange(*ends, device=device) + 0.5 for ends in ((left, right), (top, bottom)))
             pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)

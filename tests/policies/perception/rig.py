@@ -19,7 +19,16 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 WIDTH, HEIGHT = 160, 120
 IMAGE = "observation.images.scene"
 FEATURES = {OBS_ENV_STATE: {"names": list(LABELS)}}
-SMALL = {"channels": 8, "hidden": 12, "context": 8, "device": "cpu", "brightness": 0.0, "recolour": 0.0, "zoom": 0.0}
+SMALL = {
+    "channels": 8,
+    "hidden": 12,
+    "context": 8,
+    "device": "cpu",
+    "brightness": 0.0,
+    "recolour": 0.0,
+    "tint": 0.0,
+    "zoom": 0.0,
+}
 
 
 def config(kind: type[PerceptionConfig] = PerceptionConfig, **options: Any) -> Any:

@@ -242,6 +242,25 @@ def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> No
     assert 0.3 < half.float().mean() < 0.7
 
 
+def test_other_shades_of_a_colour_still_have_its_name_and_grey_stays_grey() -> None:
+    policy = PerceptionPolicy(PerceptionConfig(input_features=config().input_features)).train()
+    policy.config.recolour = policy.config.brightness = 0.0
+    assert policy.config.tint > 0
+    palette = torch.tensor(list(COLOURS.values()))
+    own = torch.arange(len(palette)).repeat(500)
+    grey = torch.linspace(0, 1, len(own))[:, None].expand(-1, 3)
+    pixels = torch.stack([palette[own], grey], dim=1)  # (images, 2, 3)
+    image, is_true = policy._varied(pixels.movedim(1, 2)[..., None])
+    shades, greys = image[..., 0].movedim(2, 1).unbind(1)
+    assert is_true.all()
+    assert torch.allclose(greys, grey, atol=1e-5)
+    assert (torch.cdist(shades, palette).argmin(1) == own).float().mean() > 0.99
+    coloured = palette.std(1)[own] > 0.1
+    apart = (shades - palette[own]).abs().max(1).values[coloured]
+    assert apart.median() > 0.03
+    assert apart.max() < 0.35
+
+
 def test_a_step_of_training_forgets_how_large_errors_were_before(trained: PerceptionPolicy) -> None:
     policy, samples = copy.deepcopy(trained), batch()
     policy.detect(samples[IMAGE])
@@ -280,8 +299,8 @@ def test_larger_images_show_objects_where_their_labels_say() -> None:
     assert close[:, 0][torch.from_numpy(elsewhere > 10)].max() < 0.5  # nothing is shown twice
     larger = zoomed.size[:, 0, 0] / labels.size[:, 0, 0]
     assert torch.equal(is_placed, larger == 1)
-    assert 0.3 < float((larger != 1).float().mean()) < 0.7  # half of them
-    assert float(larger.min()) < 0.8
+    assert 0.4 < float((larger != 1).float().mean()) < 0.8
+    assert float(larger.min()) < 0.65
     assert float(larger.max()) > 1.25
 
 
