@@ -24,7 +24,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )
 _PIXELS_GOAL = 0.6
-_FEW = ("--steps=300", "--eval_steps=300")
+_FEW = ("--steps=600", "--eval_steps=600")
 _OTHERS = ("act", "diffusion")
 _SENSES = {"deaf": "instruction", "blind": "images"}
 _BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
