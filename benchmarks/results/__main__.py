@@ -5,6 +5,7 @@ other sections of the page stay as they are; with `--seeds`, what was measured o
 """
 
 import argparse
+import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ from benchmarks.results.learning import avoid, reach
 from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
-from benchmarks.results.runner import REPOSITORY, FailedError, Runner
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner, lock
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
@@ -75,10 +76,24 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--jobs is {jobs}; it must be at least 1.")
     folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
     page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
-    if options.fresh and folder.exists():
-        shutil.rmtree(folder)
+    try:
+        descriptor = lock(folder)
+    except FailedError as error:
+        print(error, file=sys.stderr)
+        return 2
+    try:
+        return _make(options, folder, page, jobs, descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, descriptor: int) -> int:
+    """Make the results in a folder that is taken; return what `main` does."""
+    if options.fresh:
+        for left in folder.iterdir():
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
     sections: list[Section] = []
-    lock, stopped = Lock(), Event()
+    writing, stopped = Lock(), Event()
 
     def make(group: Sequence[tuple[str, str, Measure]]) -> None:
         for name, title, measure in group:
@@ -86,14 +101,19 @@ def main(arguments: list[str] | None = None) -> int:
                 continue
             section = Section(name, title)
             run = Runner(
-                folder, is_short=options.short, stopped=stopped, chosen=options.seeds, kept=page.with_suffix("")
+                folder,
+                is_short=options.short,
+                stopped=stopped,
+                chosen=options.seeds,
+                kept=page.with_suffix(""),
+                lock=descriptor,
             )
             try:
                 measure(run, section)
             except FailedError as error:
                 raise FailedError(f"{name}: {error}") from None
             section.commands = run.commands
-            with lock:
+            with writing:
                 sections.append(section)
                 # After each section: what takes hours may be stopped.
                 write_page(page, sections, [title for _, title, _ in MEASURES], is_short=options.short)

@@ -1,5 +1,6 @@
 """Runs the commands that results come from, each once, and remembers what they were and how long they took."""
 
+import fcntl
 import json
 import os
 import re
@@ -66,6 +67,7 @@ class Runner:
         stopped: once it is set, no further command is begun.
         chosen: as above.
         kept: as above; one in `folder` if nothing.
+        lock: what `lock` returned, which commands hold as well.
     """
 
     def __init__(
@@ -76,8 +78,10 @@ class Runner:
         stopped: Event | None = None,
         chosen: Sequence[int] | None = None,
         kept: Path | None = None,
+        lock: int | None = None,
     ) -> None:
         self.folder, self.is_short, self._stopped = folder, is_short, stopped
+        self._held = () if lock is None else (lock,)
         self.chosen, self.kept = chosen, folder / "trainings" if kept is None else kept
         self.commands: list[Ran] = []
 
@@ -132,7 +136,9 @@ class Runner:
         print(f"== {command}\n   log: {log}", flush=True)
         started = time.perf_counter()
         with log.open("w", encoding="utf-8") as file:
-            process = subprocess.Popen(_executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT)
+            process = subprocess.Popen(
+                _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=self._held
+            )
             # Its own processor time, and that of the processes that it waited for: others may run beside it.
             _, ended, used = os.wait4(process.pid, 0)
         status = process.returncode = os.waitstatus_to_exitcode(ended)
@@ -155,6 +161,28 @@ class Runner:
     def read(self, *parts: str) -> Any:
         """Return what a JSON file in the folder holds."""
         return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
+
+
+def lock(folder: Path) -> int:
+    """Take a folder, which is made if it is not there; return the descriptor whose end gives it back.
+
+    Two runs in one folder would remove what the other is about to make. A command that outlives a killed run holds it,
+    too.
+
+    Raises:
+        FailedError: another run has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise FailedError(
+            f"Results are being made in {folder} by another process, or by a command that a killed one left running. "
+            "Wait until it ends, or name another folder: --folder."
+        ) from None
+    return descriptor
 
 
 def _read(note: Path) -> Ran:

@@ -2,9 +2,12 @@
 
 import json
 import math
+import os
 import re
 import shlex
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -23,7 +26,7 @@ from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
-from benchmarks.results.runner import FailedError, Ran, Runner
+from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
 from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -384,6 +387,51 @@ def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
     used = {name: json.loads((tmp_path / "notes" / f"{name}.json").read_text()) for name in ("busy", "idle")}
     assert used["busy"]["cpu_seconds"] > 3 * used["idle"]["cpu_seconds"]
     assert program.main([*options, "--only", "idle"]) == 0
+
+
+_LONG = """
+import sys
+from benchmarks.results import __main__ as program
+
+def long(run, section):
+    endless = "import os, pathlib, time; made = pathlib.Path({made!r}); made.mkdir(); "
+    endless += "(made / 'new').write_text(str(os.getpid())); (made / 'new').rename(made / 'pid'); time.sleep(600)"
+    run.run("long", ["python", "-c", endless], makes=("made",))
+
+program.GROUPS = ((("long", "Long", long),),)
+sys.exit(program.main(sys.argv[1:]))
+"""
+
+
+def test_two_runs_in_one_folder_do_not_remove_what_the_other_makes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pid, options = tmp_path / "made" / "pid", [f"--folder={tmp_path}", f"--page={tmp_path / 'page.md'}"]
+    command = [sys.executable, "-c", _LONG.format(made=str(tmp_path / "made")), *options]
+    first = subprocess.Popen(command, cwd=REPOSITORY)
+    try:
+        until(pid.exists, "the first run makes something")
+        for fresh in ([], ["--fresh"]):
+            assert program.main([*options, *fresh]) == 2
+        first.kill()
+        first.wait()
+        # What it ran goes on, and nothing that it makes is removed.
+        assert program.main(options) == 2
+        assert pid.exists()
+    finally:
+        first.kill()
+        if pid.exists():
+            os.kill(int(pid.read_text()), signal.SIGKILL)
+    assert capsys.readouterr().err.count("by another process, or by a command that a killed one left running") == 3
+    until(lambda: _is_free(tmp_path), "the command has ended")
+
+
+def _is_free(folder: Path) -> bool:
+    try:
+        os.close(lock(folder))
+    except FailedError:
+        return False
+    return True
 
 
 def test_a_run_that_is_stopped_begins_nothing_else_and_says_how_to_go_on(
