@@ -211,7 +211,11 @@ SEE = Lesson(
     options=("--task.type=pick", "--task.duration_s=0.04"),
     video=False,
     network="bhd_perception",
-    policy=("--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=50"),
+    # Objects of other sizes and shades than it learned from are not what is shown here: 96 of 120 picks, 84 with both.
+    policy=(
+        *("--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=50"),
+        *("--policy.zoom=0", "--policy.tint=0"),
+    ),
     batch=16,
     steps=600,
     trials=12,
