@@ -24,7 +24,7 @@ SHORTER = {
         '"camera_width": 320, "camera_height": 240': '"camera_width": 96, "camera_height": 72',
         '"eval_split": 0.05': '"eval_split": 0.25',
         '{"type": "bhd_perception"}': '{"type": "bhd_perception", "channels": 8, "hidden": 8, "context": 8}',
-        "batch_size=32": "batch_size=4",
+        "batch_size=16": "batch_size=4",
         "steps=2400": "steps=4",
         "eval_steps=1200": "eval_steps=4",
         "n_episodes=200": "n_episodes=4",
