@@ -91,7 +91,7 @@ def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, desc
     """Make the results in a folder that is taken; return what `main` does."""
     if options.fresh:
         for left in folder.iterdir():
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
+            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
     sections: list[Section] = []
     writing, stopped = Lock(), Event()
 

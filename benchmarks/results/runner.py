@@ -170,10 +170,13 @@ def lock(folder: Path) -> int:
     too.
 
     Raises:
-        FailedError: another run has it.
+        FailedError: another run has it, or it cannot be made.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise FailedError(f"{folder} cannot be used as a folder: {error.strerror}. Name another: --folder.") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -211,7 +211,7 @@ SEE = Lesson(
     options=("--task.type=pick", "--task.duration_s=0.04"),
     video=False,
     network="bhd_perception",
-    # Objects of other sizes and shades than it learned from are not what is shown here: 96 of 120 picks, 84 with both.
+    # So short a training has no room for sizes and shades that it is not shown: 96 of 120 picks, and 84 with both.
     policy=(
         *("--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=50"),
         *("--policy.zoom=0", "--policy.tint=0"),

@@ -25,8 +25,8 @@ class RandomisationConfig:
         size: an object's measures are multiplied by 1 - this to 1 + this.
         colour: up to this is added to or taken from each of an object's red, green and blue.
         plain: probability that an object lacks what others of its kind have: a cup its handle, a box its tape.
-        across: probability that a box has its tape across, not along its length.
         marked: probability that it has neither of these, but a stripe around it and a patch on its top, light or dark.
+        across: probability that a box has its tape across, not along its length.
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
@@ -48,8 +48,8 @@ class RandomisationConfig:
     size: float = 0.1
     colour: float = 0.08
     plain: float = 0.0
-    across: float = 0.0
     marked: float = 0.0
+    across: float = 0.0
     light: float = 0.4
     light_direction: float = 0.3
     camera_m: float = 0.02
@@ -83,10 +83,10 @@ class RandomisationConfig:
                 f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
                 f"which is {self.latency_s}."
             )
-        if self.plain + self.across + self.marked > 1:
+        if self.plain + self.marked + self.across > 1:
             raise ConfigError(
-                f"randomisation.plain is {self.plain}, randomisation.across {self.across} and randomisation.marked "
-                f"{self.marked}; they are probabilities, together at most 1."
+                f"randomisation.plain is {self.plain}, randomisation.marked {self.marked} and randomisation.across "
+                f"{self.across}; they are probabilities, together at most 1."
             )
         for name in ("size", "light"):
             if getattr(self, name) >= 1:

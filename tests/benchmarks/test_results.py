@@ -398,14 +398,18 @@ def long(run, section):
     endless += "(made / 'new').write_text(str(os.getpid())); (made / 'new').rename(made / 'pid'); time.sleep(600)"
     run.run("long", ["python", "-c", endless], makes=("made",))
 
+program.LAST = ("last", "Last", lambda run, section: None)
 program.GROUPS = ((("long", "Long", long),),)
+program.MEASURES = (*program.GROUPS[0], program.LAST)
 sys.exit(program.main(sys.argv[1:]))
 """
 
 
 def test_two_runs_in_one_folder_do_not_remove_what_the_other_makes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(program, "GROUPS", ())  # should it not be refused, it shall at least not take hours
+    monkeypatch.setattr(program, "LAST", ("last", "Last", lambda *_: None))
     pid, options = tmp_path / "made" / "pid", [f"--folder={tmp_path}", f"--page={tmp_path / 'page.md'}"]
     command = [sys.executable, "-c", _LONG.format(made=str(tmp_path / "made")), *options]
     first = subprocess.Popen(command, cwd=REPOSITORY)
@@ -424,6 +428,25 @@ def test_two_runs_in_one_folder_do_not_remove_what_the_other_makes(
             os.kill(int(pid.read_text()), signal.SIGKILL)
     assert capsys.readouterr().err.count("by another process, or by a command that a killed one left running") == 3
     until(lambda: _is_free(tmp_path), "the command has ended")
+
+
+def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_is_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert program.main([f"--folder={tmp_path / 'file'}"]) == 2
+    assert "file cannot be used as a folder: File exists. Name another: --folder" in capsys.readouterr().err
+    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "results"
+    for one in (elsewhere, folder / "notes"):
+        one.mkdir(parents=True)
+        (one / "kept").write_text("")
+    (folder / "link").symlink_to(elsewhere)
+    monkeypatch.setattr(program, "GROUPS", ())
+    monkeypatch.setattr(program, "LAST", ("last", "Last", lambda *_: None))
+    assert program.main([f"--folder={folder}", f"--page={tmp_path / 'page.md'}", "--fresh", "--only", "avoid"]) == 0
+    assert not list(folder.iterdir())
+    assert (elsewhere / "kept").exists()
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def _is_free(folder: Path) -> bool:

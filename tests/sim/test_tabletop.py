@@ -299,9 +299,6 @@ def test_a_camera_sees_each_table_as_it_is_laid_now() -> None:
         camera.close()
 
 
-# --- touch -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_differ() -> None:
     box = TableObject("box", "blue", 0.045, 0.025, 0.08, 0.5, 0.0)
     world = World(BODY, 2)
@@ -317,6 +314,9 @@ def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_diff
     for name in ("geom_size", "geom_rgba", "geom_friction"):
         np.testing.assert_array_equal(getattr(along, name)[same], getattr(across, name)[same])
     np.testing.assert_array_equal(along.body_inertia, across.body_inertia)
+
+
+# --- touch -----------------------------------------------------------------------------------------------------------
 
 
 def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, bool, list[bool]]:

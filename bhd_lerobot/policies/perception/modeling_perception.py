@@ -175,7 +175,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         uniform = torch.rand(3, count, 1, 1, device=device)
         is_true = uniform[0] >= config.recolour
         # A mixture of the three channels for each of the three: new hues, or nearly none. A little of it, or of its
-        # opposite, makes another shade of what is coloured, which brightness does not: the table changes with that.
+        # opposite, makes another shade. The rows' sums are 1, so that grey stays grey.
         mixture = torch.rand(count, 3, 3, device=device).square()
         mixture = mixture / mixture.sum(2, keepdim=True)
         share = torch.where(is_true, config.tint * (2 * uniform[1] - 1), 1.0)
