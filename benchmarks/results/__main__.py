@@ -20,7 +20,7 @@ from benchmarks.results.learning import avoid, reach
 from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
-from benchmarks.results.runner import REPOSITORY, FailedError, Runner, lock
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner, check_own, lock
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
         choices=SEEDS,
         help="training seeds to make; the others stay as they were measured before, which lies beside the page",
     )
-    parser.add_argument("--fresh", action="store_true", help="begin anew")
+    parser.add_argument("--fresh", action="store_true", help="begin anew: remove all that is in the folder")
     options = parser.parse_args(arguments)
     jobs = (2 if options.short else 1) if options.jobs is None else options.jobs
     if jobs < 1:
@@ -77,6 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
     folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
     page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
     try:
+        if options.fresh:
+            check_own(folder)
         descriptor = lock(folder)
     except FailedError as error:
         print(error, file=sys.stderr)

@@ -16,6 +16,7 @@ from threading import Event
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+_NOTES = "notes"  # in the folder of a run: what was run, and for how long
 
 # Command lines, and the modules behind them: the tests of a checkout must not depend on what is in PATH.
 _MODULES = {
@@ -120,7 +121,7 @@ class Runner:
         command = shlex.join(arguments)
         if self._stopped is not None and self._stopped.is_set():
             raise FailedError(f"{command}\nwas not begun: the run was stopped.")
-        note = REPOSITORY / self.path("notes", f"{name}.json")
+        note = REPOSITORY / self.path(_NOTES, f"{name}.json")
         is_outdated = note.exists() and self._is_outdated(note)
         if note.exists() and not is_outdated:
             kept = _read(note)
@@ -155,7 +156,7 @@ class Runner:
     def _is_outdated(self, note: Path) -> bool:
         """Whether something that the command of a note names was made after it had ended."""
         command, ended = _read(note).command, note.stat().st_mtime_ns
-        newer = (one for one in (REPOSITORY / self.path("notes")).rglob("*.json") if one.stat().st_mtime_ns > ended)
+        newer = (one for one in (REPOSITORY / self.path(_NOTES)).rglob("*.json") if one.stat().st_mtime_ns > ended)
         return any(re.search(rf"{re.escape(path)}(?![\w-])", command) for one in newer for path in _read(one).makes)
 
     def read(self, *parts: str) -> Any:
@@ -186,6 +187,19 @@ def lock(folder: Path) -> int:
             "Wait until it ends, or name another folder: --folder."
         ) from None
     return descriptor
+
+
+def check_own(folder: Path) -> None:
+    """Check that a folder may be emptied.
+
+    Raises:
+        FailedError: it holds something, and no notes of a run that made it.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / _NOTES).is_dir():
+        raise FailedError(
+            f"{folder} holds what no run of `make results` made: it has no folder {_NOTES!r}. --fresh would remove it. "
+            "Name another folder (--folder), or empty it yourself."
+        )
 
 
 def _read(note: Path) -> Ran:

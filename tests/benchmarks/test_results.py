@@ -23,7 +23,7 @@ from benchmarks.results import __main__ as program
 from benchmarks.results import trainings
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered
-from benchmarks.results.learning import values
+from benchmarks.results.learning import seeds_rows, values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
@@ -121,6 +121,9 @@ def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
     low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98]))[1:3])
     assert low < 90
     assert 98 < high <= 100  # three seeds say little
+    made = {seed: {"brains": {f"seed_{seed}": {"success": {"value": 0.9}}}} for seed in range(3)}
+    assert [row.value[:5] for row in seeds_rows(made)] == ["90.0%"]
+    assert not seeds_rows({seed: made[seed] for seed in (0, 1)}), "of two it would be from 22 to 100 %"
 
 
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
@@ -430,7 +433,7 @@ def test_two_runs_in_one_folder_do_not_remove_what_the_other_makes(
     until(lambda: _is_free(tmp_path), "the command has ended")
 
 
-def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_is_in_it(
+def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_a_run_made_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("mine")
@@ -445,6 +448,8 @@ def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_is_in_it(
     monkeypatch.setattr(program, "LAST", ("last", "Last", lambda *_: None))
     assert program.main([f"--folder={folder}", f"--page={tmp_path / 'page.md'}", "--fresh", "--only", "avoid"]) == 0
     assert not list(folder.iterdir())
+    assert program.main([f"--folder={elsewhere}", "--fresh"]) == 2
+    assert "elsewhere holds what no run of `make results` made" in capsys.readouterr().err
     assert (elsewhere / "kept").exists()
     assert (tmp_path / "file").read_text() == "mine"
 
