@@ -347,9 +347,7 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
 
 
 def seeds_rows(made: Mapping[int, Any], what: str = "all seeds", name: str = "") -> list[Row]:
-    """Return the row of the mean success of policies that differ in their training seeds only; none below three.
-
-    Of two, the interval over seeds goes from nearly nothing to nearly everything.
+    """Return the row of the mean success of policies that differ in their training seeds only; none if there is one.
 
     Args:
         made: what `summary` returned, by seed.
@@ -358,4 +356,4 @@ def seeds_rows(made: Mapping[int, Any], what: str = "all seeds", name: str = "")
     """
     rates = [float(results["brains"][name or f"seed_{seed}"]["success"]["value"]) for seed, results in made.items()]
     what = f"{what}: mean success, its interval over {len(rates)} trainings"
-    return [Row(what, over_seeds(rates))] if len(rates) > 2 else []
+    return [Row(what, over_seeds(rates))] if len(rates) > 1 else []

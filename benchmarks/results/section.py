@@ -75,9 +75,10 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
 def over_seeds(rates: Sequence[float]) -> str:
     """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds.
 
-    Where all are the same, or there is one, there is no interval.
+    It takes trainings that fail now and then for improbable, if none of these did: three cannot tell. Where all are the
+    same, or there is one, there is no interval.
     """
-    one = statistics.mean(rates, within=(0.0, 1.0))
+    one = statistics.mean(rates)
     interval = "" if math.isnan(one.low) else f" ({max(0.0, one.low):.1%} to {min(1.0, one.high):.1%})"
     return f"{one.value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
 
