@@ -434,7 +434,7 @@ class _Network(nn.Module):
     def __init__(self, config: PerceptionConfig) -> None:
         super().__init__()
         fine, coarse, context = config.channels, config.hidden, config.context
-        # Whether what is small is a cup or a box shows in a few pixels: two layers look at every second of them.
+        # Cups and boxes that are small differ in a few pixels: more than one layer sees half of the resolution.
         self.stem = nn.Sequential(
             _convolution(3, 16, 5, stride=2),
             _convolution(16, 16, 3),
