@@ -6,7 +6,6 @@ other sections of the page stay as they are; with `--seeds`, what was measured o
 
 import argparse
 import os
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,7 +19,7 @@ from benchmarks.results.learning import avoid, reach
 from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
-from benchmarks.results.runner import REPOSITORY, FailedError, Runner, check_own, lock
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner, empty, lock
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
@@ -77,23 +76,23 @@ def main(arguments: list[str] | None = None) -> int:
     folder = REPOSITORY / (options.folder or (f"{_FOLDER}_short" if options.short else _FOLDER))
     page = REPOSITORY / (options.page or (folder / "results.md" if options.short else _PAGE))
     try:
-        if options.fresh:
-            check_own(folder)
         descriptor = lock(folder)
     except FailedError as error:
         print(error, file=sys.stderr)
         return 2
     try:
+        if options.fresh:
+            empty(folder)
         return _make(options, folder, page, jobs, descriptor)
+    except FailedError as error:
+        print(error, file=sys.stderr)
+        return 2
     finally:
         os.close(descriptor)
 
 
 def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, descriptor: int) -> int:
     """Make the results in a folder that is taken; return what `main` does."""
-    if options.fresh:
-        for left in folder.iterdir():
-            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
     sections: list[Section] = []
     writing, stopped = Lock(), Event()
 

@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-_NOTES = "notes"  # in the folder of a run: what was run, and for how long
+_OWN = ".made_by_results"  # in a folder that was empty when a run took it
 
 # Command lines, and the modules behind them: the tests of a checkout must not depend on what is in PATH.
 _MODULES = {
@@ -121,7 +121,7 @@ class Runner:
         command = shlex.join(arguments)
         if self._stopped is not None and self._stopped.is_set():
             raise FailedError(f"{command}\nwas not begun: the run was stopped.")
-        note = REPOSITORY / self.path(_NOTES, f"{name}.json")
+        note = REPOSITORY / self.path("notes", f"{name}.json")
         is_outdated = note.exists() and self._is_outdated(note)
         if note.exists() and not is_outdated:
             kept = _read(note)
@@ -156,7 +156,7 @@ class Runner:
     def _is_outdated(self, note: Path) -> bool:
         """Whether something that the command of a note names was made after it had ended."""
         command, ended = _read(note).command, note.stat().st_mtime_ns
-        newer = (one for one in (REPOSITORY / self.path(_NOTES)).rglob("*.json") if one.stat().st_mtime_ns > ended)
+        newer = (one for one in (REPOSITORY / self.path("notes")).rglob("*.json") if one.stat().st_mtime_ns > ended)
         return any(re.search(rf"{re.escape(path)}(?![\w-])", command) for one in newer for path in _read(one).makes)
 
     def read(self, *parts: str) -> Any:
@@ -186,20 +186,25 @@ def lock(folder: Path) -> int:
             f"Results are being made in {folder} by another process, or by a command that a killed one left running. "
             "Wait until it ends, or name another folder: --folder."
         ) from None
+    if not any(folder.iterdir()):
+        (folder / _OWN).touch()
     return descriptor
 
 
-def check_own(folder: Path) -> None:
-    """Check that a folder may be emptied.
+def empty(folder: Path) -> None:
+    """Remove all that is in a folder that was taken; links, not what they lead to.
 
     Raises:
-        FailedError: it holds something, and no notes of a run that made it.
+        FailedError: the folder was not made, or was not empty, when a run took it first: some of that is not ours.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / _NOTES).is_dir():
+    left = [one for one in folder.iterdir() if one.name != _OWN]
+    if left and not (folder / _OWN).exists():
         raise FailedError(
-            f"{folder} holds what no run of `make results` made: it has no folder {_NOTES!r}. --fresh would remove it. "
-            "Name another folder (--folder), or empty it yourself."
+            f"{folder} has no file {_OWN}: what it holds was not made by `make results`, or by an older version of it, "
+            "and --fresh would remove it. Name another folder (--folder), or empty it yourself."
         )
+    for one in left:
+        shutil.rmtree(one) if one.is_dir() and not one.is_symlink() else one.unlink()
 
 
 def _read(note: Path) -> Ran:

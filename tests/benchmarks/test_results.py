@@ -438,17 +438,24 @@ def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_a_run_made_and_
     assert program.main([f"--folder={tmp_path / 'file'}"]) == 2
     assert "file cannot be used as a folder: File exists. Name another: --folder" in capsys.readouterr().err
     elsewhere, folder = tmp_path / "elsewhere", tmp_path / "results"
-    for one in (elsewhere, folder / "notes"):
-        one.mkdir(parents=True)
+    for one in (elsewhere / "notes", elsewhere):
+        one.mkdir(parents=True, exist_ok=True)
         (one / "kept").write_text("")
-    (folder / "link").symlink_to(elsewhere)
     monkeypatch.setattr(program, "GROUPS", ())
     monkeypatch.setattr(program, "LAST", ("last", "Last", lambda *_: None))
-    assert program.main([f"--folder={folder}", f"--page={tmp_path / 'page.md'}", "--fresh", "--only", "avoid"]) == 0
-    assert not list(folder.iterdir())
-    assert program.main([f"--folder={elsewhere}", "--fresh"]) == 2
-    assert "elsewhere holds what no run of `make results` made" in capsys.readouterr().err
+    options = [f"--page={tmp_path / 'page.md'}", "--only", "avoid"]
+    assert program.main([f"--folder={folder}", *options]) == 0
+    made = list(folder.iterdir())
+    (folder / "notes").mkdir()
+    (folder / "notes" / "one.json").write_text("")
+    (folder / "link").symlink_to(elsewhere)
+    assert program.main([f"--folder={folder}", *options, "--fresh"]) == 0
+    assert list(folder.iterdir()) == made
+    assert program.main([f"--folder={elsewhere}", *options]) == 0
+    assert program.main([f"--folder={elsewhere}", *options, "--fresh"]) == 2
+    assert "elsewhere has no file .made_by_results" in capsys.readouterr().err
     assert (elsewhere / "kept").exists()
+    assert (elsewhere / "notes" / "kept").exists()
     assert (tmp_path / "file").read_text() == "mine"
 
 
