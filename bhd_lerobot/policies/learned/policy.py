@@ -140,8 +140,8 @@ def _load(folder: Path, config: Any, device: str) -> tuple[Any, Any, Any]:
         reason = " ".join(str(error).split())
         raise ConfigError(
             f"The checkpoint {folder} cannot be loaded ({type(error).__name__}: {reason[:300]}). It was perhaps "
-            "interrupted while it was written or copied: use an earlier checkpoint of the run, or copy it again. Or another "
-            "version wrote it, with another network (CHANGELOG.md): train anew."
+            "interrupted while it was written or copied: use an earlier checkpoint of the run, or copy it again. Or "
+            "another version wrote it, with another network (CHANGELOG.md): train anew."
         ) from error
     policy.eval()
     return policy, before, after
