@@ -71,7 +71,7 @@ class CnnPolicy(MlpPolicy):
             reduction: ``"mean"``, or ``"none"`` for one loss a row, shape (batch,).
         """
         features, log_range = self._look(batch)
-        loss, outputs = self._compared(self._chunk(features, batch), batch, reduction)
+        loss, outputs = self._compared(features, batch, reduction)
         true = self._history(batch, OBS_RANGES)[:, -1].clamp(self.config.range_minimum, self.config.range_maximum)
         error = (log_range - true.log()).abs().mean(-1)
         outputs["range_error"] = float(error.detach().mean())

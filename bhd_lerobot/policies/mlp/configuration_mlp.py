@@ -144,6 +144,8 @@ class MlpConfig(PreTrainedConfig):
         loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if nothing, ``"nll"`` with `gaussian` and
             ``"l1"`` without.
         huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.
+        modes: chunks that it predicts, of which it carries out the likeliest: where a rule passes something now on the
+            left and now on the right, the mean of both is neither.
         gaussian: also learn how much actions scatter, as a standard deviation for every action of the chunk that does
             not depend on the observation.
         initial_log_std: its logarithm before training, in normalised actions.
@@ -189,6 +191,7 @@ class MlpConfig(PreTrainedConfig):
     min_std: float = 1e-3
     loss: str | None = None
     huber_delta: float = 0.5
+    modes: int = 1
     gaussian: bool = False
     initial_log_std: float = 0.0
     sample: bool = False
@@ -230,7 +233,7 @@ class MlpConfig(PreTrainedConfig):
             ConfigError: names the value and the valid ones.
         """
         super().__post_init__()
-        positive = dict.fromkeys(("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps"), 1)
+        positive = dict.fromkeys(("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps", "modes"), 1)
         for name, least in {**positive, "yaw_harmonics": 0}.items():
             if getattr(self, name) < least:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least {least}.")

@@ -25,6 +25,7 @@ ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
 }
 _LOG_STD = (-5.0, 2.0)  # a standard deviation that goes to 0 makes the loss go to minus infinity
+_MODE_SCALE = 0.1  # of a Laplace distribution about each mode, in normalised actions
 _PADDING = "action_is_pad"
 _PREPROCESSED = " Run the policy's own preprocessor first."
 _HINTS = {
@@ -73,7 +74,8 @@ class MlpPolicy(PreTrainedPolicy):
         self.feature_size = (
             steps * (len(columns) + environment_size + yaws + relative) + self._beams + config.sight_size
         )
-        self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
+        outputs = config.modes * config.chunk_size * self._action_size + (config.modes if config.modes > 1 else 0)
+        self.net = nn.Sequential(*_perceptron(config, self.feature_size, outputs))
         self.residual: Residual | None = None
         if config.residual:
             self.residual = Residual(config.residual_columns, kwargs.get("dataset_stats"), config.min_std)
@@ -153,21 +155,28 @@ class MlpPolicy(PreTrainedPolicy):
                 (batch, chunk_size), if any is.
             reduction: ``"mean"``, or ``"none"`` for one loss a row, shape (batch,).
         """
-        return self._compared(self._chunk(self.features(batch), batch), batch, reduction)
+        return self._compared(self.features(batch), batch, reduction)
 
-    def _compared(self, mean: Tensor, batch: dict[str, Tensor], reduction: str) -> tuple[Tensor, dict[str, float]]:
-        """Return what `forward` returns, given the chunks that were predicted, shape (batch, chunk_size, actions)."""
+    def _compared(self, features: Tensor, batch: dict[str, Tensor], reduction: str) -> tuple[Tensor, dict[str, float]]:
+        """Return what `forward` returns, given what the network sees."""
+        chunks, logits = self._chunks(features, batch)
         target = batch[ACTION]
-        target = target.unsqueeze(1) if target.ndim == 2 else target
-        loss = self._loss(mean, target)
+        target = (target.unsqueeze(1) if target.ndim == 2 else target).unsqueeze(1)
+        loss = self._loss(chunks, target)
         padding = batch.get(_PADDING)
-        valid = torch.ones_like(loss[..., :1]) if padding is None else (~padding).unsqueeze(-1).to(loss.dtype)
-        loss = loss * valid
-        outputs = {"l1_loss": float(((mean.detach() - target).abs() * valid).sum() / (valid.sum() * target.shape[-1]))}
+        valid = torch.ones_like(target[..., :1]) if padding is None else (~padding)[:, None, :, None].to(loss.dtype)
+        numbers = (valid.sum((1, 2, 3)) * target.shape[-1]).clamp_min(1)
+        # Of a mixture: what is nearest to the target learns from it, and that it was the one to choose.
+        scale = _MODE_SCALE * numbers
+        mixed = torch.log_softmax(logits, dim=1) - (loss * valid).sum((2, 3)) / scale.unsqueeze(1)
+        loss = -scale * mixed.logsumexp(1)
+        chosen = chosen_mode(chunks.detach(), logits)
+        error = (chosen - target[:, 0]).abs() * valid[:, 0]
+        outputs = {"l1_loss": float(error.sum() / (valid.sum() * target.shape[-1]))}
         if self.log_std is not None:
             outputs["std"] = float(self._std().detach().mean())
         if reduction == "none":
-            return loss.sum((1, 2)) / (valid.sum((1, 2)) * target.shape[-1]).clamp_min(1), outputs
+            return loss / numbers, outputs
         return loss.sum() / (valid.sum() * target.shape[-1]).clamp_min(1), outputs
 
     @torch.no_grad()
@@ -209,8 +218,24 @@ class MlpPolicy(PreTrainedPolicy):
         return self._planned.popleft()
 
     def _chunk(self, features: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        chunk: Tensor = self.net(features).unflatten(-1, (self.config.chunk_size, self._action_size))
-        return chunk if self.residual is None else chunk + self.residual(self._history(batch, OBS_STATE)[:, -1])
+        return chosen_mode(*self._chunks(features, batch))
+
+    def _chunks(self, features: Tensor, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the chunk of each mode, shape (batch, modes, chunk_size, actions), and the modes' logits."""
+        chunks, logits = self.split_modes(self.net(features))
+        if self.residual is not None:
+            chunks = chunks + self.residual(self._history(batch, OBS_STATE)[:, -1]).unsqueeze(1)
+        return chunks, logits
+
+    def split_modes(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Split what the network says into chunks, shape (batch, modes, chunk_size, actions), and the modes' logits.
+
+        Args:
+            outputs: of `net`, shape (batch, outputs).
+        """
+        shape = (self.config.modes, self.config.chunk_size, self._action_size)
+        chunks, logits = outputs.tensor_split([math.prod(shape)], dim=-1)
+        return chunks.unflatten(-1, shape), logits if self.config.modes > 1 else outputs.new_zeros(len(outputs), 1)
 
     def _history(self, batch: dict[str, Tensor], key: str) -> Tensor:
         """Return an input, shape (batch, n_obs_steps, width)."""
@@ -235,7 +260,8 @@ class MlpPolicy(PreTrainedPolicy):
         return self.log_std.clamp(*_LOG_STD).exp()
 
     def _loss(self, mean: Tensor, target: Tensor) -> Tensor:
-        """Return the loss of every number, in the shape of the target."""
+        """Return the loss of every number, in the shape of what was predicted."""
+        target = target.expand_as(mean)
         match self.config.loss_name:
             case "l1":
                 return functional.l1_loss(mean, target, reduction="none")
@@ -245,6 +271,11 @@ class MlpPolicy(PreTrainedPolicy):
                 return functional.huber_loss(mean, target, reduction="none", delta=self.config.huber_delta)
         std = self._std()
         return 0.5 * ((target - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
+
+
+def chosen_mode(chunks: Tensor, logits: Tensor) -> Tensor:
+    """Return the chunk of the likeliest mode, shape (batch, chunk_size, actions); see `MlpPolicy.split_modes`."""
+    return chunks[torch.arange(len(chunks), device=chunks.device), logits.argmax(1)]
 
 
 def _perceptron(config: MlpConfig, inputs: int, outputs: int) -> list[nn.Module]:

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
 
-from bhd_lerobot.policies.mlp.modeling_mlp import ACTIVATION_LAYERS, MlpPolicy
+from bhd_lerobot.policies.mlp.modeling_mlp import ACTIVATION_LAYERS, MlpPolicy, chosen_mode
 from bhd_lerobot.training.rl.config import RlConfig
 from bhd_lerobot.training.rl.environment import RlVecEnv
 from bhd_lerobot.training.rl.log import Row
@@ -96,6 +96,23 @@ class Networks(nn.Module):
         return self.value_net(features)
 
 
+class ActionHead(nn.Module):
+    """From the last hidden layer of a `bhd_mlp` with a chunk of one action to that action, of the likeliest mode.
+
+    Args:
+        policy: the `bhd_mlp`; its last layer is shared, not copied.
+    """
+
+    def __init__(self, policy: MlpPolicy) -> None:
+        super().__init__()
+        self.last = policy.net[-1]
+        self._split = policy.split_modes
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Return actions, shape (n, actions), of hidden layers, shape (n, width)."""
+        return chosen_mode(*self._split(self.last(hidden)))[:, 0]
+
+
 class MlpActorCritic(ActorCriticPolicy):
     """A `bhd_mlp` as actor, and a critic of its own.
 
@@ -145,7 +162,7 @@ class MlpActorCritic(ActorCriticPolicy):
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         actor, *_, fresh = self._ingredients
-        self.action_net = actor.net[-1]
+        self.action_net = ActionHead(actor)
         parts: list[tuple[nn.Module, float]] = [(self.mlp_extractor.value_net, 2**0.5), (self.value_net, 1.0)]
         if fresh:
             parts += [(self.mlp_extractor.policy_net, 2**0.5), (self.action_net, 0.01)]

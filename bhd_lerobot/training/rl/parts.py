@@ -149,11 +149,14 @@ def single_action(policy: MlpPolicy) -> MlpPolicy:
     config = dataclasses.replace(old, **values)
     config.scan = copy.deepcopy(old.scan)
     actor = MlpPolicy(config)
-    size = int(config.action_feature.shape[0])
+    size, modes = int(config.action_feature.shape[0]), old.modes
     state = dict(policy.state_dict())
     last = f"net.{len(policy.net) - 1}"
+    rows = torch.arange(len(state[f"{last}.bias"]))
+    chunks = modes * old.chunk_size * size
+    first = rows[:chunks].reshape(modes, old.chunk_size * size)[:, :size].flatten()
     for name in ("weight", "bias"):
-        state[f"{last}.{name}"] = state[f"{last}.{name}"][:size].clone()
+        state[f"{last}.{name}"] = state[f"{last}.{name}"][torch.cat([first, rows[chunks:]])]
     if "log_std" in state:
         state["log_std"] = state["log_std"][:1].clone()
     else:

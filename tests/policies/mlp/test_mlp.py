@@ -322,6 +322,32 @@ def test_it_learns_a_function_and_how_much_it_scatters() -> None:
     assert outputs["std"] == pytest.approx(float(policy.log_std.detach().exp().mean()), abs=0.05)
 
 
+def test_where_two_ways_are_shown_it_takes_the_likelier_and_not_what_is_between_them() -> None:
+    torch.manual_seed(0)
+    made = config(0, modes=3, hidden_dims=[32], chunk_size=1, optimizer_lr=1e-2, scheduler="constant")
+    policy = MlpPolicy(made)
+    optimizer = made.get_optimizer_preset().build(policy.get_optim_params())
+    for step in range(400):
+        generator = torch.Generator().manual_seed(step)
+        state = torch.randn(128, 10, generator=generator)
+        # To the left or to the right, more often to the side of the first number; forward as the second says.
+        is_left = torch.rand(128, generator=generator) < 0.5 + 0.2 * state[:, 0].sign()
+        action = torch.stack([is_left.float() * 2 - 1, state[:, 1].sin()], dim=-1)
+        loss, _ = policy({OBS_STATE: state, ACTION: action.unsqueeze(1)})
+        rows, _ = policy({OBS_STATE: state, ACTION: action.unsqueeze(1)}, reduction="none")
+        assert rows.mean().item() == pytest.approx(loss.item(), abs=1e-5)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    state = torch.randn(256, 10, generator=torch.Generator().manual_seed(9999))
+    state = state[state[:, 0].abs() > 0.3]
+    turn, forward = policy.predict_action_chunk({OBS_STATE: state})[:, 0].T
+    assert float((turn - state[:, 0].sign()).abs().median()) < 0.1
+    assert float((turn.abs() < 0.7).float().mean()) < 0.02
+    assert float((turn.sign() == state[:, 0].sign()).float().mean()) > 0.9
+    assert float((forward - state[:, 1].sin()).abs().mean()) < 0.15
+
+
 def test_biases_and_deviations_do_not_decay() -> None:
     policy = MlpPolicy(config(gaussian=True, layer_norm=True, scan=ScanConfig(channels=[2])))
     weights, others = policy.get_optim_params()

@@ -27,7 +27,7 @@ from bhd_lerobot.training.rl import train as module
 from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 from bhd_lerobot.training.rl.environment import RlVecEnv
 from bhd_lerobot.training.rl.features import in_units
-from bhd_lerobot.training.rl.learner import make_learner
+from bhd_lerobot.training.rl.learner import ActionHead, ActorHead, make_learner
 from bhd_lerobot.training.rl.log import draw_curve
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, main, train
@@ -392,14 +392,20 @@ def test_bhd_train_with_an_algorithm_runs_reinforcement_learning(tmp_path: Path,
     assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
 
 
-def test_the_first_action_of_the_checkpoints_chunk_becomes_the_actors() -> None:
-    policy = MlpPolicy(mlp(chunk_size=4))
+@pytest.mark.parametrize("modes", [1, 3])
+def test_the_first_action_of_the_checkpoints_chunk_becomes_the_actors(modes: int) -> None:
+    torch.manual_seed(0)
+    policy = MlpPolicy(mlp(chunk_size=4, modes=modes))
     actor = single_action(policy)
-    batch = {"observation.state": torch.linspace(-1, 1, 10).reshape(2, 5)}
+    batch = {"observation.state": torch.randn(32, 5)}
     chunk = policy.predict_action_chunk(batch)
     torch.testing.assert_close(actor.predict_action_chunk(batch)[:, 0], chunk[:, 0], rtol=0, atol=1e-6)
     assert actor.config.chunk_size == 1
     assert actor.log_std is not None
+    # In PPO, too.
+    features = actor.features(batch)
+    learned = ActionHead(actor)(ActorHead(actor, features.shape[1])(features))
+    torch.testing.assert_close(learned, chunk[:, 0], rtol=0, atol=1e-6)
 
 
 def mlp(**values: object) -> MlpConfig:
