@@ -69,8 +69,8 @@ def camera_drive(run: Runner, section: Section) -> None:
         "camera, and the wheels' odometry. The "
         "lidar's ranges taught it how far away things are; they are no input, and neither is what ground it has "
         f"visited. `clone` learned from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further "
-        "rounds, corrected by the rule. `blind` is seed 0 with black images: it drives a small circle, on which it touches "
-        "nothing and gets nowhere, so success alone says little here, and the score counts."
+        "rounds, corrected by the rule. `blind` is seed 0 with black images: it drives a small circle, on which it "
+        "touches nothing and gets nowhere, so success alone says little here, and the score counts."
     )
 
 
