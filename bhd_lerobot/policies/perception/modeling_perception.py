@@ -43,7 +43,7 @@ _OUTPUTS = {
     "is_box": 1,
     "colour": len(COLOURS),
     "size": 3,
-    "yaw": 2,
+    "yaw": 4,
 }
 
 
@@ -235,7 +235,7 @@ class PerceptionPolicy(PreTrainedPolicy):
     def _errors(self, answers: Mapping[str, Tensor], true: Labels) -> dict[str, Tensor]:
         """Return the parts of the loss of every cell, as if each were near an object, shape (batch, h, w)."""
         above = (self.places(answers) - true.position)[..., 2].abs() / _ERROR
-        turn = torch.stack([torch.cos(2 * true.yaw), torch.sin(2 * true.yaw)], dim=-1)
+        turn = torch.stack([of(times * true.yaw) for times in (2, 4) for of in (torch.cos, torch.sin)], dim=-1)
         entropy = functional.cross_entropy(answers["colour"].movedim(-1, 1), true.colour, reduction="none")
         box = functional.binary_cross_entropy_with_logits(answers["is_box"], true.is_box, reduction="none")
         size = answers["size"] - torch.log(true.size.clamp_min(1e-3) / _SIZE)
@@ -398,7 +398,6 @@ class PerceptionPolicy(PreTrainedPolicy):
             rows, columns = is_peak[image].nonzero(as_tuple=True)
             order = presence[image, rows, columns].argsort(descending=True, stable=True)
             cells = image, rows[order], columns[order]
-            yaw = answers["yaw"][cells]
             one = Detections(
                 presence=presence[cells],
                 position=position[cells],
@@ -406,13 +405,26 @@ class PerceptionPolicy(PreTrainedPolicy):
                 is_box=torch.sigmoid(answers["is_box"][cells]),
                 colour=torch.softmax(answers["colour"][cells], dim=-1),
                 size=_SIZE * torch.exp(answers["size"][cells]),
-                yaw=torch.atan2(yaw[:, 1], yaw[:, 0]) / 2,
+                yaw=turned(answers["yaw"][cells]),
             )
             found.append(_distinct(one))
         return found
 
 
 _WEIGHTS = {"above": 0.2, "is_box": 3.0, "colour": 1.0, "size": 2.0, "yaw": 10.0}
+
+
+def turned(answers: Tensor) -> Tensor:
+    """Return yaws of boxes, from -pi/2 to pi/2 [rad], of cosine and sine of twice and of four times these, (k, 4).
+
+    A box that is nearly square looks nearly the same after a quarter of a turn, and what is said of the double angle is
+    then in between. Four times the angle is the same for both; the double angle only decides between quarters.
+    """
+    double, fourfold = (torch.atan2(one[:, 1], one[:, 0]) for one in answers.chunk(2, dim=1))
+    half = fourfold / 2
+    is_other = torch.cos(double - half) < 0
+    double = half + torch.pi * is_other
+    return torch.atan2(double.sin(), double.cos()) / 2
 
 
 def _distinct(found: Detections) -> Detections:
