@@ -7,8 +7,9 @@ has it beside those that were made before: what was measured of each lies beside
 import hashlib
 import json
 import re
+import struct
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,23 @@ class Training:
         commands: what was run for it alone.
         configs: SHA-256 of the configurations that these name, and that those name, by their paths.
         measured: what the rows need, as JSON has it.
+        networks: SHA-256 of names and shapes of all parameters, of each network that was trained; unknown if empty.
+            No configuration tells that a policy's code has changed.
     """
 
     made: str
     commands: list[Ran]
     configs: dict[str, str]
     measured: Any
+    networks: list[str] = field(default_factory=list)
 
     def is_like(self, other: "Training", own: int, others: int) -> bool:
         """Whether two trainings, of these seeds, differ in nothing else."""
-        return self.configs == other.configs and _recipe(self.commands, own) == _recipe(other.commands, others)
+        return (
+            self.configs == other.configs
+            and _recipe(self.commands, own) == _recipe(other.commands, others)
+            and (self.networks == other.networks or not self.networks or not other.networks)
+        )
 
 
 def each(
@@ -64,7 +72,7 @@ def each(
         first = len(run.commands)
         measured = json.loads(json.dumps(measure(seed)))
         commands = run.commands[first:]
-        trainings[seed] = Training(provenance(), commands, _digests(commands), measured)
+        trainings[seed] = Training(provenance(), commands, _digests(commands), measured, _networks(commands))
         if not run.is_short:
             run.kept.mkdir(parents=True, exist_ok=True)
             text = json.dumps(asdict(trainings[seed])) + "\n"
@@ -107,3 +115,15 @@ def _digests(commands: Sequence[Ran]) -> dict[str, str]:
                 found[path] = hashlib.sha256(content).hexdigest()
                 texts.append(content.decode())
     return found
+
+
+def _networks(commands: Sequence[Ran]) -> list[str]:
+    """Return the SHA-256 of names and shapes of the parameters in every checkpoint that commands made."""
+    found = set()
+    for folder in {one for command in commands for one in command.makes}:
+        for path in (REPOSITORY / folder).glob("**/model.safetensors"):
+            with path.open("rb") as file:  # the length of a JSON header, then that
+                header = json.loads(file.read(*struct.unpack("<Q", file.read(8))))
+            shapes = {name: one["shape"] for name, one in header.items() if name != "__metadata__"}
+            found.add(hashlib.sha256(json.dumps(shapes, sort_keys=True).encode()).hexdigest())
+    return sorted(found)

@@ -11,11 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
@@ -267,14 +269,19 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     (tmp_path / "configs/inner.yaml").write_text("steps: 1")
     (tmp_path / "configs/outer.yaml").write_text("config: configs/inner.yaml")
 
-    def sitting(*chosen: int, option: str = "", short: bool = False) -> tuple[dict[int, Any], Section, Runner]:
+    def sitting(
+        *chosen: int, option: str = "", short: bool = False, width: int = 3
+    ) -> tuple[dict[int, Any], Section, Runner]:
         section = Section("s", "S")
-        run = Runner(
-            tmp_path / f"sitting_{chosen}{option}{short}", is_short=short, chosen=chosen, kept=tmp_path / "kept"
-        )
+        folder = tmp_path / f"sitting_{chosen}{option}{short}{width}"
+        run = Runner(folder, is_short=short, chosen=chosen, kept=tmp_path / "kept")
 
         def measure(seed: int) -> dict[str, Any]:
-            run.run(f"train_{seed}", ["python", "-c", f"'configs/outer.yaml {option} --seed={seed} seed_{seed}/x'"])
+            code, policy = f"'configs/outer.yaml {option} --seed={seed} seed_{seed}/x'", f"policy_{seed}"
+            ran = run.run(f"train_{seed}", ["python", "-c", code])
+            (folder / policy).mkdir(exist_ok=True)
+            save_file({"weight": np.full((width, 2), seed, np.float32)}, folder / policy / "model.safetensors")
+            run.commands[-1] = replace(ran, makes=[str(folder / policy)])
             return {"rate": seed / 10, "series": (1.5, None)}
 
         return trainings.each(run, section, "part", (0, 1, 12), measure), section, run
@@ -292,6 +299,9 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     assert list(sitting(0, 1, 12, short=True)[0]) == [0]
     assert list(sitting(1, option="--steps=2")[0]) == [1]
     assert "seed 12 was made by another recipe and is left out; make it with --seeds 12" in capsys.readouterr().out
+    assert list(sitting(1)[0]) == [0, 1, 12]
+    # A change of a policy's code changes its network, if not its configuration.
+    assert list(sitting(1, width=4)[0]) == [1]
     assert list(sitting(1)[0]) == [0, 1, 12]
     (tmp_path / "configs/inner.yaml").write_text("steps: 2")
     assert list(sitting(12)[0]) == [12]
