@@ -430,6 +430,7 @@ def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path, activation: 
         ({"dropout": 1.0}, "policy.dropout"),
         ({"feature_clip": 0.0}, "policy.feature_clip"),
         ({"huber_delta": 0.0}, "policy.huber_delta"),
+        ({"modes": 0}, "policy.modes is 0; it must be at least 1"),
         ({"min_std": -1.0}, "policy.min_std"),
         ({"scan": ScanConfig(transform="invers")}, "Did you mean 'inverse'"),
         ({"scan": ScanConfig(scale=0)}, "policy.scan.scale"),
