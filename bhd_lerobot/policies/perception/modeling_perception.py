@@ -405,7 +405,7 @@ class PerceptionPolicy(PreTrainedPolicy):
                 is_box=torch.sigmoid(answers["is_box"][cells]),
                 colour=torch.softmax(answers["colour"][cells], dim=-1),
                 size=_SIZE * torch.exp(answers["size"][cells]),
-                yaw=turned(answers["yaw"][cells]),
+                yaw=box_yaw(answers["yaw"][cells]),
             )
             found.append(_distinct(one))
         return found
@@ -414,7 +414,7 @@ class PerceptionPolicy(PreTrainedPolicy):
 _WEIGHTS = {"above": 0.2, "is_box": 3.0, "colour": 1.0, "size": 2.0, "yaw": 10.0}
 
 
-def turned(answers: Tensor) -> Tensor:
+def box_yaw(answers: Tensor) -> Tensor:
     """Return yaws of boxes, from -pi/2 to pi/2 [rad], of cosine and sine of twice and of four times these, (k, 4).
 
     A box that is nearly square looks nearly the same after a quarter of a turn, and what is said of the double angle is

@@ -21,7 +21,7 @@ from bhd_lerobot.policies.manipulation.skills import scene_object
 from bhd_lerobot.policies.perception.camera import Projection
 from bhd_lerobot.policies.perception.configuration_perception import LABELS, PerceptionConfig
 from bhd_lerobot.policies.perception.labels import Labels
-from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy, turned
+from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy, box_yaw
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.policies.perception.rig import FEATURES, HEIGHT, IMAGE, SMALL, WIDTH, config, painted, states
@@ -167,7 +167,7 @@ def test_a_quarter_of_a_turn_is_all_that_the_yaw_of_a_square_can_be_wrong_by() -
     for off in (-2.9, -1.4, -0.5, 0.0, 0.9, 1.5, 2.5):
         double, fourfold = 2 * yaws + off, 4 * yaws
         answers = torch.stack([0.1 * double.cos(), 0.1 * double.sin(), 2 * fourfold.cos(), 2 * fourfold.sin()], dim=1)
-        found = turned(answers)
+        found = box_yaw(answers)
         assert (found.abs() <= math.pi / 2 + 1e-5).all()
         error = torch.remainder(found - yaws + math.pi / 4, math.pi) - math.pi / 4
         wanted = 0.0 if abs(off) < math.pi / 2 else math.pi / 2
