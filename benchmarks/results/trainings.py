@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from benchmarks.results.provenance import provenance
 from benchmarks.results.runner import REPOSITORY, Ran, Runner
 from benchmarks.results.section import Section
@@ -28,7 +30,7 @@ class Training:
     Attributes:
         made: when, where and with what, in words.
         commands: what was run for it alone.
-        configs: SHA-256 of the configurations that these name, and that those name, by their paths.
+        configs: SHA-256 of what the configurations say that these name, and that those name, by their paths.
         measured: what the rows need, as JSON has it.
         networks: SHA-256 of names and shapes of all parameters, of each network that was trained; unknown if empty.
             No configuration tells that a policy's code has changed.
@@ -105,15 +107,16 @@ def _recipe(commands: Sequence[Ran], seed: int) -> list[str]:
 
 
 def _digests(commands: Sequence[Ran]) -> dict[str, str]:
-    """Return the SHA-256 of every configuration that is named in commands or in such a configuration."""
+    """Return the SHA-256 of what every configuration says that is named in commands or in such a configuration."""
     found: dict[str, str] = {}
     texts = [one.command for one in commands]
     while texts:
         for path in re.findall(r"configs/[\w/]+\.yaml", texts.pop()):
             if path not in found:
-                content = (REPOSITORY / path).read_bytes() if (REPOSITORY / path).exists() else b""
-                found[path] = hashlib.sha256(content).hexdigest()
-                texts.append(content.decode())
+                content = (REPOSITORY / path).read_text(encoding="utf-8") if (REPOSITORY / path).exists() else ""
+                text = json.dumps(yaml.safe_load(content), sort_keys=True)  # comments count for nothing
+                found[path] = hashlib.sha256(text.encode()).hexdigest()
+                texts.append(text)
     return found
 
 

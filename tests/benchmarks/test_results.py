@@ -303,6 +303,8 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     # A change of a policy's code changes its network, if not its configuration.
     assert list(sitting(1, width=4)[0]) == [1]
     assert list(sitting(1)[0]) == [0, 1, 12]
+    (tmp_path / "configs/inner.yaml").write_text("# a comment\nsteps: 1")
+    assert list(sitting(12)[0]) == [0, 1, 12]
     (tmp_path / "configs/inner.yaml").write_text("steps: 2")
     assert list(sitting(12)[0]) == [12]
 
