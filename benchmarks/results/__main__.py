@@ -70,6 +70,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--fresh", action="store_true", help="begin anew: remove all that is in the folder")
     options = parser.parse_args(arguments)
+    if options.short and 0 not in (options.seeds or [0]):
+        parser.error("--short makes training seed 0 only. Leave --seeds out.")
     jobs = (2 if options.short else 1) if options.jobs is None else options.jobs
     if jobs < 1:
         parser.error(f"--jobs is {jobs}; it must be at least 1.")

@@ -15,7 +15,7 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
-from benchmarks.results.trainings import SEEDS, each
+from benchmarks.results.trainings import SEEDS, each, first_of
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, ROUNDS = 1000, 3
@@ -35,7 +35,7 @@ def aggregate(run: Runner, section: Section) -> None:
         return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy")
 
     made = each(run, section, "aggregate", SEEDS, learn)
-    clones = each(run, section, "aggregate_clone", SEEDS[:1], clone)
+    clones = each(run, section, "aggregate_clone", first_of(made), clone)
     first, *_ = made.values()
     section.rows.append(success_row(first, _RULE))
     section.rows += [success_row(one, "clone") for one in clones.values()]

@@ -7,7 +7,7 @@ from typing import Any
 from benchmarks.results.learning import SHORTER, aggregation, scores, seeds_rows, success_row, summary
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
-from benchmarks.results.trainings import SEEDS, each
+from benchmarks.results.trainings import SEEDS, each, first_of
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, ROUNDS = 500, 2
@@ -33,7 +33,7 @@ def camera_drive(run: Runner, section: Section) -> None:
         return {"brains": beside["brains"] | _evaluate(run, "blind", blind, ("blind",), _BLANKED)["brains"]}
 
     made = each(run, section, "camera_drive", SEEDS, learn)
-    beside = each(run, section, "camera_drive_others", SEEDS[:1], others)
+    beside = each(run, section, "camera_drive_others", first_of(made), others)
     first, *_ = made.values()
     levels = [(first, _RULE), *((one, name) for one in beside.values() for name in one["brains"])]
     for results, name in (*levels, *((results, f"seed_{seed}") for seed, results in made.items())):
@@ -68,10 +68,14 @@ def camera_drive(run: Runner, section: Section) -> None:
         "`bhd_cnn`; each seed is one of recording and training. It sees images of 64 x 48 pixels from the front "
         "camera, and the wheels' odometry. The "
         "lidar's ranges taught it how far away things are; they are no input, and neither is what ground it has "
-        f"visited. `clone` learned from the rule's episodes alone; the others drove in {run.size(ROUNDS, 1)} further "
-        "rounds, corrected by the rule. `blind` is seed 0 with black images: it drives a small circle, on which it "
-        "touches nothing and gets nowhere, so success alone says little here, and the score counts."
+        f"visited. Policies drove in {run.size(ROUNDS, 1)} further rounds, corrected by the rule; `clone` learned from "
+        "the rule's episodes alone."
     )
+    if beside:
+        section.remarks.append(
+            "`blind` is seed 0 with black images: it drives a small circle, on which it touches nothing and gets "
+            "nowhere, so success alone says little here, and the score counts."
+        )
 
 
 def _learned(run: Runner, seed: int) -> tuple[str, float]:

@@ -10,10 +10,10 @@ from bhd_lerobot.datasets.storage.disk import Disk
 _HEAD = (
     "# Results",
     "",
-    "Written by `make results`, which runs the commands below each table; nothing here was typed by hand. Rates",
-    "are with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness, over the",
-    "same held-out episodes for all brains of a table. Times of training include the start of the program. Each",
-    "section says when and where it was made.",
+    "Written by `make results`, which runs the commands below each table; no number was typed by hand. Rates are",
+    "with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness (bootstrap",
+    "intervals where a section says so), over the same held-out episodes for all brains of a table. Times of training",
+    "include the start of the program. Each section says when and where it was made.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 
@@ -30,7 +30,8 @@ def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *
     texts = {} if not path.exists() else _kept(path.read_text(encoding="utf-8"))
     for section in sections:
         first, *rest = section.markdown()
-        texts[section.title] = "\n".join([first, "", f"Made {provenance()}.", *rest])
+        made = max((one.made for one in section.commands if one.made), default=provenance())  # begins with the date
+        texts[section.title] = "\n".join([first, "", f"Made {made}.", *rest])
     lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
     lines += ["\n" + texts[title].strip() for title in titles if title in texts]
     # What other sessions took hours for is on it: it is never half written.

@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.results.learning import TOOL, aggregation, evaluate, seeds_rows, success_row, summary
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
-from benchmarks.results.trainings import SEEDS, each
+from benchmarks.results.trainings import SEEDS, each, first_of
 
 EPISODES, ROUNDS = 500, 3
 _GOAL = 0.97
@@ -39,7 +39,7 @@ def pick(run: Runner, section: Section) -> None:
         return summary(results, *_OTHERS)
 
     made = each(run, section, "pick", SEEDS, learn)
-    beside = each(run, section, "pick_others", SEEDS[:1], others)
+    beside = each(run, section, "pick_others", first_of(made), others)
     section.rows += [success_row(one, name) for one in beside.values() for name in _OTHERS]
     for seed, results in made.items():
         row, low = success_row(results, f"seed_{seed}"), results["brains"][f"seed_{seed}"]["success"]["low"]

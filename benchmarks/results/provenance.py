@@ -1,12 +1,17 @@
 """When, where and with what something was measured."""
 
+import hashlib
+import json
 import os
 import platform
+import re
+from collections.abc import Iterable
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
+import yaml
 
 _PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
 
@@ -15,6 +20,25 @@ def provenance() -> str:
     """Return the date, the machine and the versions, as they follow on "made"."""
     versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     return f"on {datetime.now():%Y-%m-%d}, on {_machine()}, with {versions}"
+
+
+def digests(commands: Iterable[str], root: Path) -> dict[str, str]:
+    """Return the SHA-256 of what every configuration says that commands name, or that such a configuration names.
+
+    Args:
+        commands: as a person would type them.
+        root: folder that the paths in them begin in.
+    """
+    found: dict[str, str] = {}
+    texts = list(commands)
+    while texts:
+        for path in re.findall(r"configs/[\w/]+\.yaml", texts.pop()):
+            if path not in found:
+                content = (root / path).read_text(encoding="utf-8") if (root / path).exists() else ""
+                text = json.dumps(yaml.safe_load(content), sort_keys=True)  # comments count for nothing
+                found[path] = hashlib.sha256(text.encode()).hexdigest()
+                texts.append(text)
+    return found
 
 
 def _machine() -> str:

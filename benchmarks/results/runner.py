@@ -15,6 +15,8 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from benchmarks.results.provenance import digests, provenance
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 _OWN = ".made_by_results"  # in a folder that was empty when a run took it
 
@@ -41,6 +43,8 @@ class Ran:
         status: its exit status.
         cpu_seconds: processor time, of all its processes and threads together [s].
         makes: what it made, as commands name it.
+        configs: SHA-256 of the configurations that it named, and that those named, by their paths, when it began.
+        made: when, where and with what, in words.
     """
 
     command: str
@@ -48,13 +52,15 @@ class Ran:
     status: int
     cpu_seconds: float = 0.0
     makes: list[str] = field(default_factory=list)
+    configs: dict[str, str] = field(default_factory=dict)
+    made: str = ""
 
 
 class Runner:
     """Runs commands in the repository and keeps a note of each that succeeded.
 
     A command that a note in the folder tells of is not run again: a run of hours that was stopped goes on where it was.
-    It is run again if what it reads was made anew since.
+    It is run again if what it reads was made anew since, or if its configuration says something else now.
 
     Attributes:
         folder: where everything goes; one folder for each section.
@@ -113,7 +119,8 @@ class Runner:
             allowed: exit statuses that are no failure.
             makes: paths in the folder of what it makes and would not make anew; what is left there of a run that was
                 stopped, or of another command, is removed.
-            resumes: likewise of what it goes on with if it was stopped; removed only if what it reads was made anew.
+            resumes: likewise of what it goes on with if it was stopped; removed only if what it reads was made anew, or
+                its configuration was changed.
 
         Raises:
             FailedError: it failed; the message names its log.
@@ -135,7 +142,7 @@ class Runner:
                 shutil.rmtree(left)
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
-        started = time.perf_counter()
+        started, configs, made_by = time.perf_counter(), digests([command], REPOSITORY), provenance()
         with log.open("w", encoding="utf-8") as file:
             process = subprocess.Popen(
                 _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=self._held
@@ -144,7 +151,8 @@ class Runner:
             _, ended, used = os.wait4(process.pid, 0)
         status = process.returncode = os.waitstatus_to_exitcode(ended)
         made = [str(self.path(one)) for one in (*makes, *resumes)]
-        ran = Ran(command, time.perf_counter() - started, status, used.ru_utime + used.ru_stime, made)
+        spent = time.perf_counter() - started, used.ru_utime + used.ru_stime
+        ran = Ran(command, spent[0], status, spent[1], made, configs, made_by)
         if status not in allowed:
             tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
             raise FailedError(f"{command}\nended with status {status}. The end of {log}:\n{tail}")
@@ -154,8 +162,11 @@ class Runner:
         return ran
 
     def _is_outdated(self, note: Path) -> bool:
-        """Whether something that the command of a note names was made after it had ended."""
-        command, ended = _read(note).command, note.stat().st_mtime_ns
+        """Whether something that the command of a note names was made, or configured otherwise, since."""
+        kept, ended = _read(note), note.stat().st_mtime_ns
+        command = kept.command
+        if kept.configs != digests([command], REPOSITORY):
+            return True
         newer = (one for one in (REPOSITORY / self.path("notes")).rglob("*.json") if one.stat().st_mtime_ns > ended)
         return any(re.search(rf"{re.escape(path)}(?![\w-])", command) for one in newer for path in _read(one).makes)
 

@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.results.learning import record, seeds_rows, success_row, summary, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
-from benchmarks.results.trainings import SEEDS, each
+from benchmarks.results.trainings import SEEDS, each, first_of
 
 EPISODES = 500
 _ANY = "--task.language=any"
@@ -47,7 +47,7 @@ def see(run: Runner, section: Section) -> None:
         return _blanked(run, "see_eval/others", "ur5_pick", inner)
 
     made = each(run, section, "see", SEEDS, learn)
-    beside = each(run, section, "see_others", SEEDS[:1], others)
+    beside = each(run, section, "see_others", first_of(made), others)
     for seed, results in made.items():
         _perceived(section, f"seed_{seed}", results["look"])
     _rows(run, section, made, [goal for _, _, goal in WORLDS])
@@ -57,10 +57,13 @@ def see(run: Runner, section: Section) -> None:
     ]
     section.remarks.append(
         "Each seed is one of the training. The brain `language` sees with the checkpoint and gets "
-        "nothing else of the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind "
-        "one black images: both refuse, and say why. What was learned from has no object of the style of those that "
-        "it has not seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
+        "nothing else of the objects; the skill `pick` does the rest. What was learned from has no object of the style "
+        "of those that it has not seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
     )
+    if beside:
+        section.remarks.append(
+            "A deaf brain gets an empty instruction, a blind one black images: both refuse, and say why."
+        )
 
 
 def record_tables(run: Runner) -> float:
@@ -120,7 +123,7 @@ def pixels(run: Runner, section: Section) -> None:
         return {**blanked, "others": summary(results, *_OTHERS)}
 
     made = each(run, section, "pixels", SEEDS, learn)
-    beside = each(run, section, "pixels_others", SEEDS[:1], others)
+    beside = each(run, section, "pixels_others", first_of(made), others)
     _rows(run, section, made, [_PIXELS_GOAL, *[None] * len(WORLDS[1:])])
     for one in beside.values():
         section.rows += [
@@ -134,11 +137,14 @@ def pixels(run: Runner, section: Section) -> None:
     section.remarks.append(
         "`bhd_pixels`; each seed is one of the trainings: from an episode's first image, the instruction as bytes and "
         "the robot's state to tool poses. It begins with the perception of the same seed of the section `see`; "
-        "`pick_servo` showed it how. True poses taught it where to look; none is an input. A deaf policy gets an empty "
-        "instruction, a blind one black images. LeRobot's ACT and Diffusion, with a ResNet18 that begins from "
-        "nothing, learn from every frame of the rule's episodes, of 160 x 120 pixels; they have no input for words, "
-        "and can do no better than to pick any one of the objects."
+        "`pick_servo` showed it how. True poses taught it where to look; none is an input."
     )
+    if beside:
+        section.remarks.append(
+            "A deaf policy gets an empty instruction, a blind one black images. LeRobot's ACT and Diffusion, with a "
+            "ResNet18 that begins from nothing, learn from every frame of the rule's episodes, of 160 x 120 pixels; "
+            "they have no input for words, and can do no better than to pick any one of the objects."
+        )
 
 
 def _in_worlds(run: Runner, output: str, config: str, brain: Sequence[str], name: str) -> dict[str, Any]:

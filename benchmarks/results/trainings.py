@@ -8,14 +8,12 @@ import hashlib
 import json
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from benchmarks.results.provenance import provenance
+from benchmarks.results.provenance import digests
 from benchmarks.results.runner import REPOSITORY, Ran, Runner
 from benchmarks.results.section import Section
 from bhd_lerobot.datasets.storage.disk import Disk
@@ -74,7 +72,8 @@ def each(
         first = len(run.commands)
         measured = json.loads(json.dumps(measure(seed)))
         commands = run.commands[first:]
-        trainings[seed] = Training(provenance(), commands, _digests(commands), measured, _networks(commands))
+        configs = {path: digest for one in commands for path, digest in one.configs.items()}
+        trainings[seed] = Training(commands[-1].made, commands, configs, measured, _networks(commands))
         if not run.is_short:
             run.kept.mkdir(parents=True, exist_ok=True)
             text = json.dumps(asdict(trainings[seed])) + "\n"
@@ -83,7 +82,8 @@ def each(
         kept = _read(run.kept / f"{name}_{seed}.json")
         if kept is None:
             continue
-        if kept.configs != _digests(kept.commands) or any(not kept.is_like(trainings[one], seed, one) for one in asked):
+        now = digests([one.command for one in kept.commands], REPOSITORY)
+        if kept.configs != now or any(not kept.is_like(trainings[one], seed, one) for one in asked):
             print(f"-- {name}: seed {seed} was made by another recipe and is left out; make it with --seeds {seed}")
             continue
         trainings[seed] = kept
@@ -92,6 +92,11 @@ def each(
     order = sorted(trainings)
     run.commands[before:] = [command for seed in order for command in trainings[seed].commands]
     return {seed: trainings[seed].measured for seed in order}
+
+
+def first_of(made: Mapping[int, Any]) -> tuple[int, ...]:
+    """Return the first training seed, beside which a section shows other things, if it is among those made."""
+    return tuple(seed for seed in SEEDS[:1] if seed in made)
 
 
 def _read(path: Path) -> Training | None:
@@ -104,20 +109,6 @@ def _read(path: Path) -> Training | None:
 def _recipe(commands: Sequence[Ran], seed: int) -> list[str]:
     """Return commands without what tells one seed from another."""
     return [re.sub(rf"\b(seed[_=]){seed}\b", r"\1N", one.command) for one in commands]
-
-
-def _digests(commands: Sequence[Ran]) -> dict[str, str]:
-    """Return the SHA-256 of what every configuration says that is named in commands or in such a configuration."""
-    found: dict[str, str] = {}
-    texts = [one.command for one in commands]
-    while texts:
-        for path in re.findall(r"configs/[\w/]+\.yaml", texts.pop()):
-            if path not in found:
-                content = (REPOSITORY / path).read_text(encoding="utf-8") if (REPOSITORY / path).exists() else ""
-                text = json.dumps(yaml.safe_load(content), sort_keys=True)  # comments count for nothing
-                found[path] = hashlib.sha256(text.encode()).hexdigest()
-                texts.append(text)
-    return found
 
 
 def _networks(commands: Sequence[Ran]) -> list[str]:

@@ -22,12 +22,13 @@ from safetensors.numpy import save_file
 from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results import __main__ as program
-from benchmarks.results import trainings
+from benchmarks.results import runner, trainings
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
+from benchmarks.results.provenance import digests
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
 from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
@@ -204,7 +205,8 @@ class Pretended(Runner):
         elif program == "bhd-train":
             assert "--output_dir" in keys
             assert Path(options[0].partition("=")[2]).is_file()
-        self.commands.append(Ran(shlex.join(arguments), 12.0, 0, 10.0))
+        command = shlex.join(arguments)
+        self.commands.append(Ran(command, 12.0, 0, 10.0, configs=digests([command], REPOSITORY), made="on a day"))
         return self.commands[-1]
 
     def read(self, *parts: str) -> Any:
@@ -264,7 +266,8 @@ def test_every_section_fills_its_table_from_what_its_commands_write(tmp_path: Pa
 def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(trainings, "REPOSITORY", tmp_path)
+    for module in (trainings, runner):
+        monkeypatch.setattr(module, "REPOSITORY", tmp_path)
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/inner.yaml").write_text("steps: 1")
     (tmp_path / "configs/outer.yaml").write_text("config: configs/inner.yaml")
@@ -304,9 +307,15 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     assert list(sitting(1, width=4)[0]) == [1]
     assert list(sitting(1)[0]) == [0, 1, 12]
     (tmp_path / "configs/inner.yaml").write_text("# a comment\nsteps: 1")
-    assert list(sitting(12)[0]) == [0, 1, 12]
+    made, _, run = sitting(12)
+    assert list(made) == [0, 1, 12]
+    before = run.commands[-1]
+    # What the same folder has of another configuration is made anew.
     (tmp_path / "configs/inner.yaml").write_text("steps: 2")
-    assert list(sitting(12)[0]) == [12]
+    made, _, run = sitting(12)
+    assert list(made) == [12]
+    assert run.commands[-1].seconds != before.seconds
+    assert json.loads((tmp_path / "kept/part_12.json").read_text())["configs"] == run.commands[-1].configs
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------
@@ -447,6 +456,9 @@ def test_a_folder_that_is_none_is_refused_and_fresh_removes_what_a_run_made_and_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit):
+        program.main([f"--folder={tmp_path}", "--short", "--seeds", "1", "2"])
+    assert "--short makes training seed 0 only" in capsys.readouterr().err
     assert program.main([f"--folder={tmp_path / 'file'}"]) == 2
     assert "file cannot be used as a folder: File exists. Name another: --folder" in capsys.readouterr().err
     elsewhere, folder = tmp_path / "elsewhere", tmp_path / "results"
