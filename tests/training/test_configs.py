@@ -16,6 +16,7 @@ from bhd_lerobot.rollout import configuration
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import command, parse_aggregation, read_stages
+from bhd_lerobot.training.rl.config import parse_rl
 from tests.training.support import MLP, make_dataset, options, run_train
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "train"
@@ -63,6 +64,15 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
     if "cameras" in path.stem or "pixels" in path.stem:
         assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
+
+
+def test_ppo_has_the_robot_of_the_recordings_that_its_start_learned_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(FOLDER.parents[1])
+    recorded = ["--config_path=configs/record/ur5_reach.yaml", "--robot.action_space=tool", "--robot.tool_pose=true"]
+    learning = ["--config_path=configs/train/ppo_ur5_reach.yaml", "--start_from=x", "--output_dir=x"]
+    robots = [make_robot(one.robot) for one in (configuration.parse(RecordConfig, recorded), parse_rl(learning))]
+    assert robots[0].action_names == robots[1].action_names
+    assert robots[0].observation_names == robots[1].observation_names
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("dagger_*.yaml")), ids=lambda path: path.stem)

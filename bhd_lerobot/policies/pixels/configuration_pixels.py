@@ -28,7 +28,8 @@ class PixelsConfig(PerceptionConfig):
     Attributes:
         perception: a checkpoint of ``bhd_perception`` whose weights the learning begins with; without one it begins
             from nothing.
-        freeze: do not change these weights: every first image is then looked at once in a training.
+        freeze: do not change the weights of `perception`: every first image is then looked at once in a training.
+            Without one they are learned.
         chunk_size: actions that it predicts, one a frame.
         n_action_steps: how many of them are carried out before it predicts again.
         longest_instruction: bytes of the longest instruction, in UTF-8.
@@ -94,6 +95,11 @@ class PixelsConfig(PerceptionConfig):
         for name in ("min_std", "pointing_weight", "perception_weight"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the weights that see stay as they were read."""
+        return self.freeze and self.perception is not None
 
     @property
     def observation_delta_indices(self) -> list[int]:  # type: ignore[override]

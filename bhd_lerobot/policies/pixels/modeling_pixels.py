@@ -62,7 +62,7 @@ class PixelsPolicy(PreTrainedPolicy):
         self.perception = PerceptionPolicy(config)
         if config.perception and initialise:
             self._initialise(config.perception)
-        self.perception.requires_grad_(not config.freeze)
+        self.perception.requires_grad_(not config.is_frozen)
         state = int(config.input_features[OBS_STATE].shape[0])  # type: ignore[index]
         columns = [column for column in range(state) if column not in config.ignored_columns]
         self.register_buffer("_columns", torch.tensor(columns), persistent=False)
@@ -124,7 +124,7 @@ class PixelsPolicy(PreTrainedPolicy):
     def train(self, mode: bool = True) -> "PixelsPolicy":
         """Switch to training, or not; what is not to be changed sees as it does afterwards."""
         super().train(mode)
-        self.perception.train(mode and not self.config.freeze)
+        self.perception.train(mode and not self.config.is_frozen)
         return self
 
     def reset(self) -> None:
@@ -147,7 +147,7 @@ class PixelsPolicy(PreTrainedPolicy):
         config, image = self.config, self._first(batch)
         environment = batch[OBS_ENV_STATE][:, 0]
         parts: dict[str, Tensor] = {}
-        if self.training and not config.freeze:
+        if self.training and not config.is_frozen:
             sight = {config.image_key: image, OBS_ENV_STATE: environment}
             parts["perception"] = config.perception_weight * self.perception(sight)[0]
         cells, where = self._cells(image)
@@ -236,7 +236,7 @@ class PixelsPolicy(PreTrainedPolicy):
 
         Shapes (batch, cells, numbers) and (batch, cells).
         """
-        if not (self.training and self.config.freeze):
+        if not (self.training and self.config.is_frozen):
             return self._look(image)
         # In a training the same first images come again and again.
         keys = [one.tobytes() for one in image[..., ::_THUMBNAIL, ::_THUMBNAIL].cpu().numpy()]

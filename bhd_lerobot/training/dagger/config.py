@@ -18,6 +18,7 @@ _OWN = frozenset(
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
         *("policy.push_to_hub", "selection.expert_action", "resume", "output_dir", "seed"),
         *("only", "baseline", "split", "n_episodes", "videos"),
+        *("brains.expert", "brains.policy", "brains.policy.type", "brains.policy.path"),
     }
 )
 """Options that the rounds set themselves."""
@@ -101,6 +102,7 @@ class Stages:
 
     Attributes:
         expert: the type of the expert's brain.
+        brain: all of the expert's brain, as plain values.
         robot: the type of its robot.
         fps: frames a second [Hz].
         has_advice: whether the expert's action is recorded in every frame.
@@ -108,6 +110,7 @@ class Stages:
     """
 
     expert: str
+    brain: dict[str, Any]
     robot: str
     fps: int
     has_advice: bool
@@ -136,14 +139,35 @@ def read_stages(config: AggregationConfig) -> Stages:
             "not record what the expert would have done (dataset.expert_action is false): they are not learned from. "
             "Leave it out of its options."
         )
-    configuration.parse(EvalConfig, command(config.evaluation, {}))
+    evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
+    for other, name in ((learner, "learner"), (evaluation, "evaluation")):
+        _check_same(expert, other, f"{name}.config, {getattr(config, name).config!r}", config.expert.config)
     return Stages(
         expert=str(kinds[0]),
+        brain=configuration.encode(expert)["brain"],
         robot=expert.robot.type,
         fps=expert.dataset.fps,
         has_advice=learner.dataset.expert_action,
         steps=policy.steps,
     )
+
+
+def _check_same(expert: RecordConfig, other: RecordConfig | EvalConfig, who: str, expert_file: str) -> None:
+    """Refuse a program that has another robot, frame rate or kind of task than the expert.
+
+    Raises:
+        ConfigError: names what differs.
+    """
+    for name, theirs, ours in (
+        ("robot.type", other.robot.type, expert.robot.type),
+        ("the frame rate", other.robot.fps, expert.robot.fps),
+        ("task.type", *(one.task.get_choice_name(type(one.task)) for one in (other, expert))),
+    ):
+        if theirs != ours:
+            raise ConfigError(
+                f"{name} is {theirs!r} in {who}, and {ours!r} in that of the expert, {expert_file!r}. A policy learns "
+                "from both: make them equal, in the files or in their options."
+            )
 
 
 def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:

@@ -195,7 +195,9 @@ class _Rounds:
 
     def _train(self, number: int, folder: Path) -> None:
         run_folder = folder / "policy"
-        if (run_folder / "checkpoints" / "last").exists():
+        if (last := run_folder / "checkpoints" / "last").exists():
+            if int(last.resolve().name) >= self._stages.steps:
+                return  # it was stopped between its last checkpoint and the note of it
             self._call(number, "bhd-train", ["--resume=true", f"--config_path={run_folder}"])
             return
         shutil.rmtree(run_folder, ignore_errors=True)
@@ -207,7 +209,7 @@ class _Rounds:
         }
         if self._stages.has_advice:
             own["selection.expert_action"] = "true"
-        elif number:
+        elif number or self._config.data:  # which may have been recorded with takeovers, too
             own["selection.learner_weight"] = 0
         self._run(number, "bhd-train", self._config.policy, own)
 
@@ -238,7 +240,7 @@ class _Rounds:
             "output_dir": target,
         }
         if not number:
-            own["brains.expert.type"] = self._stages.expert
+            own["brains.expert"] = json.dumps(self._stages.brain)
         self._run(number, "bhd-eval", self._config.evaluation, own)
 
     def _policy(self, number: int) -> Path:

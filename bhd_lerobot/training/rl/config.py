@@ -25,7 +25,8 @@ _CHOICES = {
     "reward.potential": ("none", "pose"),
     "validation.select": ("score", "success", "return"),
 }
-_EVENTS = tuple(event.cause for event in Event if event != Event.NOTHING)
+# Not among them: that an expert drives ends nothing, and of a failure without a cause only a person says so.
+_EVENTS = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION, Event.FAILURE))
 _LEAST = {
     "steps": 1,
     "env.n_envs": 1,
@@ -141,7 +142,8 @@ class PpoConfig:
         lr: learning rate of Adam.
         lr_schedule: ``"linear"``: to 0 over `steps`, whatever time they take; ``"constant"``.
         target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
-        log_std_init: logarithm of the exploration noise, in normalised actions; the checkpoint's own, or 0, if nothing.
+        log_std_init: logarithm of the exploration noise, in normalised actions, the same for all; the mean of the
+            checkpoint's own, or 0, if nothing.
     """
 
     n_steps: int = 64

@@ -119,6 +119,11 @@ def _from_checkpoint(
         width = loaded.width(key)
         if width is not None and width != len(names or ()):
             raise ConfigError(f"{who} has {width} numbers in {key!r}; this robot has {len(names or ())}.")
+    if loaded.config.residual:
+        raise ConfigError(
+            f"{who} predicts by how much actions differ from what is observed (policy.residual is "
+            f"{list(loaded.config.residual)}); PPO learns the actions themselves. Train one without it."
+        )
     if loaded.config.dropout:
         raise ConfigError(f"{who} has dropout {loaded.config.dropout}; PPO needs a policy without it.")
     if loaded.config.scan.channels and loaded.config.scan.transform == "none":

@@ -100,7 +100,7 @@ def test_it_learns_to_look_at_what_is_named() -> None:
 
 
 def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, samples = PixelsPolicy(made()), batch()
+    policy, samples = PixelsPolicy(made(perception="read before"), initialise=False), batch()
     before = {name: values.clone() for name, values in policy.state_dict().items()}
     looks: list[int] = []
     look = policy._look
@@ -121,6 +121,8 @@ def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytes
     }
     assert not [name for name in changed if name.startswith("perception.")]
     assert {"reader.said.weight", "named.key.weight", "others.key.weight", "actor.0.weight"} <= changed
+    # Without weights that were read, there is nothing to keep: it learns to see.
+    assert all(one.requires_grad for one in PixelsPolicy(made()).perception.parameters())
 
 
 def test_actions_behind_the_end_do_not_count() -> None:

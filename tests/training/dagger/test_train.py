@@ -27,9 +27,12 @@ def settings(folder: Path, **changed: Any) -> Path:
         "algorithm": "dagger",
         "expert": {
             "config": str(CONFIGS / "record/turtlebot3_avoid.yaml"),
-            "options": [*record["options"], "--brain.type=gap_follower"],
+            "options": [*record["options"], "--brain.type=gap_follower", "--brain.margin_m=0.08"],
         },
-        "learner": {"config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"), **record},
+        "learner": {
+            "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
+            "options": [*record["options"], "--brain.expert.margin_m=0.08"],
+        },
         "policy": {
             "config": str(CONFIGS / "train/bc_turtlebot3_avoid.yaml"),
             "options": ["--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]"],
@@ -120,6 +123,25 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_training_that_had_ended_before_it_was_noted_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    argument = f"--config_path={settings(tmp_path, rounds=0)}"
+    assert main([argument]) == 0
+    (tmp_path / "run" / "round_0" / "done.json").write_text(json.dumps({"done": ["record"], "seconds": 1.0}))
+    called: list[str] = []
+    programs = {name: lambda given, name=name: called.append(name) or 130 for name in dagger._PROGRAMS}
+    monkeypatch.setattr(dagger, "_PROGRAMS", programs)
+    assert main([argument]) == 130
+    assert called == ["bhd-eval"]
+
+
+def test_the_expert_is_judged_as_it_is_configured(tmp_path: Path) -> None:
+    assert main([f"--config_path={settings(tmp_path, rounds=0)}"]) == 0
+    judged = yaml.safe_load((tmp_path / "run" / "round_0" / "evaluation" / "config.yaml").read_text())
+    assert judged["brains"]["expert"]["margin_m"] == 0.08
+
+
 def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,7 +200,11 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     for number in (0, 1):
         with pytest.raises(dagger._StoppedError):
             rounds._train(number, tmp_path)
-    assert ["--selection.learner_weight=0" in one for one in called] == [False, True]
+    # What was recorded before may hold a learner's mistakes as well.
+    rounds._config.data = ["before"]
+    with pytest.raises(dagger._StoppedError):
+        rounds._train(0, tmp_path)
+    assert ["--selection.learner_weight=0" in one for one in called] == [False, True, True]
     assert not any("expert_action" in option for one in called for option in one)
 
 
@@ -194,9 +220,29 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             {"learner": {"config": str(CONFIGS / "record/turtlebot3_avoid.yaml"), "options": []}},
             "whose brain is 'avoidance'; it must be 'dagger'",
         ),
+        *(
+            (
+                {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [f"--{name}=x"]}},
+                f"The option --{name} of .* is set by the rounds themselves",
+            )
+            for name in ("split", "brains.policy.path")
+        ),
         (
-            {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": ["--split=train"]}},
-            "The option --split of .* is set by the rounds themselves",
+            {"evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []}},
+            "robot.type is 'ur5' in evaluation.config, .*ur5_pick.yaml', and 'turtlebot3' in that of the expert",
+        ),
+        (
+            {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_navigate.yaml"), "options": []}},
+            "task.type is 'navigate' in evaluation.config, .* and 'avoid' in that of the expert",
+        ),
+        (
+            {
+                "learner": {
+                    "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
+                    "options": [*BRIEF, "--dataset.fps=5"],
+                }
+            },
+            "the frame rate is 5 in learner.config, .* and 10 in that of the expert",
         ),
         (
             {

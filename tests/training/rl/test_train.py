@@ -1,8 +1,10 @@
 import io
 import json
 import os
+import shutil
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -346,7 +348,7 @@ def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: 
         run(tmp_path / "history", start_from=finished.checkpoint, see_history=True)
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_architecture_is_refused(finished: RlResult, tmp_path: Path) -> None:
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
@@ -365,6 +367,15 @@ def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None
         one.save_pretrained(tmp_path)
     with pytest.raises(ConfigError, match="'act'; PPO starts from a 'bhd_mlp'"):
         run(tmp_path / "run", start_from=tmp_path)
+    residual = {"residual": ["*"], "residual_columns": [-1, -1]}
+    for name, changed, message in (
+        ("residual", residual, r"policy.residual is \['\*'\]\); PPO learns the actions themselves"),
+        ("dropout", {"dropout": 0.1}, "has dropout 0.1; PPO needs a policy without it"),
+    ):
+        folder = shutil.copytree(Path(finished.checkpoint) / "pretrained_model", tmp_path / name)
+        MlpPolicy(replace(MlpPolicy.from_pretrained(folder).config, **changed)).save_pretrained(folder)
+        with pytest.raises(ConfigError, match=message):
+            run(tmp_path / "run", start_from=folder)
 
 
 def test_a_folder_that_exists_is_not_overwritten_and_one_without_a_run_not_resumed(tmp_path: Path) -> None:
