@@ -30,6 +30,7 @@ FEW_PPO = (
 )
 SHORTER = ("--task.duration_s=30",)  # episodes of a short run
 _AVOID_TRAIN_S, _PPO_TRAIN_S = 120, 1200
+_HELPED = "dagger"
 _REACH_GOAL, _PPO_GOAL = 0.97, 1.2
 
 
@@ -138,13 +139,24 @@ def _score_row(results: Any, name: str, shown: str) -> Row:
 
 
 def reach(run: Runner, section: Section) -> None:
-    """Cloning a rule on the reach task, from few to many episodes."""
+    """Clone a rule on the reach task, from few to many episodes, and let it help the clone where that gets stuck."""
     numbers = reach_numbers(run)
     recorded = {episodes: record_reach(run, episodes) for episodes in numbers}
 
     def learn(seed: int) -> dict[str, Any]:
         seconds = {f"bc_{episodes}": recorded[episodes] + train_reach(run, seed, episodes) for episodes in numbers}
         folders = {f"bc_{episodes}": reach_folder(seed, episodes) for episodes in numbers}
+        folders[_HELPED], seconds[_HELPED] = aggregation(
+            run,
+            f"reach_dagger_{seed}",
+            "dagger_ur5_reach",
+            f"reach/seed_{seed}/dagger",
+            seed=seed,
+            rounds=1,
+            short=(numbers[-1], numbers[0], 8),
+            policy=_FEW_REACH if run.is_short else (),
+            options=_COARSE,
+        )
         results = evaluate(
             run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run)
         )
@@ -153,8 +165,8 @@ def reach(run: Runner, section: Section) -> None:
     made = each(run, section, "reach", SEEDS, learn)
     first, *_ = made.values()
     section.rows.append(success_row(first, "reach"))
-    for episodes in numbers:
-        name, goal = f"bc_{episodes}", _REACH_GOAL if episodes == numbers[-1] else None
+    for name in (*(f"bc_{episodes}" for episodes in numbers), _HELPED):
+        goal = _REACH_GOAL if name in (f"bc_{numbers[-1]}", _HELPED) else None
         for seed, results in made.items():
             row = success_row(results, name, goal)
             section.rows.append(replace(row, what=f"seed {seed}, {row.what}"))
@@ -162,7 +174,9 @@ def reach(run: Runner, section: Section) -> None:
         seconds = ", ".join(f"{results['seconds'][name]:.0f} s" for results in made.values())
         section.rows.append(Row(f"{name}: time from nothing", seconds))
     section.remarks.append(
-        "`bc_N` learned from N episodes, all with the same number of steps; each seed is one of the training."
+        "`bc_N` learned from N episodes, all with the same number of steps; each seed is one of the training. `dagger` "
+        f"learned from {numbers[-1]} others and from those in which the first policy drove and the rule took over "
+        "where that got stuck; each seed is one of recording, too."
     )
 
 
@@ -241,7 +255,7 @@ def aggregation(
     seed: int,
     rounds: int,
     short: Sequence[int],
-    steps: int,
+    steps: int | None = None,
     policy: Sequence[str] = (),
     data: Sequence[str] = (),
     options: Sequence[str] = (),
@@ -256,8 +270,8 @@ def aggregation(
         seed: of recordings and trainings.
         rounds: beyond the expert's own episodes; one in a short run.
         short: in a short run, how many episodes the expert drives, the learner drives, and it is validated on.
-        steps: of each training of a short run.
-        policy: options of each training.
+        steps: of each training of a short run; those that `policy` or the configuration say if None.
+        policy: options of each training, beside those of the configuration.
         data: datasets that are learned from in every round, too.
         options: of recordings and validations of a short run, beside those of the configuration.
     """
@@ -266,15 +280,18 @@ def aggregation(
     if run.is_short:
         names = ("expert_episodes", "episodes", "validation_episodes")
         command += [f"--{key}={value}" for key, value in zip(names, short, strict=True)]
-        policy = (*policy, f"--steps={steps}")
+        policy = (*policy, *(() if steps is None else (f"--steps={steps}",)))
+    parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
     if run.is_short and options:
-        parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
         for part in ("expert", "learner", "evaluation"):
             command.append(f"--{part}.options=[{', '.join([*parts[part].get('options', ()), *options])}]")
     if data:
         command.append(f"--data=[{', '.join(data)}]")
     if policy:
-        command.append(f"--policy.options=[{', '.join(policy)}]")
+        # How often to save and to look at what is held out is said for the configuration's number of steps.
+        counted = ("--steps=", "--eval_steps=", "--save_freq=")
+        own = [one for one in parts["policy"].get("options", ()) if not (run.is_short and one.startswith(counted))]
+        command.append(f"--policy.options=[{', '.join([*own, *policy])}]")
     ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
     # Of all rounds, also of those that an earlier command made before it was stopped; rounds of an older version have
     # no time.
