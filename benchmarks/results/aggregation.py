@@ -55,7 +55,7 @@ def aggregate(run: Runner, section: Section) -> None:
         "Each seed is one of recording and training. "
         "`clone` learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule "
         "took over before collisions and said in every frame what it would do; the others learned that, from all "
-        "episodes so far."
+        "episodes so far. The rule that taught them keeps 0.08 m away from things, `gap_follower` of this table 0.05 m."
     )
 
 

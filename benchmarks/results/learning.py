@@ -1,5 +1,6 @@
 """The sections about what is learned: recorded, trained and evaluated by the commands that a user has."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -284,14 +285,14 @@ def aggregation(
     parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
     if run.is_short and options:
         for part in ("expert", "learner", "evaluation"):
-            command.append(f"--{part}.options=[{', '.join([*parts[part].get('options', ()), *options])}]")
+            command.append(f"--{part}.options={json.dumps([*parts[part].get('options', ()), *options])}")
     if data:
         command.append(f"--data=[{', '.join(data)}]")
     if policy:
         # How often to save and to look at what is held out is said for the configuration's number of steps.
         counted = ("--steps=", "--eval_steps=", "--save_freq=")
         own = [one for one in parts["policy"].get("options", ()) if not (run.is_short and one.startswith(counted))]
-        command.append(f"--policy.options=[{', '.join([*own, *policy])}]")
+        command.append(f"--policy.options={json.dumps([*own, *policy])}")
     ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
     # Of all rounds, also of those that an earlier command made before it was stopped; rounds of an older version have
     # no time.

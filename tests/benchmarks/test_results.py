@@ -35,6 +35,7 @@ from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navi
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
 from tests.waiting import until
 
@@ -205,6 +206,8 @@ class Pretended(Runner):
         elif program == "bhd-train":
             assert "--output_dir" in keys
             assert Path(options[0].partition("=")[2]).is_file()
+            if "/dagger_" in options[0]:
+                read_stages(parse_aggregation(options))
         command = shlex.join(arguments)
         self.commands.append(Ran(command, 12.0, 0, 10.0, configs=digests([command], REPOSITORY), made="on a day"))
         return self.commands[-1]
