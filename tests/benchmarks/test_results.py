@@ -32,6 +32,7 @@ from benchmarks.results.provenance import digests
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
 from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
+from bhd_lerobot import plugin  # noqa: F401 - registers our policies
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
