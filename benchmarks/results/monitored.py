@@ -64,8 +64,9 @@ def monitored(run: Runner, section: Section) -> None:
     section.rows += [Row(f"ppo_{seed}: time of PPO", f"{one['seconds']:.0f} s") for seed, one in made.items()]
     section.remarks.append(
         "`clone_N` learned from `gap_follower` by aggregation, `ppo_N` from there by PPO with the monitor in the loop "
-        "(`robot.collision_monitor`); `avoidance`, the rule of the articles, has no monitor. All drive the same arenas. The "
-        "start is a candidate like any other: where it fails least in the 512 episodes that decide, `ppo_N` is it."
+        "(`robot.collision_monitor`); `avoidance`, the rule of the articles, has no monitor. All drive the same "
+        "arenas. The start is a candidate like any other: where it fails least in the 512 episodes that decide, "
+        "`ppo_N` is it."
     )
 
 
