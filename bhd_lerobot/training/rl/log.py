@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 PLOT_NAME = "learning_curve.png"
 Row = dict[str, Any]
 
+RECENT = 100  # episodes that a point of training stands for
 _CURVES = (("return", "return of the task"), ("success", "success"), ("score", "score"))
 SHOWN = (
     ("return", "return"),
@@ -38,9 +39,10 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
     axes = figure.subplots(len(_CURVES), 2, sharey="row", sharex="col", squeeze=False)
     for line, (key, label) in zip(axes, _CURVES, strict=True):
         for axis, time in zip(line, ("step", "minutes"), strict=True):
-            training = _points(rows, time, key)
+            training = recent(rows, time, key)
             if training:
-                axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label="training, with exploration")
+                label_of = f"training, with exploration: last {RECENT} episodes"
+                axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label=label_of)
             judged = _points(rows, time, f"val_{key}")
             if judged:
                 axis.plot(
@@ -55,6 +57,30 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
     axes[0][0].legend(frameon=False, fontsize=9)
     axes[0][0].xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M" if value >= 1e5 else f"{value:g}")
     figure.savefig(path, dpi=110)
+
+
+def recent(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[float]] | None:
+    """Return the points of a curve of training: means over the last episodes that had ended by then.
+
+    In one update few episodes end, and those that end between the others' are the failures.
+
+    Args:
+        rows: rows of a metrics file; those in which episodes ended say how many, and the mean over these.
+        time: key of the points' abscissae.
+        key: of what is shown.
+
+    Returns:
+        abscissae and ordinates; None if no episode has ended.
+    """
+    ended = [(row[time], row["episodes"], row[key]) for row in rows if row.get(key) is not None]
+    values = []
+    for last in range(len(ended)):
+        first, count = last, ended[last][1]
+        while first and count < RECENT:
+            first -= 1
+            count += ended[first][1]
+        values.append(sum(number * value for _, number, value in ended[first : last + 1]) / count)
+    return ([when for when, *_ in ended], values) if ended else None
 
 
 def _points(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[float]] | None:
