@@ -13,7 +13,7 @@ TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 SHOWN = {
     "record_and_look": ["400 frames in 4 episodes", "valid, no errors", "identical in 100 frames"],
     "train_and_evaluate": [" of 3 episodes succeeded", "step   20", "difference: "],
-    "cameras": ["12 tables in", "found what was asked for: ", "rule: 2 of 2"],
+    "cameras": ["12 tables in", "chose an object: ", "rule: 2 of 2"],
     "from_a_ros2_bag": ["control.applied_action", "valid, no errors"],
     "your_own": ["4 of 4 episodes succeeded", "gap_follower 4 of 4"],
 }
