@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 PLOT_NAME = "learning_curve.png"
 Row = dict[str, Any]
 
-RECENT = 100  # episodes that a point of training stands for
+RECENT = 100  # least episodes that a point of training stands for, if so many have ended
 _CURVES = (("return", "return of the task"), ("success", "success"), ("score", "score"))
 SHOWN = (
     ("return", "return"),
@@ -41,8 +41,8 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
         for axis, time in zip(line, ("step", "minutes"), strict=True):
             training = recent(rows, time, key)
             if training:
-                label_of = f"training, with exploration: last {RECENT} episodes"
-                axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label=label_of)
+                name = f"training, with exploration: last {RECENT} episodes or more"
+                axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label=name)
             judged = _points(rows, time, f"val_{key}")
             if judged:
                 axis.plot(
