@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.results.learning import record, seeds_rows, success_row, summary, train
+from benchmarks.results.learning import record, scores, seeds_rows, success_row, summary, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each, first_of
+from bhd_lerobot.evaluation import statistics
 
 EPISODES = 500
 _ANY = "--task.language=any"
@@ -23,6 +24,8 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("the same scenes, two or more objects", (_ANY, "--task.min_objects=2"), None),
     ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
 )
+_AS_IT_IS, _OTHER_SENTENCES = 0, 3  # of these
+_WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
 _FEW = ("--steps=600", "--eval_steps=600")
 _OTHERS = ("act", "diffusion")
@@ -51,6 +54,8 @@ def see(run: Runner, section: Section) -> None:
     for seed, results in made.items():
         _perceived(section, f"seed_{seed}", results["look"])
     _rows(run, section, made, [goal for _, _, goal in WORLDS])
+    if not run.is_short:
+        section.rows += [_wording_row(f"seed_{seed}", results["worlds"]) for seed, results in made.items()]
     section.rows += [success_row(one, name) for one in beside.values() for name in _SENSES]
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
@@ -166,6 +171,17 @@ def _rows(run: Runner, section: Section, made: Mapping[int, Any], goals: Sequenc
             words = "" if goal is None else f"lower end at least {goal:.0%}"
             section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
         section.rows += seeds_rows(results, what)
+
+
+def _wording_row(name: str, worlds: Mapping[str, Any]) -> Row:
+    """Return the row of what sentences of other families than the known ones cost, in the same scenes."""
+    # An episode of the pick task has the score 1 if it is a success, and less otherwise.
+    known, other = ([score == 1 for score in scores(worlds[str(one)], name)] for one in (_AS_IT_IS, _OTHER_SENTENCES))
+    found = statistics.rate_difference(other, known)
+    value = f"{100 * found.value:+.1f} points ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
+    goal = f"lower end at least -{100 * _WORDING_GOAL:.0f} points"
+    what = f"{name}: other sentences - the world as it is: success, paired"
+    return Row(what, value, goal, found.low >= -_WORDING_GOAL)
 
 
 def _blanked(run: Runner, output: str, config: str, inner: Mapping[str, str]) -> dict[str, Any]:
