@@ -1,10 +1,12 @@
 """Checkpoints do the same in bhd-eval, lerobot-eval and lerobot-rollout, and what a robot cannot give is named."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import torch
 from lerobot.datasets import LeRobotDataset
 
 from bhd_lerobot.errors import ConfigError
@@ -34,6 +36,15 @@ class Trained(NamedTuple):
     bhd_eval: list[str]
     lerobot_eval: list[str]
     lerobot_rollout: list[str]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Let all programs infer with one thread: the last bits of an action depend on their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
