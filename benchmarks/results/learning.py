@@ -131,7 +131,7 @@ def _driving_rows(results: Any, seed: int) -> list[Row]:
             f"at least {_PPO_GOAL}, its interval above 1",
             ratio.value >= _PPO_GOAL and ratio.low > 1,
         ),
-        Row(f"ppo_{seed} / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))),
+        Row(f"ppo_{seed} / avoidance, the simple rule: mean score, paired", mean(asdict(over))),
     ]
 
 

@@ -64,7 +64,7 @@ def monitored(run: Runner, section: Section) -> None:
     section.rows += [Row(f"ppo_{seed}: time of PPO", f"{one['seconds']:.0f} s") for seed, one in made.items()]
     section.remarks.append(
         "`clone_N` learned from `gap_follower` by aggregation, `ppo_N` from there by PPO with the monitor in the loop "
-        "(`robot.collision_monitor`); `avoidance`, the rule of the articles, has no monitor. All drive the same "
+        "(`robot.collision_monitor`); `avoidance`, the simple rule, has no monitor. All drive the same "
         "arenas. The start is a candidate like any other: where it fails least in the 512 episodes that decide, "
         "`ppo_N` is it."
     )
@@ -100,6 +100,6 @@ def rows(alone: Any, behind: Any, seed: int) -> list[Row]:
     what = f"{name} / clone_{seed} without the monitor: mean score, paired"
     found.append(Row(what, mean(asdict(clone)), "at least 1", clone.value >= 1))
     over = ratio_of_means(score, scores(alone, _RULE))
-    what = f"{name} / avoidance, the rule of the articles: mean score, paired"
+    what = f"{name} / avoidance, the simple rule: mean score, paired"
     found.append(Row(what, mean(asdict(over)), f"at least {_RULE_GOAL}", over.value >= _RULE_GOAL))
     return found

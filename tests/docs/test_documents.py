@@ -90,9 +90,9 @@ def broken_references(document: Path) -> list[str]:
         if name.startswith(tuple(f"{folder}/" for folder in FOLDERS)) and not (ROOT / name).exists():
             broken.append(name)
     targets_of_make = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    for name in re.findall(r"`make ([a-z-]+)", prose) + re.findall(r"^make ([a-z-]+)", text, re.MULTILINE):
-        if name not in targets_of_make:
-            broken.append(f"make {name}")
+    calls = re.findall(r"`make ([a-z-]+)( --)?", prose) + re.findall(r"^make ([a-z-]+)( --)?", text, re.MULTILINE)
+    # Options behind a target are options of make.
+    broken += [f"make {name}{option}" for name, option in calls if option or name not in targets_of_make]
     return broken
 
 
@@ -106,7 +106,14 @@ def test_every_link_and_every_file_exists() -> None:
 
 @each_case(
     "planted",
-    ["[x](no.md)", "[x](README.md#no-such-heading)", '<img src="no.png">', "`docs/no.md`", "`make nothing`"],
+    [
+        "[x](no.md)",
+        "[x](README.md#no-such-heading)",
+        '<img src="no.png">',
+        "`docs/no.md`",
+        "`make nothing`",
+        "`make results --only see`",
+    ],
 )
 def test_a_planted_broken_reference_is_found(tmp_path: Path, planted: str) -> None:
     (tmp_path / "README.md").write_text("# Heading\n")
@@ -125,7 +132,7 @@ def quoted_commands(path: Path) -> Iterator[str]:
         comments = "\n".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
         lines = comments.replace("\\\n", " ").splitlines()
     else:
-        blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", text, re.DOTALL))
+        blocks = "\n".join(re.findall(r"```(?:bash|sh|text)?\n(.*?)```", text, re.DOTALL))
         lines = blocks.replace("\\\n", " ").splitlines()
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
     # "…" stands for the options of an earlier command.

@@ -199,9 +199,19 @@ class _Run:
             result.checkpoint = checkpoints.folder_of(result.output_dir, result.step)
             rows = read_metrics(metrics, result.step)
             clean(result.output_dir)
-        if result.step >= config.steps:
+        # The episodes that decide between checkpoints may be what a killed run has left to do.
+        is_judged = not config.validation.confirm or any(
+            row["step"] == result.step and "candidate" in row for row in rows
+        )
+        if result.step >= config.steps and is_judged:
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
+            )
+        minutes = config.max_minutes
+        if config.resume and minutes is not None and self._minutes() >= minutes and is_judged:
+            raise ConfigError(
+                f"The run has used its time over all sittings: max_minutes is {minutes:g}. To go on, set more with "
+                f"--max_minutes, or no limit with --max_minutes=null."
             )
         _write_config(config, result.output_dir)
         self._metrics = MetricsFile(metrics, rows)

@@ -140,6 +140,8 @@ def test_a_run_goes_on_where_it_was(finished: RlResult, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="has done 64 of 64"):
         train(parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true"]), Console(file=io.StringIO()))
     command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=128"]
+    with pytest.raises(ConfigError, match=r"used its time.*max_minutes is 1e-06.*--max_minutes=null"):
+        train(parse_rl([*command, "--max_minutes=1e-6"]), Console(file=io.StringIO()))
     second = train(parse_rl(command), Console(file=io.StringIO()))
     assert second.step == 128
     steps = [row["step"] for row in rows(second.output_dir)]
@@ -272,10 +274,18 @@ def test_the_best_checkpoint_is_the_one_of_most_successes_and_the_start_is_among
         result = run(tmp_path / str(confirm), validation__confirm=confirm, **wanted)
         assert result.best == result.output_dir / "checkpoints" / f"{best:09d}"
     assert [step for step, further in driven if further] == [0, 64, 96]
+    # What a run that was killed among these episodes has left to do is done.
+    metrics = tmp_path / "2/metrics.jsonl"
+    kept = [line for line in metrics.read_text().splitlines() if "candidate" not in line]
+    metrics.write_text("\n".join(kept) + "\n")
+    again = [f"--config_path={tmp_path / '2'}", "--resume=true"]
+    assert train(parse_rl(again), Console(file=io.StringIO())).best == tmp_path / "2/checkpoints/000000000"
+    assert [step for step, further in driven if further] == [0, 64, 96] * 2
+    driven.clear()
     again = [f"--config_path={tmp_path / '2'}", "--resume=true", "--steps=97"]
     levels[128] = ((1.0, 0.4), (1.0, 0.25))
     assert train(parse_rl(again), Console(file=io.StringIO())).best == tmp_path / "2/checkpoints/000000128"
-    assert [step for step, further in driven if further] == [0, 64, 96, 128]
+    assert [step for step, further in driven if further] == [128]
 
 
 def test_ctrl_c_saves_and_prints_the_resume_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
