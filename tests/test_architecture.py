@@ -315,16 +315,27 @@ def test_the_real_time_process_stays_light(packages: tuple[str, ...], unwanted: 
         f"{PACKAGE}.{module_name(p, SOURCE)}" for package in packages for p in sorted((SOURCE / package).rglob("*.py"))
     ]
     assert len(modules) >= len(packages)
+    assert imported_with(modules, unwanted) == []
+
+
+def test_recording_and_evaluating_rules_start_without_what_networks_need() -> None:
+    unwanted = ("diffusers", "torchvision", "transformers", "datasets", "lerobot.configs", "lerobot.datasets")
+    programs = [f"{PACKAGE}.recording.record", f"{PACKAGE}.evaluation.evaluate"]
+    assert imported_with(programs, unwanted) == []
+
+
+def imported_with(modules: list[str], candidates: tuple[str, ...]) -> list[str]:
+    """Return which of some packages are imported where a process imports some modules."""
     program = (
         "import importlib, sys\n"
         f"for name in {modules!r}: importlib.import_module(name)\n"
-        f"print(*sorted(set({unwanted!r}) & set(sys.modules)))\n"
+        f"print(*sorted(set({candidates!r}) & set(sys.modules)))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT, stdin=subprocess.DEVNULL
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
+    return done.stdout.split()
 
 
 # Written in two halves, or this file would break its own rule.

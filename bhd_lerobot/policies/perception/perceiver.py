@@ -12,7 +12,6 @@ from bhd_lerobot.errors import ConfigError, PerceptionError
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.manipulation.grasp import SeenObject
-from bhd_lerobot.policies.perception import configuration_perception  # noqa: F401 - registers bhd_perception
 
 if TYPE_CHECKING:
     from bhd_lerobot.policies.perception.modeling_perception import Detections
