@@ -176,7 +176,8 @@ def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:
     Raises:
         ConfigError: an option of the stage is one that a round sets itself.
     """
-    if taken := sorted(_names(stage) & _OWN):
+    # The curve compares with the expert that teaches, not with one that another option changed.
+    if taken := sorted(name for name in _names(stage) if name in _OWN or name.startswith("brains.expert.")):
         raise ConfigError(
             f"The option --{taken[0]} of {stage.config!r} is set by the rounds themselves; leave it out of its options."
         )

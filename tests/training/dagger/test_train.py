@@ -225,7 +225,7 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
                 {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [f"--{name}=x"]}},
                 f"The option --{name} of .* is set by the rounds themselves",
             )
-            for name in ("split", "brains.policy.path")
+            for name in ("split", "brains.policy.path", "brains.expert.margin_m")
         ),
         (
             {"evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []}},
