@@ -360,7 +360,8 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
     """Return the row of a brain's success."""
     brain = results["brains"][name]
     met = None if goal is None else brain["success"]["value"] >= goal
-    what = f"{name}: success in {brain['episodes']}"
+    told = ", from privileged state" if brain.get("privileged") else ""
+    what = f"{name}{told}: success in {brain['episodes']}"
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
 
 

@@ -24,7 +24,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
 from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
 from bhd_lerobot.evaluation.metrics import JerkMeasure
 from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
-from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
+from bhd_lerobot.evaluation.results import BrainSummary, EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent, perception_sentence
 from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
@@ -56,7 +56,7 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         failures = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
         pair = results.paired.get(label)
         table.add_row(
-            escape(label) + ("\n(baseline)" if label == baseline and len(results.brains) > 1 else ""),
+            escape(label) + "".join(f"\n({mark})" for mark in _marks(one, baseline, len(results.brains))),
             _lines(f"{one.successes}/{one.episodes} = {percent(one.success)}"),
             _lines(number(one.means["score"], 3)),
             _lines(percent(pair.success, sign=True)) if pair else "",
@@ -79,6 +79,12 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
         console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
     console.print(f"Report: {escape(str(result.report))}", soft_wrap=True)
+
+
+def _marks(one: BrainSummary, baseline: str, count: int) -> list[str]:
+    """Return what is said of a brain beside its name."""
+    marks = ["baseline"] if one.brain == baseline and count > 1 else []
+    return [*marks, "privileged state"] if one.privileged else marks
 
 
 def _lines(text: str) -> str:
@@ -178,6 +184,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         {brain_run.label: brain_run.episodes for brain_run in runs},
         len(config.indices),
         config.reference,
+        privileged={brain_run.label for brain_run in runs if brain_run.is_privileged},
     )
     timing = {
         "made": datetime.now().astimezone().isoformat(timespec="seconds"),

@@ -4,7 +4,7 @@ import base64
 import hashlib
 import io
 import shlex
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
@@ -158,8 +158,14 @@ def _summary(given: ReportInput) -> str:
         f"of scores also hold what may have stayed unseen. Jerk is that of the commanded motion ({what}), from frame "
         "to frame; “largest” is the mean over episodes of each one's largest."
     )
+    privileged = {label for label, one in results.brains.items() if one.privileged}
+    if privileged:
+        note += (
+            " Privileged state: the brain acts on what the task reports of the simulator's truth "
+            "(<code>observation.environment_state</code>), which no sensor tells."
+        )
     drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
-    return drawn + table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
+    return drawn + table(head, rows, results.config["baseline"], privileged) + f'<p class="note">{note}</p>'
 
 
 def _paired(given: ReportInput) -> str:
@@ -389,13 +395,18 @@ def cell(text: str, below: str = "") -> str:
     return "<br>".join(line for line in lines if line and line != '<span class="ci"></span>')
 
 
-def table(head: list[str], rows: list[tuple[str, list[str]]], baseline: str | None = None) -> str:
-    """Return a table with a row for each brain; the baseline's is marked."""
+def table(
+    head: list[str],
+    rows: list[tuple[str, list[str]]],
+    baseline: str | None = None,
+    privileged: Collection[str] = (),
+) -> str:
+    """Return a table with a row for each brain; the baseline's is marked, and those that use a privileged state."""
+    badge = ' <span class="badge">privileged state</span>'
     top = "".join(f"<th>{escape(one)}</th>" for one in ["brain", *head])
     body = "".join(
-        f"<tr{' class=baseline' if label == baseline and len(rows) > 1 else ''}><td class='name'>{escape(label)}</td>"
-        + "".join(f"<td>{text}</td>" for text in cells)
-        + "</tr>"
+        f"<tr{' class=baseline' if label == baseline and len(rows) > 1 else ''}><td class='name'>{escape(label)}"
+        f"{badge if label in privileged else ''}</td>" + "".join(f"<td>{text}</td>" for text in cells) + "</tr>"
         for label, cells in rows
     )
     return f'<div class="scroll"><table><tr>{top}</tr>{body}</table></div>'

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ class BrainSummary:
 
     Attributes:
         brain: its name in the evaluation.
+        privileged: whether it acts on what no sensor tells: on the environment state that the task reports.
         episodes: how many it ran.
         successes: how many of them were a success.
         success: its success rate with its Wilson interval.
@@ -40,6 +41,7 @@ class BrainSummary:
     """
 
     brain: str
+    privileged: bool
     episodes: int
     successes: int
     success: Estimate
@@ -126,6 +128,8 @@ def summarise(
     episodes: Mapping[str, Sequence[EpisodeMetrics]],
     requested: int,
     baseline: str,
+    *,
+    privileged: Collection[str] = (),
 ) -> EvalResults:
     """Return the summaries of brains after some episodes.
 
@@ -135,18 +139,19 @@ def summarise(
         episodes: of each brain, by its name.
         requested: how many episodes of each brain were requested.
         baseline: the brain that the others are compared with.
+        privileged: the brains that act on what no sensor tells.
     """
     results = EvalResults(config, versions, requested)
     compared = max(1, len(episodes) - 1)
     for label, ran in episodes.items():
         results.episodes += ran
-        results.brains[label] = _brain(label, ran)
+        results.brains[label] = _brain(label, ran, label in privileged)
         if label != baseline:
             results.paired[label] = _pair(ran, episodes[baseline], label, baseline, compared)
     return results
 
 
-def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
+def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool) -> BrainSummary:
     successes = sum(episode.success for episode in episodes)
     means = {}
     for name in MEANS:
@@ -155,6 +160,7 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
         means[name] = statistics.mean(values[np.isfinite(values)], within=within)
     return BrainSummary(
         brain=label,
+        privileged=privileged,
         episodes=len(episodes),
         successes=successes,
         success=statistics.wilson(successes, len(episodes)),

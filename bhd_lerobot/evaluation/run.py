@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
-from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.policies.brain import Brain, is_privileged
 from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
 from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_task
@@ -57,6 +57,11 @@ class BrainRun:
     videos: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
     initial_states: list[NDArray[np.float64]] = field(default_factory=list)
     wall_s: float = 0.0
+
+    @property
+    def is_privileged(self) -> bool:
+        """Whether the brain acts on what no sensor tells."""
+        return is_privileged(self.loop.brain, self.loop.task.environment_names)
 
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""

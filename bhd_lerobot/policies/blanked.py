@@ -56,6 +56,11 @@ class BlankedBrain:
         """Whether the brain uses images."""
         return self._brain.uses_images
 
+    @property
+    def uses_privileged_state(self) -> bool:
+        """Whether the brain uses what no sensor tells."""
+        return self._brain.uses_privileged_state
+
     def bind(self, robot: RobotFeatures) -> None:
         """Bind the brain."""
         self._brain.bind(robot)

@@ -63,7 +63,7 @@ class Observation:
         names: feature names of the columns of `state`.
         state: the robots' floats, shape (n, len(names)), read-only.
         images: by camera name, shape (n, height, width, 3), RGB.
-        environment_state: what the task reports to the brain, shape (n, k), or None.
+        environment_state: privileged: what the task reports of the simulator's truth, shape (n, k), or None.
         results: how goals ended since the last observation, by simulation.
         running: which simulations are in an episode, shape (n,); all if None. What the others see means nothing.
     """
@@ -112,6 +112,10 @@ class Brain(Protocol):
     def uses_images(self) -> bool:
         """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may get none."""
 
+    @property
+    def uses_privileged_state(self) -> bool:
+        """Whether `act` uses the observation's `environment_state`, which no sensor tells. If not, it gets none."""
+
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot it will drive.
 
@@ -145,6 +149,11 @@ class Brain(Protocol):
         """Return everything that defines the brain, as plain values."""
 
 
+def is_privileged(brain: Brain, environment_names: Sequence[str]) -> bool:
+    """Return whether a brain acts on what no sensor tells: it uses the environment state, and the task reports one."""
+    return bool(environment_names) and getattr(brain, "uses_privileged_state", True)
+
+
 class ConfiguredBrain:
     """What brains have in common that are defined by their configuration; without images and without a plan.
 
@@ -154,6 +163,8 @@ class ConfiguredBrain:
 
     name: str
     uses_images = False
+    uses_privileged_state: bool = True
+    """Of a brain that does not say, it is taken for granted that it uses what the task reports, if that is anything."""
     has_plan = False
 
     def __init__(self, config: Any) -> None:

@@ -13,7 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.host import FrameReport, Host
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -186,7 +186,8 @@ class EpisodeLoop:
             # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
             truth = simulation.truth() if self._truth is None else self._truth
             values[keys.ENVIRONMENT_STATE] = task.environment_state(truth).astype(np.float32)
-            environment = values[keys.ENVIRONMENT_STATE].astype(np.float64)
+            if is_privileged(brain, task.environment_names):
+                environment = values[keys.ENVIRONMENT_STATE].astype(np.float64)
         seen = Observation(
             simulation.observation_names,
             state.astype(np.float64),

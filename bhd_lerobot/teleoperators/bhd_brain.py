@@ -13,7 +13,7 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals, Mixed
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
@@ -154,9 +154,8 @@ class BhdBrain(Teleoperator):
         state = np.array([[seen[name] for name in robot.observation_names]])
         images = {name: seen[name][None] for name in robot.camera_shapes}
         names, reported = robot.environment
-        observation = Observation(
-            robot.observation_names, state, images, reported[None] if names else None, {0: self._results}
-        )
+        environment = reported[None] if is_privileged(self._brain, names) else None
+        observation = Observation(robot.observation_names, state, images, environment, {0: self._results})
         wanted = self._brain.act(observation)
         if isinstance(wanted, Mixed):
             raise ConfigError(

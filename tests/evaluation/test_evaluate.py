@@ -71,6 +71,19 @@ def test_the_same_bytes_twice_and_for_any_number_of_simulations(whole, tmp_path)
         assert all(np.array_equal(one[name], other[name]) for name in one.files)
 
 
+def test_who_acts_on_what_no_sensor_tells_is_marked_everywhere(tmp_path):
+    """The rule `navigator` is told where its goal is; `gap_follower` is not, though the task tells it."""
+    task = {"task__type": "navigate", "task__duration_s": 1, "task__min_path_m": None, "n_episodes": 1, "n_envs": 1}
+    brains = {"brains__old__type": "navigator", "brains__new__type": "gap_follower"}
+    result, printed = run_eval(tmp_path, **task, **brains)
+    assert {label: one["privileged"] for label, one in results(tmp_path)["brains"].items()} == {
+        "old": True,
+        "new": False,
+    }
+    assert result.report.read_text(encoding="utf-8").count('"badge">privileged state<') == 1
+    assert printed.count("(privileged state)") == 1
+
+
 def test_brains_get_the_same_episodes_which_are_held_out(whole):
     folder, result, _ = whole
     by_brain = {label: [e for e in result.results.episodes if e.brain == label] for label in ("old", "new")}

@@ -18,7 +18,7 @@ from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.plots import OUTCOMES, notable_episodes
 from bhd_lerobot.evaluation.results import summarise, write_json
 from bhd_lerobot.evaluation.statistics import Estimate
-from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.evaluation.text import number, percent, sentences, verdict
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.tasks.task import Event
 from tests.evaluation.test_evaluate import FAILING, run_eval
@@ -187,6 +187,35 @@ def test_sentences_claim_a_difference_only_where_the_interval_leaves_out_nothing
     assert "beside" not in text["old"]
     assert "it succeeds more often (+50.0 points) and it has a higher score, 2.90 times" in text["new"]
     assert "no difference in success is certain" in text["same"]
+
+
+def test_comparisons_of_several_brains_hold_all_at_once():
+    base = [metrics("base", n, 0.5, "success" if n % 2 else "stuck") for n in range(40)]
+    same = [metrics("same", n, 0.5) for n in range(40)]
+    one = [metrics("one", n, 0.5 + 0.01 * (n % 7), "success" if n % 2 or n < 14 else "stuck") for n in range(40)]
+    alone = summarise({}, {}, {"base": base, "one": one}, 40, "base").paired["one"]
+    others = {f"same_{number}": same for number in range(4)}
+    among = summarise({}, {}, {"base": base, "one": one, **others}, 40, "base").paired["one"]
+    assert among.differ.p == pytest.approx(5 * alone.differ.p)
+    success, score = ([one.differ.better for one in (alone, among)], [one.episodes for one in (alone, among)])
+    assert success == [7, 7]
+    assert score == [40, 40]
+    for name in ("success", "score", "ratio"):
+        narrow, wide = getattr(alone, name), getattr(among, name)
+        assert wide.low < narrow.low < narrow.value == wide.value < narrow.high < wide.high, name
+    # 7 to 0 is more than chance for one brain, and less than that for one of five.
+    assert "succeeds more often" in verdict(alone)
+    assert "no difference in success is certain" in verdict(among)
+
+
+def test_episodes_that_begin_alike_are_counted_and_said_to_be_no_independent_ones():
+    for states, words in ((["a", "b", "c"], None), (["a", "a", "b"], "began in 2 different states"), ("aaa", "alike")):
+        ran = [replace(metrics("rule", n, 0.5), initial_state=state) for n, state in enumerate(states)]
+        results = summarise({}, {}, {"rule": ran}, 3, "rule")
+        assert results.brains["rule"].starts == len(set(states))
+        said = sentences(results)[0]
+        assert ("not independent" in said) == (words is not None)
+        assert words is None or words in said
 
 
 def test_infinity_and_nan_become_null_in_json(tmp_path):

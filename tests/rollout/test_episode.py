@@ -8,6 +8,7 @@ import pytest
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.brain import is_privileged
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -57,6 +58,26 @@ def run(kind: str, brain: Script, n: int = 2) -> list[Episode]:
         simulation = make_simulation(TurtleBot3Config(beams=36), n)
         task = make_task(AvoidConfig(duration_s=FRAMES / 10), n, 10)
     return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(3)]))
+
+
+@pytest.mark.parametrize(("declared", "told"), [(True, True), (False, False), (None, True)])
+def test_what_no_sensor_tells_is_for_brains_that_say_that_they_use_it(declared: bool | None, told: bool) -> None:
+    """Of a brain that says nothing, such as an older plug-in's, it is taken for granted."""
+    seen = []
+
+    class Spy(Script):
+        def act(self, observation: Any) -> Any:
+            seen.append(observation.environment_state)
+            return super().act(observation)
+
+    brain = Spy(script("ur5"))
+    if declared is not None:
+        brain.uses_privileged_state = declared  # type: ignore[attr-defined]
+    assert is_privileged(brain, ["target.x"]) == told  # type: ignore[arg-type]
+    episodes = run("ur5", brain)
+    assert {one is not None for one in seen} == {told}
+    # It is recorded all the same.
+    assert episodes[0].columns["observation.environment_state"].shape[1] == 7
 
 
 def script(kind: str) -> np.ndarray:

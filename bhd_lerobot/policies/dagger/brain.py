@@ -113,6 +113,11 @@ class DaggerBrain:
         """Whether learner or expert uses images."""
         return self.learner.uses_images or self.expert.uses_images
 
+    @property
+    def uses_privileged_state(self) -> bool:
+        """Whether learner or expert uses what no sensor tells."""
+        return self.learner.uses_privileged_state or self.expert.uses_privileged_state
+
     def bind(self, robot: RobotFeatures) -> None:
         """Bind learner and expert, and find what is to be watched."""
         config = self.config

@@ -88,6 +88,11 @@ class LanguageBrain(PickBrain):
         """Whether it sees for itself."""
         return self.perceiver is not None
 
+    @property
+    def uses_privileged_state(self) -> bool:  # type: ignore[override]
+        """Whether it is told where the objects are, because it does not see for itself."""
+        return self.perceiver is None
+
     def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations it is about to look at something, shape (n,)."""
         return np.array([self._is_looking(sim, results.get(sim, ())) for sim in range(len(self._pending))], np.bool_)

@@ -84,6 +84,7 @@ class LearnedBrain:
         self.contract = PolicyContract.load(folder)
         self.loaded = load_policy(folder, config.device, config.n_action_steps)
         self.uses_images = bool(self.loaded.cameras)
+        self.uses_privileged_state = _ENVIRONMENT in self.loaded.inputs
         self.inference = make_inference(self.loaded, sample=config.sample, exact=config.exact, threads=config.threads)
         if config.stream and self.inference.steps == 1:
             raise ConfigError(

@@ -51,6 +51,7 @@ class AvoidanceBrain(ConfiguredBrain):
 
     name = "avoidance"
     robot_kind = "base"
+    uses_privileged_state = False
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()

@@ -74,6 +74,7 @@ class GapFollowerBrain(DrivingBrain):
     """
 
     name = "gap_follower"
+    uses_privileged_state = False
     has_narrow = False
 
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
