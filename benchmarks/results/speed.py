@@ -108,7 +108,12 @@ def sight_rows(results: Mapping[str, Any]) -> list[Row]:
                 f"at most {results['goals']['wake_p99']:g} x",
                 over["wake_p99"] <= results["goals"]["wake_p99"],
             ),
-            Row(f"{what}: ticks later than 0.1 ms", f"{share}; missed {row['missed']}, beside noop {alone['missed']}"),
+            Row(
+                f"{what}: ticks later than 0.1 ms",
+                f"{share}; missed {row['missed']}, beside noop {alone['missed']}",
+                f"at most {results['goals']['late_share']:.1%} more",
+                row["later_share"] <= results["goals"]["late_share"],
+            ),
             Row(
                 f"{what}: frames/s",
                 f"{row['frames_per_s']:.2f}, beside noop {alone['frames_per_s']:.2f}; {row['cpu_ms']:.1f} CPU ms each",

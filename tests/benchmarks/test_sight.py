@@ -35,8 +35,16 @@ def test_what_is_too_slow_misses_its_goal_and_the_page_says_so() -> None:
     table = rows([block(NOOP, 0, 10.0), block(PERCEPTION, 0, 10.0, rate=20.0)])
     assert not table[1]["met"]
     shown = sight_rows({"rows": table, "goals": GOALS})
-    assert [row.met for row in shown] == [True, None, False]
+    assert [row.met for row in shown] == [True, True, False]
     assert "20.00, beside noop 25.00" in shown[2].value
+
+
+def test_more_late_ticks_than_beside_noop_in_the_same_round_miss_the_goal() -> None:
+    for late, met in ((2e-3, True), (3e-3, False)):
+        blocks = [block(NOOP, 0, 10.0), {**block(PERCEPTION, 0, 10.0), "late_share": late}]
+        table = rows(blocks)
+        assert table[1]["met"] == met
+        assert [row.met for row in sight_rows({"rows": table, "goals": GOALS})] == [True, met, True]
 
 
 def test_the_untrained_perception_finds_as_many_objects_as_there_can_be(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.language.instruction import RulePlanner, parse
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
 from bhd_lerobot.policies.manipulation.skills import scene_object
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse as parse_configuration
 from bhd_lerobot.tasks.pick import (
     HELD_OUT_INSTRUCTIONS,
     HELD_OUT_NAMES,
@@ -26,6 +29,8 @@ from bhd_lerobot.tasks.pick import (
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig, ReportConfig
 from tests.cases import each_case
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "record"
 
 FPS = 10
 WILD = RandomisationConfig(enabled=True)
@@ -427,6 +432,13 @@ def test_names_that_are_held_out_occur_there_only_and_each_of_their_words_elsewh
     assert {colour for colour, _ in known} >= {colour for colour, _ in HELD_OUT_NAMES}
     asked = [scene.objects[scene.target_object] for scene in scenes(200, names="held_out")]
     assert {(one.colour, one.kind) for one in asked} == set(HELD_OUT_NAMES)
+
+
+@pytest.mark.parametrize("recipe", ["ur5_look", "ur5_pick_pixels", "ur5_pick_pixels_dagger"])
+def test_what_is_learned_from_leaves_out_what_is_held_out(recipe: str) -> None:
+    task = parse_configuration(RecordConfig, [f"--config_path={CONFIGS}/{recipe}.yaml"]).task
+    assert isinstance(task, PickConfig)
+    assert (task.names, task.wording, task.objects, task.swap) == ("known", "known", "known", False)
 
 
 def test_sentences_that_are_held_out_are_others_and_the_rules_understand_them() -> None:
