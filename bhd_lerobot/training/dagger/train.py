@@ -13,7 +13,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from bhd_lerobot.datasets.edit.edits import merge
+from bhd_lerobot.datasets.edit.edits import delete, merge
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
@@ -34,11 +34,27 @@ from bhd_lerobot.training.dagger.curve import draw_curve
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
 _CONFIG, _DONE = "config.yaml", "done.json"
+_OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
     "bhd-record": record.main,
     "bhd-train": training.main,
     "bhd-eval": evaluate.main,
 }
+
+
+def _repeated(root: Path) -> list[int]:
+    """Return the numbers of episodes of which an earlier one has the same start, brain and end: what was copied."""
+    known: set[str] = set()
+    repeated = []
+    for one in dataset_info(root).episodes:
+        metadata = {name: value for name, value in one.metadata.items() if name not in _OF_A_RUN}
+        if metadata.get("seed") is None:
+            continue  # of another recorder, which does not say how the episode came about
+        key = json.dumps([one.frames, metadata], sort_keys=True, default=lambda value: value.tolist())
+        if key in known:
+            repeated.append(one.index)
+        known.add(key)
+    return repeated
 
 
 class _StoppedError(Exception):
@@ -224,6 +240,9 @@ class _Rounds:
         shutil.rmtree(target, ignore_errors=True)
         self._say(number, f"merge {' '.join(map(str, parts))}")
         merge(parts, target)
+        if twice := _repeated(target):
+            self._say(number, f"leave out {len(twice)} episodes that are in these datasets more than once")
+            delete(target, twice)
         return target
 
     def _evaluate(self, number: int, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,10 @@ def test_every_round_learns_from_data_that_was_recorded_before_as_well(
         folder.mkdir()
     assert main([f"--config_path={settings(folders[0], rounds=0)}"]) == 0
     before = folders[0] / "run" / "round_0" / "data"
-    assert main([f"--config_path={settings(folders[1], rounds=0, seed=5)}", f"--data=[{before}]"]) == 0
+    # What is in several of them, because one is a copy of another, is learned once.
+    copied = shutil.copytree(before, folders[0] / "copied")
+    assert main([f"--config_path={settings(folders[1], rounds=0, seed=5)}", f"--data=[{before}, {copied}]"]) == 0
+    assert "leave out 2 episodes that are in these datasets more than once" in " ".join(capsys.readouterr().err.split())
     run = folders[1] / "run"
     frames = [dataset_info(root).frames for root in (before, run / "round_0" / "data")]
     learned = PolicyContract.load(run / "round_0" / "policy").dataset
