@@ -354,6 +354,36 @@ def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in
         assert np.allclose(stats["mean"], wanted.mean(axis=0), atol=1e-5)
 
 
+ARM = {"robot__type": "ur5", "robot__beams": None, "robot__action_space": "tool", "robot__tool_pose": True}
+EXPERTS = {
+    "navigator": {"task__type": "navigate"},
+    "reach_servo": {**ARM, "task__type": "reach"},
+    "pick_servo": {**ARM, "task__type": "pick"},
+}
+
+
+@pytest.mark.parametrize("expert", EXPERTS)
+def test_every_rule_that_gives_setpoints_says_what_it_would_do_where_it_did_not_choose_to_be(
+    expert: str, tmp_path: Path
+) -> None:
+    common = {**EXPERTS[expert], "dataset__expert_action": True, "dataset__episode_time_s": 1.6}
+    brains = {"brain__type": "dagger", "brain__learner__type": "noop", "brain__expert__type": expert}
+    turns = {"brain__patience_s": 0.4, "brain__hold_s": 0.4, "brain__collision_s": None, "brain__stall_s": None}
+    turns = {name: "null" if value is None else value for name, value in turns.items()}
+    run_record(tmp_path / "driven", **common, **brains, **turns, dataset__num_episodes=2)
+    run_record(tmp_path / "alone", **common, brain__type=expert, dataset__num_episodes=2)
+    driven, alone = (
+        {key: np.array(values) for key, values in data_columns(tmp_path / name).items()} for name in ("driven", "alone")
+    )
+    by_expert = driven["event"] == int(Event.INTERVENTION)
+    assert 0.2 < by_expert.mean() < 0.8
+    assert np.array_equal(driven["expert.action"][by_expert], driven["action"][by_expert])
+    assert (np.abs(driven["expert.action"] - driven["action"])[~by_expert].max(axis=1) > 0.001).mean() > 0.5
+    assert np.array_equal(alone["expert.action"], alone["action"])
+    starts = [one["frame_index"] == 0 for one in (alone, driven)]
+    assert np.array_equal(alone["action"][starts[0]], driven["expert.action"][starts[1]])
+
+
 def test_who_is_no_expert_gives_no_advice(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"brain.type is 'dagger', with an expert that gives goals\. Use a rule"):
         run_record(tmp_path / "goals", **REACH, dataset__expert_action=True)
