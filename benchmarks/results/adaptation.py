@@ -13,6 +13,7 @@ from benchmarks.results.learning import (
     reaching,
     record,
     record_reach,
+    seeds_rows,
     summary,
     train,
     train_reach,
@@ -72,6 +73,7 @@ def fine_tune(run: Runner, section: Section) -> None:
     made = each(run, section, "fine_tune", SEEDS, learn)
     for seed, results in made.items():
         section.rows += _recovery_rows(results, seed, f"{SHOWN} episodes", shifted, GOAL)
+    section.rows += seeds_rows({seed: one[shifted] for seed, one in made.items()}, f"tuned, {shifted}", "tuned")
     section.remarks.append(
         "The share is (tuned, shifted - base, shifted) / (base, original - base, shifted) over the same seeds; its "
         "interval is a bootstrap over them, which draws all three outcomes of a seed together."
@@ -105,6 +107,8 @@ def move_camera(run: Runner, section: Section) -> None:
     made = each(run, section, "move_camera", SEEDS, learn)
     for seed, results in made.items():
         section.rows += _recovery_rows(results, seed, f"{TABLES} tables", _ELSEWHERE, _CAMERA_GOAL)
+    elsewhere = {seed: one[_ELSEWHERE] for seed, one in made.items()}
+    section.rows += seeds_rows(elsewhere, f"tuned, {_ELSEWHERE}", "tuned")
     section.remarks.append(
         f"A table is one image with the true poses of what stands there; {TABLES} were seen through the camera where "
         "it is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "

@@ -4,7 +4,16 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from benchmarks.results.learning import SHORTER, aggregation, scores, seeds_rows, success_row, summary
+from benchmarks.results.learning import (
+    SHORTER,
+    Aggregated,
+    aggregation,
+    rounds_rows,
+    scores,
+    seeds_rows,
+    success_row,
+    summary,
+)
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from benchmarks.results.trainings import SEEDS, each, first_of
@@ -21,11 +30,12 @@ def camera_drive(run: Runner, section: Section) -> None:
     """Let a rule that reads the lidar correct a driver that sees with a camera."""
 
     def learn(seed: int) -> dict[str, Any]:
-        (policy, seconds), name = _learned(run, seed), f"seed_{seed}"
-        return {**_evaluate(run, name, _brain(run, name, policy), (_RULE, name)), "seconds": seconds}
+        (policy, seconds, rounds), name = _learned(run, seed), f"seed_{seed}"
+        results = _evaluate(run, name, _brain(run, name, policy), (_RULE, name))
+        return {**results, "seconds": seconds, "rounds": rounds}
 
     def others(seed: int) -> dict[str, Any]:
-        policy, _ = _learned(run, seed)
+        policy = _learned(run, seed).policy
         inner = _brain(run, "blind.brain", policy)
         blind = ("--brains.blind.type=blanked", "--brains.blind.images=true", *inner)
         clone = _brain(run, "clone", f"{_folder(seed)}/round_0/policy")
@@ -55,6 +65,7 @@ def camera_drive(run: Runner, section: Section) -> None:
             ),
         ]
     section.rows += seeds_rows(made)
+    section.rows += rounds_rows(made)
     section.rows += [
         Row(
             f"seed_{seed}: time from nothing",
@@ -78,8 +89,7 @@ def camera_drive(run: Runner, section: Section) -> None:
         )
 
 
-def _learned(run: Runner, seed: int) -> tuple[str, float]:
-    """Learn by aggregation, and return the folder of the policy and how long that took [s]."""
+def _learned(run: Runner, seed: int) -> Aggregated:
     name, config = f"camera_drive_train_{seed}", "dagger_turtlebot3_camera"
     return aggregation(
         run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS, options=SHORTER

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -83,10 +83,12 @@ def avoid(run: Runner, section: Section) -> None:
         section.rows += [success_row(first, name), _score_row(first, name, name)]
     for seed, results in made.items():
         section.rows += _driving_rows(results, seed)
+    for name in ("bc", "gap_bc", "ppo"):
+        section.rows += seeds_rows(made, f"{name}, all seeds", name)
     section.remarks.append(
         "Each seed N is one of the training. `bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule "
         "remembers where it has been; a network does not, so the task reports to `gap_bc` and `ppo`, which starts "
-        "from it, what ground around them they have visited (`task.trail`)."
+        "from it, what ground around them they have visited (`task.trail`, privileged: from the robot's true pose)."
     )
 
 
@@ -147,7 +149,7 @@ def reach(run: Runner, section: Section) -> None:
     def learn(seed: int) -> dict[str, Any]:
         seconds = {f"bc_{episodes}": recorded[episodes] + train_reach(run, seed, episodes) for episodes in numbers}
         folders = {f"bc_{episodes}": reach_folder(seed, episodes) for episodes in numbers}
-        folders[_HELPED], seconds[_HELPED] = aggregation(
+        folders[_HELPED], seconds[_HELPED], _ = aggregation(
             run,
             f"reach_dagger_{seed}",
             "dagger_ur5_reach",
@@ -177,7 +179,8 @@ def reach(run: Runner, section: Section) -> None:
     section.remarks.append(
         "`bc_N` learned from N episodes, all with the same number of steps; each seed is one of the training. `dagger` "
         f"learned from {numbers[-1]} others and from those in which the first policy drove and the rule took over "
-        "where that got stuck; each seed is one of recording, too."
+        "where that got stuck; each seed is one of recording, too. All are told where the target is by the simulator "
+        "(privileged state)."
     )
 
 
@@ -247,6 +250,20 @@ def train(
     return run.run(name, [*command, *(short if run.is_short else ())], makes=(output,)).seconds
 
 
+class Aggregated(NamedTuple):
+    """What learning by aggregation came to.
+
+    Attributes:
+        policy: the folder of the last round's policy.
+        seconds: how long all rounds took [s].
+        rounds: of each, from how many episodes it learned and its success on the validation episodes.
+    """
+
+    policy: str
+    seconds: float
+    rounds: list[dict[str, Any]]
+
+
 def aggregation(
     run: Runner,
     name: str,
@@ -260,8 +277,8 @@ def aggregation(
     policy: Sequence[str] = (),
     data: Sequence[str] = (),
     options: Sequence[str] = (),
-) -> tuple[str, float]:
-    """Learn by aggregation, and return the folder of the last round's policy and how long that took [s].
+) -> Aggregated:
+    """Learn by aggregation.
 
     Args:
         run: runs it.
@@ -296,8 +313,13 @@ def aggregation(
     ran = run.run(name, [*command, f"--output_dir={run.path(output)}"], resumes=(output,))
     # Of all rounds, also of those that an earlier command made before it was stopped; rounds of an older version have
     # no time.
-    seconds = run.read(output, "rounds.json")["rounds"][-1].get("seconds") or ran.seconds
-    return f"{output}/round_{rounds}/policy", float(seconds)
+    curve = run.read(output, "rounds.json")["rounds"]
+    wanted = ("round", "episodes", "success")
+    return Aggregated(
+        f"{output}/round_{rounds}/policy",
+        float(curve[-1].get("seconds") or ran.seconds),
+        [{key: row[key] for key in wanted} for row in curve],
+    )
 
 
 def evaluate(
@@ -363,6 +385,18 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
     told = ", from privileged state" if brain.get("privileged") else ""
     what = f"{name}{told}: success in {brain['episodes']}"
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
+
+
+def rounds_rows(made: Mapping[int, Any]) -> list[Row]:
+    """Return the rows of the curve over the rounds, by seed; none of trainings whose rounds were not kept."""
+    return [
+        Row(
+            f"seed_{seed}, round {row['round']}, from {row['episodes']} episodes: success in validation",
+            rate(row["success"], {}),
+        )
+        for seed, results in made.items()
+        for row in results.get("rounds", ())
+    ]
 
 
 def seeds_rows(made: Mapping[int, Any], what: str = "all seeds", name: str = "") -> list[Row]:

@@ -2,7 +2,16 @@
 
 from typing import Any
 
-from benchmarks.results.learning import TOOL, aggregation, evaluate, seeds_rows, success_row, summary
+from benchmarks.results.learning import (
+    TOOL,
+    Aggregated,
+    aggregation,
+    evaluate,
+    rounds_rows,
+    seeds_rows,
+    success_row,
+    summary,
+)
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
 from benchmarks.results.trainings import SEEDS, each, first_of
@@ -18,12 +27,12 @@ def pick(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
 
     def learn(seed: int) -> dict[str, Any]:
-        policy, seconds = _learned(run, seed)
+        policy, seconds, rounds = _learned(run, seed)
         name = f"seed_{seed}"
         results = evaluate(
             run, f"pick_eval/{name}", "ur5_pick", {name: policy}, options=(*TOOL, _ANY_ORDER), episodes=EPISODES
         )
-        return {**summary(results, name), "seconds": seconds}
+        return {**summary(results, name), "seconds": seconds, "rounds": rounds}
 
     def others(seed: int) -> dict[str, Any]:
         _learned(run, seed)
@@ -45,6 +54,7 @@ def pick(run: Runner, section: Section) -> None:
         row, low = success_row(results, f"seed_{seed}"), results["brains"][f"seed_{seed}"]["success"]["low"]
         section.rows.append(Row(row.what, row.value, f"lower end at least {_GOAL:.0%}", low >= _GOAL))
     section.rows += seeds_rows(made)
+    section.rows += rounds_rows(made)
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]
@@ -57,7 +67,7 @@ def pick(run: Runner, section: Section) -> None:
     )
 
 
-def _learned(run: Runner, seed: int) -> tuple[str, float]:
+def _learned(run: Runner, seed: int) -> Aggregated:
     name, config = f"pick_train_{seed}", "dagger_ur5_pick"
     return aggregation(run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, steps=_STEPS)
 

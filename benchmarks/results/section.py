@@ -35,6 +35,7 @@ class Section:
         rows: the numbers.
         remarks: sentences under the table.
         commands: what was run for it.
+        processor_s: of all that was recorded and trained for each training seed, how much processor time it took [s].
     """
 
     name: str
@@ -42,12 +43,17 @@ class Section:
     rows: list[Row] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     commands: list[Ran] = field(default_factory=list)
+    processor_s: dict[int, float] = field(default_factory=dict)
 
     def markdown(self) -> list[str]:
         """Return the section as lines of Markdown."""
         lines = [f"## {self.title}", "", "| measured | | goal | |", "|---|---|---|---|"]
         verdict = {True: "met", False: "**missed**", None: ""}
-        lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in self.rows]
+        spent = [
+            Row(f"seed {seed}: processor time from nothing, of recording and training", f"{seconds:.0f} s")
+            for seed, seconds in sorted(self.processor_s.items())
+        ]
+        lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in (*self.rows, *spent)]
         for remark in self.remarks:
             lines += ["", remark]
         lines += [

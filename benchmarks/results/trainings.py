@@ -90,8 +90,17 @@ def each(
         remark = f"Seed {seed} was made {kept.made}."
         section.remarks += () if remark in section.remarks else (remark,)
     order = sorted(trainings)
+    if name == section.name:
+        shared = run.commands[:before]
+        section.processor_s = {seed: _making([*shared, *trainings[seed].commands]) for seed in order}
     run.commands[before:] = [command for seed in order for command in trainings[seed].commands]
     return {seed: trainings[seed].measured for seed in order}
+
+
+def _making(commands: Sequence[Ran]) -> float:
+    """Return the processor time of the commands that recorded and trained, each of them once [s]."""
+    once = {one.command: one.cpu_seconds for one in commands}
+    return sum(seconds for command, seconds in once.items() if not command.startswith("bhd-eval"))
 
 
 def first_of(made: Mapping[int, Any]) -> tuple[int, ...]:

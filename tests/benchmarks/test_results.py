@@ -150,6 +150,14 @@ def test_a_share_of_nothing_is_not_defined() -> None:
     assert all(math.isnan(one) for one in recovered([], [], []))
 
 
+def test_processor_time_from_nothing_counts_recordings_and_trainings_once_and_no_evaluation() -> None:
+    record, train = Ran("bhd-record x", 20.0, 0, 10.0), Ran("bhd-train y", 20.0, 0, 5.0)
+    assert trainings._making([record, train, Ran("bhd-eval z", 20.0, 0, 100.0), record]) == 15.0
+    section = Section("see", "See", processor_s={1: 15.0, 0: 7.0})
+    shown = [line for line in section.markdown() if "processor time from nothing" in line]
+    assert [line.split("|")[2].strip() for line in shown] == ["7 s", "15 s"]
+
+
 def test_the_interval_gets_narrower_with_more_seeds() -> None:
     rng = np.random.default_rng(0)
     widths = []
@@ -215,7 +223,9 @@ class Pretended(Runner):
 
     def read(self, *parts: str) -> Any:
         if parts[-1] == "rounds.json":
-            return {"rounds": [{"seconds": 30.0}, {"seconds": 60.0}]}
+            rate = {"value": 0.9, "low": 0.8, "high": 0.99}
+            rounds = [{"round": number, "episodes": 10 * number, "success": rate} for number in (0, 1)]
+            return {"rounds": [{**one, "seconds": 30.0} for one in rounds]}
         return self._results["/".join(parts[:-1])]
 
     _results: dict[str, Any]
