@@ -44,7 +44,7 @@ def described(name: str) -> dict[str, dict]:
 
 
 def test_there_are_configurations() -> None:
-    assert len(CONFIGS) == 13
+    assert len(CONFIGS) == 12
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

@@ -193,7 +193,7 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     stages = {
         "expert": {"config": str(CONFIGS / "record/ur5_pick.yaml"), "options": []},
         "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
-        "policy": {"config": str(CONFIGS / "train/bc_ur5_pick.yaml"), "options": []},
+        "policy": {"config": str(CONFIGS / "train/bc_ur5_pick_servo.yaml"), "options": []},
         "evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []},
     }
     config = parse_aggregation([f"--config_path={settings(tmp_path, **stages)}"])
@@ -252,7 +252,7 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             {
                 "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
                 "policy": {
-                    "config": str(CONFIGS / "train/bc_ur5_pick.yaml"),
+                    "config": str(CONFIGS / "train/bc_ur5_pick_servo.yaml"),
                     "options": ["--selection.learner_weight=2"],
                 },
             },
