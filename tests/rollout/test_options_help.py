@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import lerobot.policies  # noqa: F401  registers LeRobot's policies
 import pytest
 
 from bhd_lerobot.evaluation.config import EvalConfig
