@@ -84,7 +84,7 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
 def _marks(one: BrainSummary, baseline: str, count: int) -> list[str]:
     """Return what is said of a brain beside its name."""
     marks = ["baseline"] if one.brain == baseline and count > 1 else []
-    return [*marks, "privileged state"] if one.privileged else marks
+    return [*marks, "privileged"] if one.privileged else marks
 
 
 def _lines(text: str) -> str:

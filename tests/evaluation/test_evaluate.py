@@ -81,7 +81,7 @@ def test_who_acts_on_what_no_sensor_tells_is_marked_everywhere(tmp_path):
         "new": False,
     }
     assert result.report.read_text(encoding="utf-8").count('"badge">privileged state<') == 1
-    assert printed.count("(privileged state)") == 1
+    assert printed.count("(privileged)") == 1
 
 
 def test_brains_get_the_same_episodes_which_are_held_out(whole):
