@@ -254,7 +254,7 @@ def rows(blocks: Sequence[dict[str, Any]], fps: int = 25) -> list[dict[str, Any]
             more = statistics.median(
                 one["late_share"] - other["late_share"] for one, other in zip(own, quiet, strict=True)
             )
-            row["later_share"] = more
+            row["late_share_excess"] = more
             is_punctual = row["ratios"]["wake_p99"] <= GOALS["wake_p99"] and more <= GOALS["late_share"]
             row["met"] = is_punctual and row["frames_per_s"] >= GOALS["frames_per_s"] * fps
         table.append(row)

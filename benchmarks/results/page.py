@@ -13,9 +13,9 @@ _HEAD = (
     "Written by `make results`, which runs the commands below each table; no number was typed by hand. Rates are",
     "with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness (bootstrap",
     "intervals where a section says so), over the same held-out episodes for all brains of a table. Times of training",
-    "include the start of the program. Where several training seeds are shown, a goal is one of each: no interval is",
-    "narrower or wider for their number; learned rows without a seed (clones, ablations, ACT, Diffusion) are of seed 0",
-    "alone. Each section says when and where it was made.",
+    "include the start of the program. Where several training seeds are shown, each has to meet the goal by itself, so",
+    "intervals are not corrected for their number; learned rows without a seed (clones, ablations, ACT, Diffusion) are",
+    "of seed 0 alone. Each section says when and where it was made.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 

@@ -50,7 +50,7 @@ class Section:
         lines = [f"## {self.title}", "", "| measured | | goal | |", "|---|---|---|---|"]
         verdict = {True: "met", False: "**missed**", None: ""}
         spent = [
-            Row(f"seed {seed}: processor time from nothing, of recording and training", f"{seconds:.0f} s")
+            Row(f"seed {seed}: processor time of all its recordings and trainings", f"{seconds:.0f} s")
             for seed, seconds in sorted(self.processor_s.items())
         ]
         lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in (*self.rows, *spent)]

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import (
+    ANY_ROBOT,
+    Brain,
+    BrainConfig,
+    DriverConfig,
+    Observation,
+    RobotFeatures,
+    uses_privileged_state,
+)
 
 
 @BrainConfig.register_subclass("blanked")
@@ -59,7 +67,7 @@ class BlankedBrain:
     @property
     def uses_privileged_state(self) -> bool:
         """Whether the brain uses what no sensor tells."""
-        return self._brain.uses_privileged_state
+        return uses_privileged_state(self._brain)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Bind the brain."""

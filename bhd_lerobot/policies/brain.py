@@ -149,9 +149,14 @@ class Brain(Protocol):
         """Return everything that defines the brain, as plain values."""
 
 
+def uses_privileged_state(brain: Brain) -> bool:
+    """Return whether a brain uses the environment state; of one that does not say it is taken for granted."""
+    return bool(getattr(brain, "uses_privileged_state", True))
+
+
 def is_privileged(brain: Brain, environment_names: Sequence[str]) -> bool:
     """Return whether a brain acts on what no sensor tells: it uses the environment state, and the task reports one."""
-    return bool(environment_names) and getattr(brain, "uses_privileged_state", True)
+    return bool(environment_names) and uses_privileged_state(brain)
 
 
 class ConfiguredBrain:

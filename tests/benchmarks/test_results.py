@@ -150,11 +150,11 @@ def test_a_share_of_nothing_is_not_defined() -> None:
     assert all(math.isnan(one) for one in recovered([], [], []))
 
 
-def test_processor_time_from_nothing_counts_recordings_and_trainings_once_and_no_evaluation() -> None:
+def test_processor_time_counts_recordings_and_trainings_once_and_no_evaluation() -> None:
     record, train = Ran("bhd-record x", 20.0, 0, 10.0), Ran("bhd-train y", 20.0, 0, 5.0)
     assert trainings._making([record, train, Ran("bhd-eval z", 20.0, 0, 100.0), record]) == 15.0
     section = Section("see", "See", processor_s={1: 15.0, 0: 7.0})
-    shown = [line for line in section.markdown() if "processor time from nothing" in line]
+    shown = [line for line in section.markdown() if "processor time of all" in line]
     assert [line.split("|")[2].strip() for line in shown] == ["7 s", "15 s"]
 
 

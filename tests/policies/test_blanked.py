@@ -42,6 +42,12 @@ def test_what_is_blanked_does_not_arrive_and_all_else_does(deaf: bool, blind: bo
     assert images["scene"].min() == 200, "nobody else's images are changed"
 
 
+def test_of_a_brain_that_does_not_say_it_is_taken_for_granted_that_it_is_told_the_truth() -> None:
+    inner: Any = SimpleNamespace(has_plan=False)
+    brain = BlankedBrain(BlankedConfig(brain=None, images=True), inner)  # type: ignore[arg-type]
+    assert brain.uses_privileged_state
+
+
 def test_a_brain_that_lacks_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"nothing is: set brain\.instruction or brain\.images"):
         BlankedConfig(brain=None)  # type: ignore[arg-type]

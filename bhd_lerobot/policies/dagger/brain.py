@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Mixed
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import (
+    ANY_ROBOT,
+    Brain,
+    BrainConfig,
+    DriverConfig,
+    Observation,
+    RobotFeatures,
+    uses_privileged_state,
+)
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
@@ -116,7 +124,7 @@ class DaggerBrain:
     @property
     def uses_privileged_state(self) -> bool:
         """Whether learner or expert uses what no sensor tells."""
-        return self.learner.uses_privileged_state or self.expert.uses_privileged_state
+        return uses_privileged_state(self.learner) or uses_privileged_state(self.expert)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Bind learner and expert, and find what is to be watched."""
