@@ -202,6 +202,7 @@ def block(name: str, cores: tuple[int, int], seconds: float, checkpoints: dict[s
     )
     with closing(make_robot(config)) as robot, pinned(cores[0]):
         task = make_task("ur5", config.fps, seconds)
+        robot.start_rendering()  # before the first episode, as `bhd-record` and `bhd-eval` do
         used = time.process_time()
         ticks = drive(robot, task, timed, seconds)
         used = time.process_time() - used

@@ -292,8 +292,8 @@ class EpisodeLoop:
             values[keys.PHYSICS_STATE] = live.physics
         if self.task.environment_names:
             values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
-        for sim in np.flatnonzero(self.simulation.running).tolist():
-            self._images.order(sim, self.observer)  # what is shown is the end of the frame before: its beginning
+        # What is shown is the end of the frame before: its beginning. The brain was not asked, so it does not look.
+        self._images.order_all(self.observer, np.zeros(self.simulation.n, np.bool_))
         return values
 
     def _log(self, command: Command, report: FrameReport) -> None:

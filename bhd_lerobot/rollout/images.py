@@ -46,7 +46,7 @@ class EpisodeImages:
         running = np.flatnonzero(simulation.running).tolist() if cameras else []
         for sim in running:
             if wanted[sim] or observer is not None or self.sinks[sim] is not None:
-                self.order(sim, observer)
+                self._order(sim, observer)
         if wanted.any():
             height, width = simulation.config.camera_height, simulation.config.camera_width
             images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
@@ -60,7 +60,7 @@ class EpisodeImages:
                 waiting.pop(0).result()
         return images
 
-    def order(self, sim: int, observer: Observer | None) -> None:
+    def _order(self, sim: int, observer: Observer | None) -> None:
         """Order the images of what one simulation shows now."""
         sink = self.sinks[sim]
         for camera in self._simulation.camera_names:

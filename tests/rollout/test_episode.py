@@ -1,5 +1,7 @@
 """Brains that plan several frames ahead: what a chunk does is what its actions, sent one by one, would have done."""
 
+import time
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import is_privileged
-from bhd_lerobot.registry import make_simulation, make_task
+from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -17,6 +19,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import Event
+from tests.robots.host.support import relaxed, unique
 
 FRAMES = 20
 
@@ -150,3 +153,28 @@ def test_a_latched_fault_ends_the_episode_and_the_next_one_moves_again() -> None
         assert other.frames == FRAMES
         assert (other.columns[keys.MODE] != Mode.FAULT).all()
     assert np.abs(third.columns[keys.APPLIED_ACTION]).max() > 0.05
+
+
+def test_no_image_is_made_of_frames_that_went_by_unless_somebody_looks() -> None:
+    """Images that nobody looks at would keep a brain that is late from catching up."""
+
+    class Slow(Script):
+        uses_images = True
+
+        def act(self, observation: Any) -> Any:
+            time.sleep(0.35 if self.frame == 1 else 0)  # at 10 frames a second
+            return super().act(observation)
+
+    options: dict[str, Any] = {"camera": True, "camera_width": 64, "camera_height": 48, "beams": 36}
+    config = TurtleBot3Config(id=unique("images"), clock="realtime", realtime=relaxed(), **options)
+    for is_watched in (False, True):
+        brain, made = Slow(script("turtlebot3")), []
+        with closing(make_robot(config)) as robot:
+            render = robot.render_later
+            robot.render_later = lambda *order, render=render, made=made: (made.append(order), render(*order))[1]
+            loop = EpisodeLoop(robot, make_task(AvoidConfig(duration_s=FRAMES / 10), 1, 10), brain)
+            loop.observer = (lambda *_: None) if is_watched else None
+            (episode,) = loop.run([EpisodeSpec(0, 0)])
+        frames = len(episode.columns["action"])
+        assert brain.frame < frames
+        assert len(made) == len(robot.camera_names) * (frames if is_watched else brain.frame)

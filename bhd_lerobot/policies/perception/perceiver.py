@@ -115,7 +115,9 @@ class Perceiver:
                 f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
                 f"{image.shape[1]} x {image.shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
             )
-        if int(image.max()) < _DARK or float(image.std(axis=(0, 1)).max()) < _FLAT:
+        # Along what is next to each other in memory: across the channels it takes half as long as the network.
+        channels = np.ascontiguousarray(image.reshape(-1, 3).T)
+        if int(channels.max()) < _DARK or float(channels.std(axis=1, dtype=np.float32).max()) < _FLAT:
             raise PerceptionError(f"the camera {self.camera!r} shows nothing: its image has one colour only")
         values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self._device).float() / 255
         return _objects(self._policy.detect(values)[0], self._least)
