@@ -14,6 +14,7 @@ from benchmarks.results.learning import (
     record,
     record_reach,
     seeds_rows,
+    success_row,
     summary,
     train,
     train_reach,
@@ -21,8 +22,8 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
-from benchmarks.results.seeing import perception_folder, record_tables, train_perception
-from benchmarks.results.trainings import SEEDS, each
+from benchmarks.results.seeing import SENSES, blanked, perception_folder, record_tables, train_perception
+from benchmarks.results.trainings import SEEDS, each, first_of
 
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
@@ -104,16 +105,27 @@ def move_camera(run: Runner, section: Section) -> None:
             found[world] = {**summary(results, *folders), **_successes(results, folders)}
         return found
 
+    def senseless(seed: int) -> dict[str, Any]:
+        inner = {"type": "language", "perception.path": str(run.path(f"camera/seed_{seed}"))}
+        return blanked(run, "camera_eval/blanked", "ur5_pick", inner, (*_STILL, *_MOVED))
+
     made = each(run, section, "move_camera", SEEDS, learn)
+    without = each(run, section, "move_camera_blanked", first_of(made), senseless)
     for seed, results in made.items():
         section.rows += _recovery_rows(results, seed, f"{TABLES} tables", _ELSEWHERE, _CAMERA_GOAL)
     elsewhere = {seed: one[_ELSEWHERE] for seed, one in made.items()}
     section.rows += seeds_rows(elsewhere, f"tuned, {_ELSEWHERE}", "tuned")
+    section.rows += [success_row(one, name) for one in without.values() for name in SENSES]
     section.remarks.append(
         f"A table is one image with the true poses of what stands there; {TABLES} were seen through the camera where "
         "it is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "
         "tuned perception looks from where the camera was moved to, and is not meant for where it was before."
     )
+    if without:
+        section.remarks.append(
+            "A deaf brain, with the tuned perception where the camera is now, gets an empty instruction, a blind one "
+            "black images."
+        )
 
 
 def _successes(results: Any, names: Iterable[str]) -> dict[str, dict[str, list[bool]]]:

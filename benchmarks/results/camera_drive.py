@@ -84,8 +84,8 @@ def camera_drive(run: Runner, section: Section) -> None:
     )
     if beside:
         section.remarks.append(
-            "`blind` is seed 0 with black images: it drives a small circle, on which it touches nothing and gets "
-            "nowhere, so success alone says little here, and the score counts."
+            f"`blind` is seed {min(beside)} with black images: it drives a small circle, on which it touches nothing "
+            "and gets nowhere, so success alone says little here, and the score counts."
         )
 
 

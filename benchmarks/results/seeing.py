@@ -29,8 +29,8 @@ _WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
 _FEW = ("--steps=600", "--eval_steps=600")
 _OTHERS = ("act", "diffusion")
-_SENSES = {"deaf": "instruction", "blind": "images"}
-_BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
+SENSES = {"deaf": "instruction", "blind": "images"}
+_BESIDE = 100  # episodes of what is shown beside the trainings, such as brains that are deaf or blind
 
 
 def see(run: Runner, section: Section) -> None:
@@ -47,7 +47,7 @@ def see(run: Runner, section: Section) -> None:
     def others(seed: int) -> dict[str, Any]:
         train_perception(run, seed)
         inner = {"type": "language", "perception.path": _path(run, seed)}
-        return _blanked(run, "see_eval/others", "ur5_pick", inner)
+        return blanked(run, "see_eval/others", "ur5_pick", inner)
 
     made = each(run, section, "see", SEEDS, learn)
     beside = each(run, section, "see_others", first_of(made), others)
@@ -56,7 +56,7 @@ def see(run: Runner, section: Section) -> None:
     _rows(run, section, made, [goal for _, _, goal in WORLDS])
     if not run.is_short:
         section.rows += [_wording_row(f"seed_{seed}", results["worlds"]) for seed, results in made.items()]
-    section.rows += [success_row(one, name) for one in beside.values() for name in _SENSES]
+    section.rows += [success_row(one, name) for one in beside.values() for name in SENSES]
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]
@@ -111,10 +111,11 @@ def pixels(run: Runner, section: Section) -> None:
         brain = (f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(policy)}")
         return {"worlds": _in_worlds(run, "pixels_eval", "ur5_pick_pixels", brain, name), "seconds": seconds}
 
-    def others(seed: int) -> dict[str, Any]:
-        policy, _ = end_to_end(seed)
-        inner = {"type": "learned", "path": str(run.path(policy))}
-        blanked = _blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner)
+    def senseless(seed: int) -> dict[str, Any]:
+        inner = {"type": "learned", "path": str(run.path(end_to_end(seed)[0]))}
+        return blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner)
+
+    def others(_: int) -> dict[str, Any]:
         small = ("--robot.camera_width=160", "--robot.camera_height=120")
         episodes, options = run.size(800, 60), ("--seed=21", *small)
         data, brains = "pixels/small", []
@@ -122,20 +123,24 @@ def pixels(run: Runner, section: Section) -> None:
         for name in _OTHERS:
             folder = f"pixels/{name}"
             train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, data, short=("--steps=4", "--batch_size=8"))
-            brains += [f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(folder)}"]
-        output, options = "pixels_eval/others", (_ANY, *small)
-        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=_OTHERS, episodes=_BLANKED)
-        return {**blanked, "others": summary(results, *_OTHERS)}
+            inner = {"type": "learned", "path": str(run.path(folder))}
+            brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]
+            brains += _without(f"blind_{name}", "images", inner)
+        names, options = (*_OTHERS, *(f"blind_{name}" for name in _OTHERS)), (_ANY, *small)
+        output = "pixels_eval/others"
+        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE)
+        return summary(results, *names)
 
     made = each(run, section, "pixels", SEEDS, learn)
-    beside = each(run, section, "pixels_others", first_of(made), others)
+    without = each(run, section, "pixels_blanked", first_of(made), senseless)
+    beside = each(run, section, "pixels_others", SEEDS[:1], others)
     _rows(run, section, made, [_PIXELS_GOAL, *[None] * len(WORLDS[1:])])
-    for one in beside.values():
-        section.rows += [
-            replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}")
-            for row in (success_row(one["others"], name) for name in _OTHERS)
-        ]
-        section.rows += [success_row(one, name) for name in _SENSES]
+    section.rows += [success_row(one, name) for one in without.values() for name in SENSES]
+    section.rows += [
+        replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}")
+        for one in beside.values()
+        for row in (success_row(one, name) for name in one["brains"])
+    ]
     section.rows += [
         Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
     ]
@@ -144,9 +149,11 @@ def pixels(run: Runner, section: Section) -> None:
         "the robot's state to tool poses. It begins with the perception of the same seed of the section `see`; "
         "`pick_servo` showed it how. True poses taught it where to look; none is an input."
     )
+    if without:
+        section.remarks.append("A deaf policy gets an empty instruction, a blind one black images.")
     if beside:
         section.remarks.append(
-            "A deaf policy gets an empty instruction, a blind one black images. LeRobot's ACT and Diffusion, with a "
+            "LeRobot's ACT and Diffusion, with a "
             "ResNet18 that begins from nothing, learn from every frame of the rule's episodes, of 160 x 120 pixels; "
             "they have no input for words, and can do no better than to pick any one of the objects."
         )
@@ -184,14 +191,19 @@ def _wording_row(name: str, worlds: Mapping[str, Any]) -> Row:
     return Row(what, value, goal, found.low >= -_WORDING_GOAL)
 
 
-def _blanked(run: Runner, output: str, config: str, inner: Mapping[str, str]) -> dict[str, Any]:
+def blanked(
+    run: Runner, output: str, config: str, inner: Mapping[str, str], options: Sequence[str] = ()
+) -> dict[str, Any]:
     """Evaluate a brain that gets no instruction, or no images."""
-    brains = []
-    for name, sense in _SENSES.items():
-        brains += [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true"]
-        brains += [f"--brains.{name}.brain.{key}={value}" for key, value in inner.items()]
-    results = _evaluate(run, output, config, brains, (_ANY,), names=tuple(_SENSES), episodes=_BLANKED)
-    return summary(results, *_SENSES)
+    brains = [one for name, sense in SENSES.items() for one in _without(name, sense, inner)]
+    results = _evaluate(run, output, config, brains, (_ANY, *options), names=tuple(SENSES), episodes=_BESIDE)
+    return summary(results, *SENSES)
+
+
+def _without(name: str, sense: str, inner: Mapping[str, str]) -> list[str]:
+    """Return the options of a brain of which something is blanked."""
+    options = [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true"]
+    return options + [f"--brains.{name}.brain.{key}={value}" for key, value in inner.items()]
 
 
 def _perceived(section: Section, name: str, saw: Any) -> None:

@@ -104,8 +104,8 @@ def _making(commands: Sequence[Ran]) -> float:
 
 
 def first_of(made: Mapping[int, Any]) -> tuple[int, ...]:
-    """Return the first training seed, beside which a section shows other things, if it is among those made."""
-    return tuple(seed for seed in SEEDS[:1] if seed in made)
+    """Return the first training seed that was made, beside which a section shows other things."""
+    return tuple(sorted(made)[:1])
 
 
 def _read(path: Path) -> Training | None:

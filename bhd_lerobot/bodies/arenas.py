@@ -34,6 +34,7 @@ class Arena:
         start: x [m], y [m], yaw [rad] of the robot, world frame.
         goal: likewise, where a task sends the robot.
         robot_radius: of the robot that is to get through [m].
+        report_seed: of the noise on what the task tells, where there is any.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Arena:
     start: tuple[float, float, float]
     goal: tuple[float, float, float] | None = None
     robot_radius: float = BURGER_RADIUS
+    report_seed: int = 0
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance from points to the nearest obstacle [m], negative inside one.

@@ -3,8 +3,9 @@
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -273,7 +274,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
     if config.dataset.expert_action:
         _check_expert(brain)
     # What decides the episodes. How many there are, and how many run side by side, does not.
-    recording = {
+    recording: dict[str, Any] = {
         "robot": {
             key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()
         },
@@ -283,8 +284,10 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         "split": config.split,
     }
     goes_on = config.resume and not is_free(root)
-    if goes_on and (info := _info(root)) is not None and EFFORT not in info.features:
-        features.pop(EFFORT, None)  # the dataset is older than this column
+    if goes_on and (info := _info(root)) is not None:
+        if EFFORT not in info.features:
+            features.pop(EFFORT, None)  # the dataset is older than this column
+        recording["task"] = _without_new(recording["task"], info.recording.get("task"), type(config.task))
     make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
     return make(
         config.dataset.repo_id,
@@ -314,6 +317,32 @@ def _keep_to(root: Path, robot: Any, console: Console) -> None:
     if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
         robot.jerk_limits = False
         console.print("The dataset was recorded without jerk limits: it goes on with robot.jerk_limits=false.")
+
+
+def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, Any]:
+    """Return options without those that a dataset is older than, if they are as they are by default.
+
+    By default an option of a task leaves it as it was before there was that option.
+
+    Args:
+        asked: the options, as plain values.
+        recorded: those of the dataset; anything else than a mapping is left for the comparison to refuse.
+        kind: the dataclass that they are of.
+    """
+    if not isinstance(recorded, Mapping):
+        return asked
+    kept = dict(asked)
+    for field in fields(kind):
+        name = field.name
+        made = field.default if field.default_factory is MISSING else field.default_factory()
+        default = asdict(made) if is_dataclass(made) and not isinstance(made, type) else made
+        if name not in kept:
+            continue
+        if name not in recorded and kept[name] == default:
+            del kept[name]
+        elif name in recorded and is_dataclass(made):
+            kept[name] = _without_new(kept[name], recorded[name], type(made))
+    return kept
 
 
 def _info(root: Path) -> DatasetSummary | None:

@@ -85,6 +85,7 @@ def scene_to_json(scene: Any) -> str:
                 "start": scene.start,
                 "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in scene.shapes],
                 **({} if scene.goal is None else {"goal": scene.goal}),
+                **({"report_seed": scene.report_seed} if scene.report_seed else {}),
             }
         )
     return _json(asdict(scene))
@@ -101,7 +102,8 @@ def scene_from_json(text: str) -> Any:
         if "shapes" in scene:
             shapes = tuple(Shape(*row) for row in scene["shapes"])
             goal = tuple(scene["goal"]) if "goal" in scene else None
-            return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]), goal)
+            ends, start, seed = tuple(scene["extent"]), tuple(scene["start"]), int(scene.get("report_seed", 0))
+            return Arena(scene["name"], shapes, ends, start, goal, report_seed=seed)
         objects = tuple(TableObject(**_tuples(one)) for one in scene.pop("objects"))
         variation = Variation(**_tuples(scene.pop("variation")))
         return TableScene(objects=objects, variation=variation, **_tuples(scene))

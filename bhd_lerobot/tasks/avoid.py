@@ -1,7 +1,7 @@
 """Roam without touching anything."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.tasks.report import ReportConfig, Reports
 from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
@@ -19,6 +20,7 @@ TRAIL = tuple(f"trail_{bearing:g}deg_{distance:g}m" for bearing in _BEARINGS_DEG
 visited in this episode, 0 in any other."""
 
 _TINY = 1e-9
+_REPORT_STREAM = 0x7EA1
 _TRAIL_XY = np.stack([f(np.radians(_BEARINGS_DEG))[:, None] * _DISTANCES_M for f in (np.cos, np.sin)]).reshape(2, -1)
 
 
@@ -37,6 +39,7 @@ class AvoidConfig(TaskConfig):
         stuck_time_s: see `stuck_path_m` [s].
         trail: report which ground around the robot it has visited: `TRAIL`, the task's memory for brains that have none
             of their own.
+        report: what is wrong with the robot's pose that the trail is drawn around.
     """
 
     arena: str = "random"
@@ -47,6 +50,7 @@ class AvoidConfig(TaskConfig):
     stuck_path_m: float = 0.1
     stuck_time_s: float = 10.0
     trail: bool = False
+    report: ReportConfig = field(default_factory=ReportConfig)
 
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
@@ -77,6 +81,7 @@ class AvoidTask(BaseTask):
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
+        self._reports = Reports(config.report, n, fps, slice(2))
         self._window = self.in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
         self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
@@ -88,17 +93,25 @@ class AvoidTask(BaseTask):
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
-        return self.arena(self.config.arena, seed, self.config.random_start)
+        arena, report = self.arena(self.config.arena, seed, self.config.random_start), self.config.report
+        if report.is_exact:
+            return arena
+        rng = np.random.default_rng(np.random.SeedSequence([_REPORT_STREAM, int(seed)]))
+        return replace(arena, report_seed=report.draw_seed(rng))
 
     def instruction(self, scene: Arena) -> str:
         """Return what a person would ask for."""
         return "Roam without touching anything."
 
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
-        """Return `TRAIL` if the configuration asks for it, shape (n, 128); else nothing, shape (n, 0)."""
+        """Return `TRAIL` if the configuration asks for it, shape (n, 128); else nothing, shape (n, 0).
+
+        `config.report` says what is wrong with the pose that it is drawn around; which cells were visited is true.
+        """
         if not self.config.trail:
             return np.zeros((len(truth.touched), 0))
-        x, y, yaw = truth.base_pose_in_world.T[:, :, None]
+        pose = self._reports.told(truth.base_pose_in_world[:, None], self.frame)[:, 0]
+        x, y, yaw = pose.T[:, :, None]
         cos, sin, (ahead, left) = np.cos(yaw), np.sin(yaw), _TRAIL_XY
         points = np.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left], axis=-1)
         cell, inside = self._cells(points)
@@ -128,6 +141,7 @@ class AvoidTask(BaseTask):
                 grow = ((0, 0), (0, columns * rows - self._free.shape[1]))
                 self._free, self._visited = np.pad(self._free, grow), np.pad(self._visited, grow)
             self._free[sim] = self._visited[sim] = False
+            self._reports.begin(sim, arena.report_seed)
             self._free[sim, cells] = True
             self._origin[sim], self._end[sim] = arena.extent[0::2], arena.extent[1::2]
             self._columns[sim] = columns

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
+from bhd_lerobot.tasks.report import ReportConfig, Reports
 from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
@@ -40,6 +41,7 @@ class NavigateConfig(TaskConfig):
         hold_s: time that the robot must be there and at rest [s].
         stuck_path_m: a path shorter than this in `stuck_time_s` means stuck [m].
         stuck_time_s: see `stuck_path_m` [s].
+        report: what is wrong with what the task tells of the goal.
     """
 
     arena: str = "random"
@@ -54,6 +56,7 @@ class NavigateConfig(TaskConfig):
     hold_s: float = 0.5
     stuck_path_m: float = 0.1
     stuck_time_s: float = 10.0
+    report: ReportConfig = field(default_factory=ReportConfig)
 
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
@@ -117,6 +120,7 @@ class NavigateTask(BaseTask):
         self._left: NDArray[np.float64] = np.ones(n)
         self._path, self._sum = PathLengths(n, self._window), np.zeros(n)
         self._within = np.zeros(n, np.int64)
+        self._reports = Reports(config.report, n, fps, slice(2))
         if config.arena != "random":  # better now than in the middle of a run
             self.sample(0)
 
@@ -143,7 +147,8 @@ class NavigateTask(BaseTask):
             places = points[free & (away >= config.min_distance_m)]
             if len(places):
                 x, y = places[rng.integers(len(places))]
-                scene = replace(arena, goal=(float(x), float(y), float(rng.uniform(-math.pi, math.pi))))
+                goal = float(x), float(y), float(rng.uniform(-math.pi, math.pi))
+                scene = replace(arena, goal=goal, report_seed=config.report.draw_seed(rng))
                 vars(scene)["reachable"] = arena.reachable  # it does not depend on the goal, and takes a while
                 return scene
         raise ConfigError(
@@ -172,14 +177,15 @@ class NavigateTask(BaseTask):
                 raise ConfigError(
                     f"The goal of the arena {arena.name!r} is {goal}; the task navigate needs x, y and yaw."
                 )
-            field = WayField(arena, goal[:2])
+            ways = WayField(arena, goal[:2])
             start = np.array([arena.start[:2]])
-            if not interpolate(field.is_way[None].astype(np.float64), field.origin[None], start)[0] > 0:
+            if not interpolate(ways.is_way[None].astype(np.float64), ways.origin[None], start)[0] > 0:
                 raise ConfigError(
                     f"No way leads from the start {_place(arena.start)} of the arena {arena.name!r} to the goal "
                     f"{_place(goal)}; choose a goal that the robot can get to."
                 )
-            self._keep(int(sim), field)
+            self._keep(int(sim), ways)
+            self._reports.begin(int(sim), arena.report_seed)
             self._goal[sim], self._pose[sim] = goal, arena.start
         self._path.begin(ids)
         self._sum[ids] = 0.0
@@ -190,9 +196,11 @@ class NavigateTask(BaseTask):
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
         """Return the goals in the robots' frames, shape (n, 4).
 
-        x and y [m], and cosine and sine of the angle from the robot's heading to the goal's.
+        x and y [m], and cosine and sine of the angle from the robot's heading to the goal's. `config.report` says what
+        is wrong with it.
         """
-        return goal_in_robot(self._goal, truth.base_pose_in_world)
+        goals = goal_in_robot(self._goal, truth.base_pose_in_world)
+        return self._reports.told(goals[:, None], self.frame)[:, 0]
 
     def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""

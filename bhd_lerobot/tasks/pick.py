@@ -1,7 +1,6 @@
 """Pick up the object that the instruction names, and no other."""
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,8 +11,9 @@ from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.tasks.report import ReportConfig, Reports
 from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
-from bhd_lerobot.tasks.variation import RandomisationConfig, ReportConfig, draw_object_changes, draw_variation
+from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
 _AREA = np.array([[0.35, -0.30], [0.65, 0.30]])
@@ -141,7 +141,7 @@ class PickTask(ArmTask):
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
         self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
         self._camera_error = np.zeros((n, 1, 3))
-        self._reports = _Reports(config.report, n, fps)
+        self._reports = Reports(config.report, n, fps, slice(3, 6), absent=_NOTHING)
         self._best, self._height = np.zeros(n), np.zeros(n)
         self._held = np.zeros(n, np.int64)
 
@@ -166,7 +166,7 @@ class PickTask(ArmTask):
         if language == "zh":
             name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
         variation = draw_variation(config.randomisation, rng)
-        report_seed = 0 if config.report.is_exact else int(rng.integers(2**31))
+        report_seed = config.report.draw_seed(rng)
         places = [int(place) for place in rng.permutation(count)] if config.order == "random" else range(count)
         return TableScene(
             name="pick",
@@ -208,12 +208,12 @@ class PickTask(ArmTask):
         The first is the target; the others follow, at the start the nearest to it first.
         Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
-        places without one. `config.report` says what is wrong with it; then call it once a frame.
+        places without one. `config.report` says what is wrong with it.
         """
         state = self._fixed.copy()
         state[self._present, 3:10] = truth.object_poses[self._present]
         state[:, :, 3:6] += self._camera_error * self._present[:, :, None]
-        return self._reports.told(state).reshape(len(state), -1)
+        return self._reports.told(state, self.frame).reshape(len(state), -1)
 
     # --- judging -----------------------------------------------------------------------------------------------------
 
@@ -263,40 +263,6 @@ class PickTask(ArmTask):
 
     def _share(self, height: NDArray[np.float64]) -> NDArray[np.float64]:
         return 0.9 * np.minimum(np.maximum(height, 0.0) / self.config.lift_m, 1.0)
-
-
-class _Reports:
-    """What the task tells of the objects, with noise, late and with gaps.
-
-    Args:
-        config: what is wrong.
-        n: number of simulations.
-        fps: frames a second [Hz].
-    """
-
-    def __init__(self, config: ReportConfig, n: int, fps: int) -> None:
-        self._config = config
-        self._rngs = [np.random.default_rng(0)] * n
-        self._past: list[deque[NDArray[np.float64]]] = [deque(maxlen=1 + round(config.delay_s * fps)) for _ in range(n)]
-
-    def begin(self, sim: int, seed: int) -> None:
-        """Start an episode in one simulation."""
-        self._rngs[sim] = np.random.default_rng(seed)
-        self._past[sim].clear()
-
-    def told(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what is told where this is so, shape (n, places, fields)."""
-        config = self._config
-        if config.is_exact:
-            return state
-        for sim, past in enumerate(self._past):
-            past.append(state[sim].copy())
-            told = past[0].copy()  # at an episode's start, what was so then
-            rng, present = self._rngs[sim], told[:, 0] > 0
-            told[:, 3:6] += config.noise_m * rng.standard_normal((len(told), 3)) * present[:, None]
-            told[rng.random(len(told)) < config.dropout] = _NOTHING
-            state[sim] = told
-        return state
 
 
 _NOTHING = np.array([float(name == "qw") for name in OBJECT_FIELDS])  # zeros, and the identity

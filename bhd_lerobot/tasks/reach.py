@@ -15,6 +15,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.tasks.report import ReportConfig, Reports
 from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
@@ -40,6 +41,7 @@ class ReachConfig(TaskConfig):
         hold_s: time that the tool must stay there [s].
         start_spread_rad: every joint starts at home plus or minus up to this [rad].
         randomisation: how much one episode's world differs from the next.
+        report: what is wrong with what the task tells of the target.
     """
 
     duration_s: float = 10.0
@@ -48,6 +50,7 @@ class ReachConfig(TaskConfig):
     hold_s: float = 0.25
     start_spread_rad: float = 0.3
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
 
     def __post_init__(self) -> None:
         check_positive("task", self, ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"))
@@ -78,6 +81,7 @@ class ReachTask(ArmTask):
         self._hold = self.in_frames(config.hold_s)
         self._target = np.zeros((n, 7))
         self._camera_error = np.zeros((n, 3))
+        self._reports = Reports(config.report, n, fps, slice(3))
         self._first, self._last = np.ones(n), np.ones(n)
         self._angle = np.zeros(n)
         self._within = np.zeros(n, np.int64)
@@ -94,6 +98,7 @@ class ReachTask(ArmTask):
             target_pose=_draw_target(rng, kinematics),
             instruction=self.instruction(None),
             variation=draw_variation(self.config.randomisation, rng),
+            report_seed=self.config.report.draw_seed(rng),
         )
 
     def instruction(self, scene: TableScene | None) -> str:
@@ -107,14 +112,18 @@ class ReachTask(ArmTask):
                 raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
             self._target[sim] = scene.target_pose
             self._camera_error[sim] = scene.variation.camera_error
+            self._reports.begin(sim, scene.report_seed)
         self._within[ids] = self.frame[ids] = 0
         self._started[ids] = False
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
-        """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7)."""
+        """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7).
+
+        `config.report` says what is wrong with it.
+        """
         reported = self._target.copy()
         reported[:, :3] += self._camera_error
-        return reported
+        return self._reports.told(reported[:, None], self.frame)[:, 0]
 
     def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""

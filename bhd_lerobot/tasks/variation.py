@@ -93,33 +93,6 @@ class RandomisationConfig:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
 
 
-@dataclass
-class ReportConfig:
-    """What is wrong with what the task tells of the objects; nothing by default: then it is the truth.
-
-    Attributes:
-        noise_m: standard deviation of the noise on each coordinate of an object's position, anew in every frame [m].
-        delay_s: how old it is, in whole frames [s].
-        dropout: probability that an object is left out, for each and anew in every frame.
-    """
-
-    noise_m: float = 0.0
-    delay_s: float = 0.0
-    dropout: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("noise_m", "delay_s"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"report.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
-        if not 0 <= self.dropout <= 1:
-            raise ConfigError(f"report.dropout is {self.dropout}; it is a probability, from 0 to 1.")
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether nothing is wrong."""
-        return not (self.noise_m or self.delay_s or self.dropout)
-
-
 def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Variation:
     """Return the world's variation of one episode.
 

@@ -1,5 +1,6 @@
 """bhd-record: same seed same bytes, resume after any kill, signals, bad input, what is in the run folder."""
 
+import json
 import os
 import random
 import signal
@@ -298,3 +299,24 @@ def test_the_example_configuration_parses():
     path = Path(__file__).parents[2] / "configs" / "record" / "turtlebot3_avoid.yaml"
     config = parse(RecordConfig, [f"--config_path={path}", "--dataset.num_episodes=20", "--seed=1"])
     assert (config.dataset.num_episodes, config.seed) == (20, 1)
+
+
+def test_a_dataset_that_is_older_than_an_option_of_its_task_is_resumed_while_that_is_as_it_was(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    arm = {"robot__type": "ur5", "robot__beams": None, "brain__type": "reach", "task__type": "reach"}
+    run_record(root, **arm, dataset__num_episodes=1, dataset__episode_time_s=1)
+    path = root / "meta" / "bhd.json"
+    identity = json.loads(path.read_text())
+    task = identity["recording"]["task"]
+    del task["report"], task["randomisation"]["plain"]
+    path.write_text(json.dumps(identity))
+    for changed, named in (
+        ({"task__report__dropout": 0.5}, "recording.task.report: not recorded"),
+        ({"task__randomisation__plain": 0.1}, "recording.task.randomisation.plain: not recorded"),
+        ({"task__hold_s": 0.5}, "recording.task.hold_s: recorded 0.25, requested 0.5"),
+    ):
+        with pytest.raises(DatasetMismatchError, match=named):
+            run_record(root, **arm, **changed, resume="true", dataset__num_episodes=2, dataset__episode_time_s=1)
+    result, _ = run_record(root, **arm, resume="true", dataset__num_episodes=2, dataset__episode_time_s=1)
+    assert (result.recorded, result.episodes) == (1, 2)
+    assert json.loads(path.read_text()) == identity

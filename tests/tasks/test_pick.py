@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from bhd_lerobot.tasks.pick import (
     PickTask,
 )
 from bhd_lerobot.tasks.task import ArmTruth, Event
-from bhd_lerobot.tasks.variation import RandomisationConfig, ReportConfig
+from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "record"
@@ -483,62 +482,3 @@ def test_objects_that_were_not_seen_are_of_no_size_style_or_shade_that_was() -> 
 def test_what_is_held_out_is_named(options: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PickConfig(**options)
-
-
-# --- what is wrong with what it tells ---------------------------------------------------------------------------------
-
-
-def told(frames: int, **report) -> tuple[np.ndarray, np.ndarray]:
-    """Return what is told and what is true in frames in which the objects move, each of shape (frames, 5, 16)."""
-    config = PickConfig(min_objects=3, report=ReportConfig(**report))
-    task, exact = PickTask(config, 1, FPS), PickTask(PickConfig(min_objects=3), 1, FPS)
-    scene = task.sample(7)
-    rows = []
-    for one in (task, exact):
-        one.begin(np.array([0]), [scene])
-        poses = np.zeros((1, MAX_OBJECTS, 7))
-        poses[..., 3] = 1.0
-        said = []
-        for frame in range(frames):
-            poses[0, :, 0] = 0.01 * frame
-            said.append(one.environment_state(SimpleNamespace(object_poses=poses)).reshape(MAX_OBJECTS, -1))
-        rows.append(np.array(said))
-    return rows[0], rows[1]
-
-
-def test_what_is_told_is_as_noisy_late_and_incomplete_as_it_is_set_to_be() -> None:
-    said, true = told(300, noise_m=0.004)
-    present = true[:, :, 0] > 0
-    off = (said - true)[present]
-    assert off[:, 3:6].std() == pytest.approx(0.004, rel=0.1)
-    assert not np.delete(off, [3, 4, 5], axis=1).any()
-    assert np.array_equal(said[~present], true[~present])
-    said, true = told(30, delay_s=0.5)
-    assert np.array_equal(said[5:], true[:-5])
-    assert np.array_equal(said[:5], np.broadcast_to(true[0], (5, *true[0].shape)))
-    said, true = told(400, dropout=0.25)
-    gone = (true[:, :, 0] > 0) & (said[:, :, 0] == 0)
-    assert gone.sum() / (true[:, :, 0] > 0).sum() == pytest.approx(0.25, abs=0.04)
-    assert (said[gone][:, 6] == 1).all()
-
-
-def test_the_same_seed_is_told_the_same_and_the_table_is_that_without() -> None:
-    wrong = {"noise_m": 0.01, "delay_s": 0.2, "dropout": 0.1}
-    assert np.array_equal(told(50, **wrong)[0], told(50, **wrong)[0])
-    usual, other = scenes(20), scenes(20, report=ReportConfig(**wrong))
-    assert [one.objects for one in usual] == [one.objects for one in other]
-    assert len({one.report_seed for one in other}) == 20
-
-
-@each_case(
-    ("report", "message"),
-    [
-        ({"noise_m": -0.1}, r"report.noise_m is -0.1"),
-        ({"delay_s": math.inf}, r"report.delay_s is inf"),
-        ({"dropout": 1.5}, r"report.dropout is 1.5; it is a probability"),
-        ({"dropout": math.nan}, r"report.dropout is nan"),
-    ],
-)
-def test_reports_that_cannot_be_made(report: dict[str, float], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        ReportConfig(**report)

@@ -1,0 +1,101 @@
+"""What may be wrong with what a task tells a brain: noise, delay and gaps, as of a real robot's tracker."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ConfigError
+
+
+@dataclass
+class ReportConfig:
+    """What is wrong with what the task tells; nothing by default: then it is the truth.
+
+    Attributes:
+        noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame [m].
+        delay_s: how old it is, in whole frames [s].
+        dropout: probability that something is missing, for each thing and anew in every frame: an object is left out;
+            of a target, a goal or the robot's pose, what was told before is told again.
+    """
+
+    noise_m: float = 0.0
+    delay_s: float = 0.0
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("noise_m", "delay_s"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"report.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+        if not 0 <= self.dropout <= 1:
+            raise ConfigError(f"report.dropout is {self.dropout}; it is a probability, from 0 to 1.")
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing is wrong."""
+        return not (self.noise_m or self.delay_s or self.dropout)
+
+    def draw_seed(self, rng: np.random.Generator) -> int:
+        """Return the seed of what is wrong in an episode; 0, and nothing is drawn, if nothing is."""
+        return 0 if self.is_exact else int(rng.integers(2**31))
+
+
+class Reports:
+    """What n tasks tell of some things each, with noise, late and with gaps.
+
+    Args:
+        config: what is wrong.
+        n: number of simulations.
+        fps: frames a second [Hz].
+        position: which fields of a thing are its position [m].
+        absent: the fields of a thing that is not there, shape (fields,); None if it always is.
+    """
+
+    def __init__(
+        self, config: ReportConfig, n: int, fps: int, position: slice, absent: NDArray[np.float64] | None = None
+    ) -> None:
+        self._config, self._position, self._absent = config, position, absent
+        self._rngs = [np.random.default_rng(0)] * n
+        self._past: list[deque[NDArray[np.float64]]] = [deque(maxlen=1 + round(config.delay_s * fps)) for _ in range(n)]
+        self._frame = np.full(n, -1)
+        self._told: list[NDArray[np.float64]] = [np.zeros((0, 0))] * n
+
+    def begin(self, sim: int, seed: int) -> None:
+        """Start an episode in one simulation."""
+        self._rngs[sim] = np.random.default_rng(seed)
+        self._past[sim].clear()
+        self._frame[sim] = -1
+
+    def told(self, state: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what is told; in the same frame again, it is the same again.
+
+        Args:
+            state: what is true, shape (n, things, fields).
+            frame: number of each episode's frame, shape (n,).
+
+        Returns:
+            likewise, shape (n, things, fields); `state` itself where nothing is wrong.
+        """
+        if self._config.is_exact:
+            return state
+        for sim in np.flatnonzero(self._frame != frame).tolist():
+            self._told[sim] = self._tell(sim, state[sim])
+        self._frame[:] = frame
+        return np.stack(self._told)
+
+    def _tell(self, sim: int, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        config, absent, past, rng = self._config, self._absent, self._past[sim], self._rngs[sim]
+        is_first = not past
+        past.append(state.copy())
+        told = past[0].copy()  # at an episode's start, what was so then
+        present = np.ones(len(told), np.bool_) if absent is None else (told != absent).any(axis=1)
+        at = told[:, self._position]
+        at += config.noise_m * rng.standard_normal(at.shape) * present[:, None]
+        is_missing = rng.random(len(told)) < config.dropout
+        if absent is not None:
+            told[is_missing] = absent
+        elif not is_first:
+            told[is_missing] = self._told[sim][is_missing]
+        return told
