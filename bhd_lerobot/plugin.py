@@ -1,6 +1,9 @@
 """Every registration with LeRobot. LeRobot imports it through the distribution's module `lerobot_robot_bhd`."""
 
-import bhd_lerobot.registry  # noqa: F401  registers the robots
+import bhd_lerobot.policies.cnn.processor_cnn
+import bhd_lerobot.policies.mlp.processor_mlp
+import bhd_lerobot.policies.pixels.processor_pixels
+import bhd_lerobot.registry  # noqa: F401  registers the robots, and the modules above the steps of processors
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
@@ -8,5 +11,7 @@ from bhd_lerobot.policies.perception.configuration_perception import PerceptionC
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
-# Importing a configuration registers its type with LeRobot's choice registries.
+# Importing a configuration registers its type with LeRobot's choice registries. A checkpoint's processors are loaded by
+# the names of their steps, by whatever program: LeRobot imports a policy's module when it makes the policy, and the
+# module of its processors only when it makes new ones.
 __all__ = ["BhdBrainConfig", "BhdEnvConfig", "CnnConfig", "MlpConfig", "PerceptionConfig", "PixelsConfig"]

@@ -1,5 +1,8 @@
 """Checkpoints do the same in bhd-eval, lerobot-eval and lerobot-rollout, and what a robot cannot give is named."""
 
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +12,7 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 
+import bhd_lerobot
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.robots.simulated_robot import connected_robots
@@ -260,6 +264,28 @@ def test_a_checkpoint_does_the_same_in_all_three_programs(
     # and there was something to compare
     assert len(np.unique(robots.seen, axis=0)) == len(np.unique(robots.done, axis=0)) == frames
     assert not connected_robots()
+
+
+def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(request: pytest.FixtureRequest) -> None:
+    """It imports our package as a plug-in, and nothing else of it; here, other tests have imported everything."""
+    made = ("by_lerobot_train", "by_bhd_train", "pixels_by_bhd_train", "cnn_by_bhd_train")
+    paths = [str(request.getfixturevalue(one).checkpoint) for one in made]
+    program = f"""
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.processor import ProcessorStepRegistry
+from lerobot.utils.import_utils import register_third_party_plugins
+register_third_party_plugins()
+for path in {paths!r}:
+    make_pre_post_processors(PreTrainedConfig.from_pretrained(path), pretrained_path=path)
+print(*ProcessorStepRegistry.list())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    source = "".join(path.read_text(encoding="utf-8") for path in Path(bhd_lerobot.__file__).parent.rglob("*.py"))
+    ours = re.findall(r'^@ProcessorStepRegistry\.register\(name="(\w+)"\)', source, re.MULTILINE)
+    assert len(ours) >= 5
+    assert {*ours} <= {*done.stdout.split()}
 
 
 def test_lerobot_rollout_ends_after_its_duration_and_what_it_records_is_a_dataset(
