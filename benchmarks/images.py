@@ -1,10 +1,13 @@
 """Learning from images, beside stock `lerobot-train`, and rendering them: `python -m benchmarks.images`.
 
-Training: the same policy (`bhd_perception`, small and convolutional), the same data (picks of a UR5 with two cameras,
-as video), the same number of steps, one thread each. Samples a second of processor time, that of all processes of a run
-counted together; once for a whole run, from the start of the program over reading and decoding to the last checkpoint,
-and once for the steps alone: the difference between a long and a short run. Rendering: images of two cameras of 96 x 96
-pixels, beside MuJoCo's own renderer in its fastest settings, in turns. Exits with 1 if a goal is missed.
+Training: the same policy, the same data as video, the same number of steps, one thread each. Two policies take turns:
+`bhd_perception`, whose network is most of the work, on picks of a UR5 with two cameras; and `bhd_cnn`, a small network
+that looks at several images in a row, on drives of a TurtleBot3. Samples a second of processor time, that of all
+processes of a run counted together; once for a whole run, from the start of the program over reading and decoding to
+the last checkpoint, and once for the steps alone: the difference between a long and a short run.
+
+Rendering: images of two cameras of 96 x 96 pixels, beside MuJoCo's own renderer in its fastest settings, in turns.
+Exits with 1 if a goal is missed.
 """
 
 import argparse
@@ -37,27 +40,32 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 CAMERAS, SIZE = ("scene", "wrist"), 96
 BATCH = 32
 TRAIN_GOAL, RENDER_GOAL = 5.0, 0.8  # times the peer's speed
+# What is recorded to learn each policy from, and with which further options.
+RECORDINGS = {
+    "bhd_perception": ("ur5_pick_camera", "--robot.camera_width=160", "--robot.camera_height=120", "--dataset.fps=10"),
+    "bhd_cnn": ("turtlebot3_avoid_camera",),
+}
 PROGRAMS = {"bhd-train": "bhd_lerobot.cli.train", "lerobot-train": "lerobot.scripts.lerobot_train"}
 
 
-def record(folder: Path, episodes: int) -> Path:
-    """Record picks with two cameras; return the dataset's folder."""
-    root = folder / "data"
+def record(folder: Path, policy: str, episodes: int) -> Path:
+    """Record what a policy learns from; return the dataset's folder."""
+    root, (config, *more) = folder / "data", RECORDINGS[policy]
+    shutil.rmtree(root, ignore_errors=True)
     options = [f"--dataset.root={root}", f"--dataset.num_episodes={episodes}", f"--output_dir={folder / 'recording'}"]
-    size = ["--robot.camera_width=160", "--robot.camera_height=120", "--dataset.fps=10", "--preview_video=false"]
-    command = ["bhd_lerobot.recording.record", "--config_path=configs/record/ur5_pick_camera.yaml", *options, *size]
-    subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True)
+    command = ["bhd_lerobot.recording.record", f"--config_path=configs/record/{config}.yaml", *options, *more]
+    subprocess.run([sys.executable, "-m", *command, "--preview_video=false"], check=True, capture_output=True)
     return root
 
 
-def processor_time(program: str, root: Path, output: Path, steps: int) -> float:
+def processor_time(program: str, policy: str, root: Path, output: Path, steps: int) -> float:
     """Return the processor time of a training, start and end included [s]."""
     shutil.rmtree(output, ignore_errors=True)
     options = {
-        "dataset.repo_id": "bhd/ur5_pick_camera",
+        "dataset.repo_id": f"bhd/{RECORDINGS[policy][0]}",
         "dataset.root": root,
         "dataset.use_imagenet_stats": "false",
-        "policy.type": "bhd_perception",
+        "policy.type": policy,
         "policy.device": "cpu",
         "policy.push_to_hub": "false",
         "output_dir": output,
@@ -79,14 +87,14 @@ def processor_time(program: str, root: Path, output: Path, steps: int) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def training(folder: Path, episodes: int, steps: int, turns: int) -> dict[str, Any]:
+def training(folder: Path, policy: str, episodes: int, steps: int, turns: int) -> dict[str, Any]:
     """Return samples a second of processor time of both programs, whole runs and steps alone, and their ratios."""
-    root = record(folder, episodes)
+    root = record(folder, policy, episodes)
     runs: dict[tuple[str, int], list[float]] = {}
     for _ in range(turns):
         for program in PROGRAMS:
             for count in (steps // 5, steps):
-                seconds = processor_time(program, root, folder / "run", count)
+                seconds = processor_time(program, policy, root, folder / "run", count)
                 runs.setdefault((program, count), []).append(seconds)
     found: dict[str, Any] = {"episodes": episodes, "steps": steps, "batch_size": BATCH}
     for what, samples in (("whole", steps * BATCH), ("steps", (steps - steps // 5) * BATCH)):
@@ -154,18 +162,21 @@ def main() -> int:
         table.add_column(heading, justify="left" if heading in ("measured", "peer is") else "right")
     missed = []
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
+    results["training"] = {}
     try:
-        results["training"] = found = training(folder, options.episodes, options.steps, options.turns)
+        for policy in RECORDINGS:
+            found = training(folder, policy, options.episodes, options.steps, options.turns)
+            results["training"][policy] = found
+            for what, label, goal in (
+                ("whole", f"{policy}, a run of {options.steps} steps: samples per CPU s", f">= {TRAIN_GOAL:g}"),
+                ("steps", f"{policy}, its steps alone: samples per CPU s", ""),
+            ):
+                both = (shown(found[f"{what}: {program}"], ".1f") for program in PROGRAMS)
+                table.add_row(label, *both, "lerobot-train", shown(found[f"{what}: ratio"]), goal)
+            if found["whole: ratio"]["median"] < TRAIN_GOAL:
+                missed.append(f"training {policy}")
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    for what, label, goal in (
-        ("whole", f"a run of {options.steps} steps: samples per CPU s", f">= {TRAIN_GOAL:g}"),
-        ("steps", "its steps alone: samples per CPU s", ""),
-    ):
-        both = (shown(found[f"{what}: {program}"], ".1f") for program in PROGRAMS)
-        table.add_row(label, *both, "lerobot-train", shown(found[f"{what}: ratio"]), goal)
-    if found["whole: ratio"]["median"] < TRAIN_GOAL:
-        missed.append("training")
     try:
         results["rendering"] = found = rendering(100, 2 * options.turns + 1)
         label, peer = f"two cameras of {SIZE} x {SIZE}: images per s", "MuJoCo's renderer, fastest settings"

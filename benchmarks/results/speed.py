@@ -74,18 +74,18 @@ def loader_rows(results: Mapping[str, Any]) -> list[Row]:
 def images_rows(results: Mapping[str, Any]) -> list[Row]:
     """Return the rows of `benchmarks.images`."""
     rows = []
-    learned = results["training"]
-    for part, what in (("whole", f"a run of {learned['steps']} steps"), ("steps", "its steps alone")):
-        speeds = ", ".join(
-            f"{name} {learned[f'{part}: {name}']['median']:.1f}" for name in ("bhd-train", "lerobot-train")
-        )
-        ratio = learned[f"{part}: ratio"]
-        goal = "at least 5 x" if part == "whole" else ""
-        met = ratio["median"] >= 5 if part == "whole" else None
-        rows += [
-            Row(f"learning from images, {what}: samples per CPU second", speeds),
-            Row(f"learning from images, {what}: bhd-train / lerobot-train", times(ratio), goal, met),
-        ]
+    for policy, learned in results["training"].items():
+        for part, what in (("whole", f"a run of {learned['steps']} steps"), ("steps", "its steps alone")):
+            speeds = ", ".join(
+                f"{name} {learned[f'{part}: {name}']['median']:.1f}" for name in ("bhd-train", "lerobot-train")
+            )
+            ratio, name = learned[f"{part}: ratio"], f"learning {policy} from images, {what}"
+            goal = "at least 5 x" if part == "whole" else ""
+            met = ratio["median"] >= 5 if part == "whole" else None
+            rows += [
+                Row(f"{name}: samples per CPU second", speeds),
+                Row(f"{name}: bhd-train / lerobot-train", times(ratio), goal, met),
+            ]
     if "rendering" in results:
         ratio = results["rendering"]["ratio"]
         what = "two cameras of 96 x 96: images a second, over MuJoCo's own renderer"
