@@ -57,6 +57,11 @@ class AvoidConfig(TaskConfig):
             raise ConfigError(unknown_name("arena", self.arena, ARENAS))
         check_positive("task", self, ("duration_s", "cell_m", "stuck_time_s"))
         check_positive("task", self, ("min_path_m", "stuck_path_m"), or_zero=True)
+        if not (self.trail or self.report.is_exact):
+            raise ConfigError(
+                "task.report says what is wrong with the pose that the trail is drawn around, and task.trail is false: "
+                "nothing is told. Set --task.trail=true, or leave task.report out."
+            )
 
 
 class AvoidTask(BaseTask):

@@ -152,3 +152,8 @@ def test_how_many_run_side_by_side_and_when_they_begin_changes_nothing(name: str
 def test_reports_that_cannot_be_made(report: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         ReportConfig(**report)
+
+
+def test_where_nothing_is_told_nothing_can_be_wrong_with_it() -> None:
+    with pytest.raises(ConfigError, match=r"task.trail is false.*--task.trail=true"):
+        AvoidConfig(report=ReportConfig(noise_m=0.1))
