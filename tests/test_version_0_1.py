@@ -94,7 +94,6 @@ def test_a_dataset_is_resumed_with_the_brain_that_has_another_name(folder: Path)
     [
         (["--brain.hold_s=2.0"], "recording.brain.hold_s: recorded 1.0, requested 2.0"),
         (["--seed=3"], "recording.seed: recorded 2, requested 3"),
-        (["--task.report.noise_m=0.1"], "recording.task.report: not recorded, requested"),
         ([], "features.wind: recorded"),
     ],
 )
