@@ -15,7 +15,7 @@ _HEAD = (
     "intervals where a section says so), over the same held-out episodes for all brains of a table. Times of training",
     "include the start of the program. Where several training seeds are shown, each has to meet the goal by itself, so",
     "intervals are not corrected for their number; learned rows without a seed (clones, ablations, ACT, Diffusion) are",
-    "of seed 0 alone. Each section says when and where it was made.",
+    "of the first seed that was made. Each section says when and where it was made.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 

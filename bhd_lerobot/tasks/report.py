@@ -1,6 +1,5 @@
 """What may be wrong with what a task tells a brain: noise, delay and gaps, as of a real robot's tracker."""
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -9,14 +8,16 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 
+_MOST_NOISE_M, _LONGEST_DELAY_S = 100.0, 3600.0  # what no tracker is worse than; far larger numbers would overflow
+
 
 @dataclass
 class ReportConfig:
     """What is wrong with what the task tells; nothing by default: then it is the truth.
 
     Attributes:
-        noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame [m].
-        delay_s: how old it is, in whole frames [s].
+        noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame, at most 100 [m].
+        delay_s: how old it is, in whole frames, at most 3600 [s].
         dropout: probability that something is missing, for each thing and anew in every frame: an object is left out;
             of a target, a goal or the robot's pose, what was told before is told again.
     """
@@ -26,9 +27,9 @@ class ReportConfig:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("noise_m", "delay_s"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"report.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+        for name, unit, most in (("noise_m", "m", _MOST_NOISE_M), ("delay_s", "s", _LONGEST_DELAY_S)):
+            if not 0 <= getattr(self, name) <= most:
+                raise ConfigError(f"report.{name} is {getattr(self, name)}; it must be from 0 to {most:g} [{unit}].")
         if not 0 <= self.dropout <= 1:
             raise ConfigError(f"report.dropout is {self.dropout}; it is a probability, from 0 to 1.")
 

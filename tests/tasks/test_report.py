@@ -144,7 +144,8 @@ def test_how_many_run_side_by_side_and_when_they_begin_changes_nothing(name: str
     ("report", "message"),
     [
         ({"noise_m": -0.1}, r"report.noise_m is -0.1"),
-        ({"delay_s": math.inf}, r"report.delay_s is inf"),
+        ({"noise_m": 1e300}, r"report.noise_m is 1e\+300; it must be from 0 to 100 \[m\]"),
+        ({"delay_s": math.inf}, r"report.delay_s is inf; it must be from 0 to 3600 \[s\]"),
         ({"dropout": 1.5}, r"report.dropout is 1.5; it is a probability"),
         ({"dropout": math.nan}, r"report.dropout is nan"),
     ],
