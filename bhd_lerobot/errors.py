@@ -27,6 +27,10 @@ class InstructionError(BhdError, ValueError):
     """An instruction that is not understood or fits no single object, or a plan that cannot be carried out."""
 
 
+class NothingFitsError(InstructionError):
+    """An instruction that is understood, about something that is not there."""
+
+
 class PerceptionError(BhdError):
     """A camera shows nothing that can be used, or what it shows is too uncertain to act on."""
 

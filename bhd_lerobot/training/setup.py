@@ -14,6 +14,7 @@ from lerobot.configs.types import FeatureType
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.random_utils import set_seed
@@ -22,6 +23,7 @@ from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
+from bhd_lerobot.policies.mlp.processor_mlp import floored
 from bhd_lerobot.training.config import BhdTrainConfig
 
 
@@ -238,9 +240,19 @@ def build_processors(
     Raises:
         ConfigError: the checkpoint's processors cannot be used.
     """
+    before, after = _build_processors(config, policy, meta, device, keep_statistics=keep_statistics)
+    if hasattr(policy, "use_statistics"):  # some are part of the weights
+        policy.use_statistics(next(step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)))
+    return before, after
+
+
+def _build_processors(
+    config: BhdTrainConfig, policy: Any, meta: LeRobotDatasetMetadata, device: torch.device, *, keep_statistics: bool
+) -> tuple[Any, Any]:
     active: Any = config.policy
     if active.pretrained_path is None:
         return make_pre_post_processors(active, dataset_stats=meta.stats)
+    stats: Any = floored(meta.stats, active.min_std) if hasattr(active, "min_std") else meta.stats
     features = {**policy.config.input_features, **policy.config.output_features}
     norm_map = policy.config.normalization_mapping
     before: dict[str, dict[str, Any]] = {
@@ -252,8 +264,8 @@ def build_processors(
         "unnormalizer_processor": {"features": policy.config.output_features, "norm_map": norm_map},
     }
     if not keep_statistics:
-        before["normalizer_processor"]["stats"] = meta.stats
-        after["unnormalizer_processor"]["stats"] = meta.stats
+        before["normalizer_processor"]["stats"] = stats
+        after["unnormalizer_processor"]["stats"] = stats
     if getattr(active, "use_relative_actions", False):
         before["relative_actions_processor"] = {
             "enabled": True,
@@ -261,7 +273,7 @@ def build_processors(
             "action_names": getattr(active, "action_feature_names", None),
         }
         after["absolute_actions_processor"] = {"enabled": True}
-    kwargs: dict[str, Any] = {} if keep_statistics else {"dataset_stats": meta.stats}
+    kwargs: dict[str, Any] = {} if keep_statistics else {"dataset_stats": stats}
     try:
         return make_pre_post_processors(
             active,

@@ -9,6 +9,7 @@ import pytest
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
 from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 
 
 class Spy(SimpleNamespace):
@@ -46,6 +47,11 @@ def test_of_a_brain_that_does_not_say_it_is_taken_for_granted_that_it_is_told_th
     inner: Any = SimpleNamespace(has_plan=False)
     brain = BlankedBrain(BlankedConfig(brain=None, images=True), inner)  # type: ignore[arg-type]
     assert brain.uses_privileged_state
+
+
+def test_a_brain_that_brings_its_own_instruction_cannot_be_deaf() -> None:
+    with pytest.raises(ConfigError, match=r"brain\.brain\.instruction is 'pick up the red cup'"):
+        BlankedConfig(LanguageBrainConfig(instruction="pick up the red cup"), instruction=True)
 
 
 def test_a_brain_that_lacks_nothing_is_refused() -> None:

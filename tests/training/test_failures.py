@@ -8,9 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
+from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.training import output
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import MetricsFile
@@ -147,6 +151,44 @@ def test_fine_tuning_keeps_or_renews_the_statistics(
     config = json.loads((result.checkpoint / "pretrained_model" / "config.json").read_text())
     assert config["optimizer_lr"] == 1e-5
     assert config["hidden_dims"] == [16, 16]  # from the checkpoint
+
+
+def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(
+    data: Path, tmp_path: Path
+) -> None:
+    """What it says nothing about stays as it is observed: by `bhd-train` in all ways, and by LeRobot's own factory."""
+    first = tmp_path / "first"
+    run_train(options(data, first, {**MLP, "policy.residual": "['*.pos']"}, steps=1))
+    other = make_dataset(tmp_path / "set", episodes=3, shift=5.0)
+    folders = [first / "checkpoints" / "last" / "pretrained_model"]
+    for statistics in ("checkpoint", "dataset"):
+        arguments = options(other, tmp_path / statistics, {}, fine_tune=first, fine_tune_statistics=statistics, steps=1)
+        result, _ = run_train(arguments)
+        assert result.checkpoint is not None
+        folders.append(result.checkpoint / "pretrained_model")
+    arguments = options(other, tmp_path / "path", {}, steps=1)
+    result, _ = run_train([*arguments, f"--policy.path={folders[0]}"])
+    assert result.checkpoint is not None
+    folders.append(result.checkpoint / "pretrained_model")
+    made = [(one.policy, one.before, one.after) for one in map(load_policy, folders)]
+    # As `lerobot-train --policy.path` makes them.
+    meta = LeRobotDatasetMetadata("t/t", root=other)
+    config = PreTrainedConfig.from_pretrained(folders[0])
+    config.pretrained_path = folders[0]
+    stats = {"stats": meta.stats}
+    overrides = {"preprocessor_overrides": {"normalizer_processor": stats}}
+    overrides["postprocessor_overrides"] = {"unnormalizer_processor": stats}
+    made.append(
+        (make_policy(config, meta), *make_pre_post_processors(config, pretrained_path=str(folders[0]), **overrides))
+    )
+    generator = torch.Generator().manual_seed(0)
+    state, goal = torch.randn(10, 4, generator=generator), torch.zeros(10, 2)
+    for policy, before, after in made:
+        for parameter in policy.net.parameters():
+            torch.nn.init.zeros_(parameter)
+        batch = {"observation.state": state, "observation.environment_state": goal}
+        actions = after(policy.predict_action_chunk(before(batch)))
+        assert torch.allclose(actions, state[:, None, :2].expand_as(actions), atol=1e-5)
 
 
 def test_fine_tuning_starts_from_the_weights(data: Path, trained: Path, tmp_path: Path) -> None:

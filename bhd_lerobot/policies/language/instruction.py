@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
-from bhd_lerobot.errors import ConfigError, InstructionError
+from bhd_lerobot.errors import ConfigError, InstructionError, NothingFitsError
 from bhd_lerobot.policies.language.grounding import Description, descriptions, fitting
 from bhd_lerobot.policies.language.lexicon import ANYTHING, CHINESE, ENGLISH, VERBS, Language, Part, Relation
 from bhd_lerobot.policies.manipulation.skills import Plan, SceneObject, Skill, check_request, make_plan
@@ -41,7 +41,8 @@ class RulePlanner:
         """Return the plan for an instruction.
 
         Raises:
-            InstructionError: it is not understood, or no object or more than one fits.
+            NothingFitsError: no object fits.
+            InstructionError: it is not understood, or more than one object fits.
         """
         objects = list(check_request(instruction, scene).values())
         request = parse(instruction)
@@ -52,7 +53,7 @@ class RulePlanner:
         name = describe if request.language is ENGLISH else chinese
         if not found:
             there = ", ".join(name(thing) for thing in objects) or "(nothing)"
-            raise InstructionError(f"Nothing on the table is '{phrase}'. On the table: {there}.")
+            raise NothingFitsError(f"Nothing on the table is '{phrase}'. On the table: {there}.")
         exact = [_instructions(objects, thing, request.language, request.goal) for thing in found]
         advice = ", ".join(repr(each[0]) for each in exact if each)
         raise InstructionError(

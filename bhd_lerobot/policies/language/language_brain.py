@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.errors import InstructionError, PerceptionError
+from bhd_lerobot.errors import ConfigError, InstructionError, NothingFitsError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.language.instruction import RulePlanner
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp
@@ -38,6 +38,13 @@ class LanguageBrainConfig(PickBrainConfig):
     instruction: str = ""
     perception: PerceptionOptions = field(default_factory=PerceptionOptions)
 
+    def __post_init__(self) -> None:
+        if self.perception.path and any(self.camera_error_m):
+            raise ConfigError(
+                f"brain.camera_error_m is {list(self.camera_error_m)}, by which the task is wrong, and with "
+                "brain.perception.path the brain does not ask the task. Leave one of them out."
+            )
+
 
 @dataclass
 class _Sight:
@@ -47,13 +54,15 @@ class _Sight:
         objects: the objects, None until it is looked for them.
         first: those that it saw first in this episode.
         chosen: which of them it went for, None if for none.
-        image: what the camera showed then; None once it has shown something else.
+        image: what the camera showed when the brain looked last; None if it has not looked.
+        is_alive: whether the camera has shown something else since the last look.
     """
 
     objects: Sequence[SeenObject] | None = None
     first: Sequence[PerceivedObject] | None = None
     chosen: int | None = None
     image: NDArray[np.uint8] | None = None
+    is_alive: bool = False
 
 
 class LanguageBrain(PickBrain):
@@ -102,7 +111,7 @@ class LanguageBrain(PickBrain):
         if self.perceiver is None or sight is None or self._done[sim]:
             return False
         decides = pending is None or any(result.task_id == pending for result in results)
-        return decides and (sight.objects is None or sight.image is not None)
+        return decides and (sight.objects is None or not sight.is_alive)
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Take the instruction of the episode, or that of the configuration."""
@@ -132,11 +141,13 @@ class LanguageBrain(PickBrain):
                 return self._give_up(
                     sim, f"the arm, which is in the way of another look, stays there: {result.message}"
                 )
-            if result.success and sight.image is not None:
-                if np.array_equal(sight.image, seen.images[self.perceiver.camera][sim]):
+            # Also before another look, from home, whatever the camera has shown on the way.
+            if result.success and (not sight.is_alive or sight.objects is None):
+                image = seen.images[self.perceiver.camera][sim]
+                if np.array_equal(sight.image, image):
                     camera = self.perceiver.camera
                     return self._give_up(sim, f"the camera {camera!r} shows the same image although the arm has moved")
-                sight.image = None
+                sight.image, sight.is_alive = image.copy(), True
         command = super().decide(sim, seen, result)
         plan = self._work[sim].plan
         if result is None and plan is not None:
@@ -154,20 +165,21 @@ class LanguageBrain(PickBrain):
         if sight.objects is None:
             found = self.perceiver.look(seen.images, sim)
             sight.objects = found
+            sight.image, sight.is_alive = seen.images[self.perceiver.camera][sim].copy(), False
             if sight.first is None:
-                sight.first, sight.image = found, seen.images[self.perceiver.camera][sim].copy()
+                sight.first = found
         return sight.objects
 
     def _make_plan(self, sim: int, objects: Sequence[SeenObject]) -> tuple[Plan, Sequence[SeenObject]]:
         """Return the plan for what is on the table, and what it takes the objects for.
 
-        Who asks for a thing knows that it is there. Where what is seen fits nothing or too much, one object is taken
-        for what it may be instead, the likeliest such change first.
+        Who asks for a thing mostly knows that it is there. Where nothing fits, one object is taken for what it may be
+        instead, the likeliest such change first.
         """
         instruction = self._work[sim].instruction
         try:
             plan = self._planner.plan(instruction, [scene_object(item) for item in objects])
-        except InstructionError as error:
+        except NothingFitsError as error:
             for others in _otherwise(objects):
                 with contextlib.suppress(InstructionError):
                     plan, objects = self._planner.plan(instruction, [scene_object(one) for one in others]), others
@@ -183,12 +195,12 @@ class LanguageBrain(PickBrain):
 
     def _check(self, target: PerceivedObject) -> None:
         options, name = self.settings.perception, scene_object(target).name
-        if target.certainty < options.min_certainty:
+        if not target.certainty >= options.min_certainty:
             raise PerceptionError(
                 f"It is not certain that there is a {name}: {target.certainty:.0%}, which is less than "
                 f"perception.min_certainty ({options.min_certainty:.0%})."
             )
-        if target.error_90_m > options.max_error_m:
+        if not target.error_90_m <= options.max_error_m:
             raise PerceptionError(
                 f"Where the {name} is, is known to {1000 * target.error_90_m:.0f} mm only, which is more than "
                 f"perception.max_error_m ({1000 * options.max_error_m:.0f} mm)."

@@ -155,6 +155,8 @@ class Planner(Protocol):
             scene: what is on the table, in any order.
 
         Raises:
+            NothingFitsError: it is about something that is not in this scene. What sees the scene may then have taken
+                an object for something else, and asks again.
             InstructionError: the instruction is not understood or cannot be carried out with this scene. The message is
                 meant for the person who gave the instruction.
         """

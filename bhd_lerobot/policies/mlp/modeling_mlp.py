@@ -2,7 +2,8 @@
 
 import math
 from collections import deque
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -84,6 +85,22 @@ class MlpPolicy(PreTrainedPolicy):
             shape = (config.chunk_size, self._action_size)
             self.log_std = nn.Parameter(torch.full(shape, float(config.initial_log_std)))
         self.reset()
+
+    @classmethod
+    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
+        """Return the policy of a checkpoint; arguments are LeRobot's.
+
+        With `dataset_stats`, which LeRobot gives for a training only, states and actions are normalised by these.
+        """
+        policy = super().from_pretrained(*args, **kwargs)
+        if kwargs.get("dataset_stats"):
+            policy.use_statistics(kwargs["dataset_stats"])
+        return policy
+
+    def use_statistics(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take other statistics, which states and actions are normalised by from now on."""
+        if self.residual is not None:
+            self.residual.use_statistics(stats)
 
     def get_optim_params(self) -> list[dict[str, Any]]:
         """Return the parameters in two groups: weights, and biases and scales, which do not decay."""

@@ -18,31 +18,37 @@ class Residual(nn.Module):
 
     Args:
         columns: of each action, the column of `observation.state` that has its name; -1 for none, which begins at 0.
-        stats: mean and standard deviation of the dataset; those of a checkpoint follow with its weights.
+        stats: mean and standard deviation of the dataset; those of a checkpoint come with its weights.
         least: standard deviation that numbers are divided by at the least, as in the normaliser.
     """
 
     _scale: Tensor
     _offset: Tensor
     _columns: Tensor
+    _is_known: Tensor
 
     def __init__(self, columns: Sequence[int], stats: Mapping[str, Mapping[str, Any]] | None, least: float) -> None:
         super().__init__()
         found = torch.tensor(columns, dtype=torch.long)
-        scale, offset = torch.zeros(len(columns)), torch.zeros(len(columns))
-        if stats:
-            state, action = (
-                [torch.as_tensor(stats[key][name], dtype=torch.float32) for name in ("mean", "std")]
-                for key in (OBS_STATE, ACTION)
-            )
-            known = found >= 0
-            divisor = action[1].clamp(min=least)[known]
-            scale[known] = state[1].clamp(min=least)[found[known]] / divisor
-            offset[known] = (state[0][found[known]] - action[0][known]) / divisor
+        self._least = least
         # Not part of the checkpoint: the configuration says it.
+        self.register_buffer("_is_known", found >= 0, persistent=False)
         self.register_buffer("_columns", found.clamp(min=0), persistent=False)
-        self.register_buffer("_scale", scale)
-        self.register_buffer("_offset", offset)
+        self.register_buffer("_scale", torch.zeros(len(columns)))
+        self.register_buffer("_offset", torch.zeros(len(columns)))
+        if stats:
+            self.use_statistics(stats)
+
+    def use_statistics(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take other statistics, which states and actions are normalised by from now on."""
+        (state_mean, state_std), (mean, std) = (
+            [torch.as_tensor(stats[key][name], dtype=torch.float32).to(self._scale) for name in ("mean", "std")]
+            for key in (OBS_STATE, ACTION)
+        )
+        known = self._is_known
+        columns, divisor = self._columns[known], std.clamp(min=self._least)[known]
+        self._scale[known] = state_std.clamp(min=self._least)[columns] / divisor
+        self._offset[known] = (state_mean[columns] - mean[known]) / divisor
 
     def forward(self, state: Tensor) -> Tensor:
         """Return what actions begin at, shape (batch, 1, actions), of normalised states, shape (batch, width)."""

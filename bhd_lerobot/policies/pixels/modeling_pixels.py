@@ -79,10 +79,8 @@ class PixelsPolicy(PreTrainedPolicy):
         self.others = _Attention(config.text_dim + cell, cell + 3, config.n_heads)
         self.value = nn.Linear(cell + 3, _VALUES)
         # Of the state before it was normalised; of a checkpoint, with its weights.
-        known = (kwargs.get("dataset_stats") or {}).get(OBS_STATE)
-        for name, empty in (("mean", torch.zeros(state)), ("std", torch.ones(state))):
-            value = empty if known is None else torch.as_tensor(known[name], dtype=torch.float32)
-            self.register_buffer(f"_state_{name}", value.clamp(min=config.min_std) if name == "std" else value)
+        self.register_buffer("_state_mean", torch.zeros(state))
+        self.register_buffer("_state_std", torch.ones(state))
         width = len(columns) + cell + config.n_heads * _VALUES
         width += relative_size(1) if config.tool_columns else 0
         layers: list[nn.Module] = []
@@ -93,14 +91,30 @@ class PixelsPolicy(PreTrainedPolicy):
         self.actor = nn.Sequential(*layers, nn.Linear(width, config.chunk_size * self._action_size))
         self.residual: Residual | None = None
         if config.residual:
-            self.residual = Residual(config.residual_columns, kwargs.get("dataset_stats"), config.min_std)
+            self.residual = Residual(config.residual_columns, None, config.min_std)
+        if kwargs.get("dataset_stats"):
+            self.use_statistics(kwargs["dataset_stats"])
         self._looked: dict[bytes, tuple[Tensor, Tensor]] = {}
         self.reset()
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> "PixelsPolicy":
-        """Return the policy of a checkpoint, with the checkpoint's own weights only; arguments are LeRobot's."""
-        return super().from_pretrained(*args, **{**kwargs, "initialise": False})
+        """Return the policy of a checkpoint, with the checkpoint's own weights only; arguments are LeRobot's.
+
+        With `dataset_stats`, which LeRobot gives for a training only, states and actions are normalised by these.
+        """
+        policy = super().from_pretrained(*args, **{**kwargs, "initialise": False})
+        if kwargs.get("dataset_stats"):
+            policy.use_statistics(kwargs["dataset_stats"])
+        return policy
+
+    def use_statistics(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take other statistics, which states and actions are normalised by from now on."""
+        mean, std = (torch.as_tensor(stats[OBS_STATE][name], dtype=torch.float32) for name in ("mean", "std"))
+        self._state_mean.copy_(mean)
+        self._state_std.copy_(std.clamp(min=self.config.min_std))
+        if self.residual is not None:
+            self.residual.use_statistics(stats)
 
     def _initialise(self, path: str) -> None:
         from bhd_lerobot.policies.learned.policy import load_perception

@@ -9,7 +9,7 @@ import pytest
 from bhd_lerobot.bodies.tabletop import COLOURS, TableObject
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
-from bhd_lerobot.errors import ConfigError, PerceptionError
+from bhd_lerobot.errors import ConfigError, InstructionError, PerceptionError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.perception.perceiver import PerceivedObject, PerceptionOptions
@@ -63,16 +63,17 @@ class Table:
         assert self.brain.uses_images
         self.brain.reset(np.array([0]), [0], 1, [instruction])
         self.given: list[BrainCommand] = []
-        self.opening, self.frozen, self.images_wanted = MAX_OPENING, frozen, []
+        self.opening, self.images_wanted = MAX_OPENING, []
+        self.freezes_after = 1 if frozen else None
         self._random = np.random.default_rng(0)
         self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
 
     def frame(self, result: CommandResult | None = None) -> BrainCommand | None:
         """Let the brain act; images are there if it asked for them."""
-        if not self.frozen:
-            self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
         results = {0: [result]} if result else {}
         wanted = bool(self.brain.looks(results)[0])
+        if wanted and (self.freezes_after is None or sum(self.images_wanted) < self.freezes_after):
+            self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
         self.images_wanted.append(wanted)
         state = np.array([[0.0, self.opening]])
         goals = self.brain.act(Observation(OBSERVED, state, {"scene": self._image} if wanted else {}, None, results))
@@ -189,6 +190,21 @@ def test_with_a_camera_that_does_not_change_while_the_arm_moves_it_does_not_go_d
     assert "shows the same image although the arm has moved" in table.problem
 
 
+@each_case(("shown", "last"), [(2, "home"), (3, "above")])
+def test_a_camera_that_freezes_later_is_noticed_before_the_tool_goes_down_again(shown: int, last: str) -> None:
+    """After the image above the object, or after that of the second look; what is grasped first is missed."""
+    table = Table(BOTH, BOTH)
+    table.freezes_after = shown
+    table.frame()
+    table.end()
+    table.end()
+    table.opening = 0.0
+    while table.end() is not None:
+        pass
+    assert table.steps == ["above", "down", "close", "back", "home", "above"][: 5 + (last == "above")]
+    assert "shows the same image although the arm has moved" in table.problem
+
+
 def test_an_arm_that_did_not_move_says_nothing_of_its_camera() -> None:
     table = Table(BOTH, frozen=True)
     table.frame()
@@ -275,6 +291,27 @@ def test_what_was_taken_for_something_else_is_what_was_asked_for_if_it_may_be_th
     assert Table([unlikely, likely], instruction="pick up the green cup").frame() is None
 
 
+def test_what_fits_twice_or_is_refused_is_not_taken_for_something_else() -> None:
+    """Only of what is not there it is thought that it may have been mistaken for another thing."""
+    orange = TableObject("cup", "orange", CUP.size_x, CUP.size_y, CUP.height, CUP.x, CUP.y)
+    perhaps = (seen(orange, 1, certainty=0.45),)
+    twice = [seen(CUP, 0), dataclasses.replace(seen(CUP, 1, off=0.2, certainty=0.5), alternatives=perhaps)]
+    table = Table(twice)
+    assert table.frame() is None
+    assert "fits 2 objects" in table.problem
+    asked: list[int] = []
+
+    class Refusing:
+        def plan(self, instruction: str, scene: Any) -> Any:
+            asked.append(len(scene))
+            raise InstructionError("I would rather not.")
+
+    table = Table(twice)
+    table.brain._planner = Refusing()
+    assert table.frame() is None
+    assert (asked, table.problem) == ([2], "I would rather not.")
+
+
 def test_a_brain_that_gave_up_looks_no_more() -> None:
     table = Table(PerceptionError("the camera 'scene' shows nothing"))
     assert table.brain.looks({}).tolist() == [True]
@@ -293,3 +330,8 @@ def test_a_brain_that_gave_up_looks_no_more() -> None:
 def test_options_that_cannot_be_honoured(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PerceptionOptions(**options)
+
+
+def test_what_it_does_not_ask_cannot_be_wrong() -> None:
+    with pytest.raises(ConfigError, match=r"camera_error_m is \[0.01, 0, 0\].*does not ask the task"):
+        LanguageBrainConfig(perception=PerceptionOptions("somewhere"), camera_error_m=[0.01, 0, 0])
