@@ -40,9 +40,10 @@ class BlankedConfig(BrainConfig):
     def __post_init__(self) -> None:
         if not (self.instruction or self.images):
             raise ConfigError("brain.type is 'blanked' and nothing is: set brain.instruction or brain.images to true.")
-        if self.instruction and getattr(self.brain, "instruction", ""):
+        own = getattr(self.brain, "instruction", "")
+        if self.instruction and own:
             raise ConfigError(
-                f"brain.instruction is true, and brain.brain.instruction is {self.brain.instruction!r}, which the "
+                f"brain.instruction is true, and brain.brain.instruction is {own!r}, which the "
                 "brain would carry out. Leave one of them out."
             )
 

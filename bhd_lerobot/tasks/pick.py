@@ -112,6 +112,11 @@ class PickConfig(TaskConfig):
                 f"task.swap is true and task.min_objects is {self.min_objects}; to ask for another object there must "
                 "be two. Set --task.min_objects=2."
             )
+        if self.swap and self.names == "held_out":
+            raise ConfigError(
+                "task.swap is true and task.names is 'held_out': one object of a table has such a name, and it would "
+                "not be the one that is asked for. Leave one of them out."
+            )
 
 
 class PickTask(ArmTask):
@@ -205,8 +210,8 @@ class PickTask(ArmTask):
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return what is on the table, as a camera sees it: 16 numbers for each place of an object, shape (n, 80).
 
-        The first is the target; the others follow, at the start the nearest to it first.
-        Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
+        Unless `config.order` is `random`, the first is the target; the others follow, at the start the nearest to it
+        first. Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
         places without one. `config.report` says what is wrong with it.
         """

@@ -6,6 +6,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from accelerate import Accelerator  # type: ignore[import-untyped]
 from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
@@ -131,6 +132,25 @@ def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, renam
             )
 
 
+def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset whose task told something else than the truth, for a policy that learns to say what is true.
+
+    Raises:
+        DatasetError: names the option that it was recorded with.
+    """
+    task: Any = PolicyContract.from_dataset(meta).task or {}
+    wrong = {f"report.{name}": value for name, value in (task.get("report") or {}).items()}
+    randomisation = task.get("randomisation") or {}
+    if randomisation.get("enabled"):
+        wrong["randomisation.camera_error_m"] = randomisation.get("camera_error_m")
+    for name, value in wrong.items():
+        if np.any(np.asarray(value, float)):
+            raise DatasetError(
+                f"{meta.root} was recorded with task.{name} = {value}: what it says of the objects is not true, and a "
+                f"{policy.type!r} would learn to say that. Record it without."
+            )
+
+
 def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerator: Any = None) -> Any:
     """Return the policy, new or from its checkpoint, on its device; all of its randomness is the seed's.
 
@@ -139,6 +159,8 @@ def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerat
     """
     policy: Any = config.policy
     check_features(policy, meta, config.rename_map)
+    if getattr(policy, "learns_true_poses", False):
+        _check_truth(policy, meta)
     if policy.pretrained_path is not None:
         # One folder on this machine, so that what is checked is what LeRobot loads.
         policy.pretrained_path = find_checkpoint(policy.pretrained_path, policy.pretrained_revision).resolve()

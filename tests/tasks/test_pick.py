@@ -422,6 +422,8 @@ def test_a_swap_asks_for_another_object_of_the_same_table() -> None:
         assert after.name in other.instruction
     with pytest.raises(ConfigError, match=r"task.swap is true and task.min_objects is 1"):
         PickConfig(swap=True)
+    with pytest.raises(ConfigError, match=r"task.swap is true and task.names is 'held_out'"):
+        PickConfig(swap=True, names="held_out", min_objects=2)
 
 
 def test_names_that_are_held_out_occur_there_only_and_each_of_their_words_elsewhere() -> None:

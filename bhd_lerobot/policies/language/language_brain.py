@@ -144,7 +144,7 @@ class LanguageBrain(PickBrain):
             # Also before another look, from home, whatever the camera has shown on the way.
             if result.success and (not sight.is_alive or sight.objects is None):
                 image = seen.images[self.perceiver.camera][sim]
-                if np.array_equal(sight.image, image):
+                if sight.image is not None and np.array_equal(sight.image, image):
                     camera = self.perceiver.camera
                     return self._give_up(sim, f"the camera {camera!r} shows the same image although the arm has moved")
                 sight.image, sight.is_alive = image.copy(), True

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.policies.learned.inference import Rows
 
 _STATE, _ENVIRONMENT, _ACTION = "observation.state", "observation.environment_state", "action"
+_RESIZES = ("resize_shape", "resize_imgs_with_padding", "image_resolution")  # options of policies that scale images
 _log = logging.getLogger(__name__)
 
 
@@ -237,7 +238,7 @@ class LearnedBrain:
 
     def _image(self, observation: Observation, camera: str, key: str) -> NDArray[np.uint8]:
         images = observation.images.get(camera)
-        shape = tuple((self.contract.cameras or {}).get(camera, ()))
+        shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
         if images is None:
             size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""
             raise ConfigError(
@@ -245,8 +246,19 @@ class LearnedBrain:
                 f"have. There is: {', '.join(observation.images) or 'none'}. Set --robot.camera=true{size}."
             )
         if shape and images.shape[1:] != shape:
-            self.contract.check(cameras={camera: images.shape[1:]}, who=f"The policy {self.config.path!r}")
+            height, width, channels = shape
+            contract = replace(self.contract, cameras={camera: (height, width, channels)})
+            contract.check(cameras={camera: images.shape[1:]}, who=f"The policy {self.config.path!r}")
         return images
+
+    def _own_shape(self, key: str) -> tuple[int, ...]:
+        """Return the shape of images that the policy itself says it takes, channels last; empty if it takes any."""
+        config = self.loaded.config
+        feature = (config.input_features or {}).get(key)
+        if feature is None or any(getattr(config, name, None) for name in _RESIZES):
+            return ()
+        channels, *size = feature.shape
+        return (*size, channels)
 
     def _remember(self, rows: "Rows", running: NDArray[np.intp]) -> "Rows":
         """Return the frames that the policy looks at, shape (n, frames, …), oldest first."""

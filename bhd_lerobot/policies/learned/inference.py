@@ -128,7 +128,7 @@ class BatchedInference:
     def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
         """Return chunks, shape (len(ids), predicted actions, actions)."""
         chunks = []
-        with torch.inference_mode(), _threads(self._threads), _precision(self.loaded):
+        with torch.inference_mode(), use_threads(self._threads), _precision(self.loaded):
             for start in range(0, len(ids), self._block):
                 sims = ids[start : start + self._block].tolist()
                 block = {key: _filled(values[start : start + self._block], self._block) for key, values in rows.items()}
@@ -233,7 +233,7 @@ class StockInference:
     def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
         """Return the next action of every simulation, shape (len(ids), 1, actions)."""
         actions = []
-        with torch.inference_mode(), _threads(self._threads), _precision(self.loaded):
+        with torch.inference_mode(), use_threads(self._threads), _precision(self.loaded):
             for row, sim in enumerate(ids.tolist()):
                 batch: dict[str, Any] = {"task": [self._instructions[sim]]}
                 for key, values in rows.items():
@@ -279,7 +279,7 @@ def _twin(policy: Any) -> Any:
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def use_threads(count: int | None) -> Iterator[None]:
     """Give torch some threads for a while."""
     before = torch.get_num_threads()
     if count is None or count == before:

@@ -1,26 +1,23 @@
-"""How well a brain saw: what it said at an episode's start beside what was true then."""
+"""How well a brain saw: what it said at an episode's start beside what stood there."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
-from bhd_lerobot.policies.manipulation.grasp import read_objects
-from bhd_lerobot.policies.manipulation.skills import scene_object
+from bhd_lerobot.bodies.tabletop import TableScene
 
 _SAME = 0.05  # [m] what is seen this near to an object is that object
 NUMBERS = ("chosen", "wrong", "error_m", "in_50", "in_90", "objects", "seen", "named", "phantoms")
 
 
-def assess(plan: Mapping[str, Any], environment_state: NDArray[Any]) -> dict[str, float]:
+def assess(plan: Mapping[str, Any], scene: TableScene) -> dict[str, float]:
     """Return how well a brain with a perception of its own saw; nothing of one without.
 
     Args:
         plan: the brain's, with what was `seen` and which of it was `chosen`.
-        environment_state: what the task said at the time, shape (80,).
+        scene: what stood on the table, whatever the task told of it.
 
     Returns:
         `chosen`: 1 if it found an object that the instruction means, else 0; `wrong`: 1 if that was another one;
@@ -32,20 +29,20 @@ def assess(plan: Mapping[str, Any], environment_state: NDArray[Any]) -> dict[str
     said = plan.get("seen")
     if said is None:
         return {}
-    true = read_objects(environment_state.astype(np.float64).reshape(-1, len(OBJECT_FIELDS)))
-    apart = np.array([[math.dist(one["position"][:2], other.position[:2]) for other in true] for one in said])
+    true = scene.objects
+    apart = np.array([[math.dist(one["position"][:2], (other.x, other.y)) for other in true] for one in said])
     apart = apart.reshape(len(said), len(true))
     nearest = apart.argmin(axis=1) if len(true) else np.zeros(len(said), np.intp)
     is_one = apart.min(axis=1, initial=math.inf) < _SAME
     pairs = {int(nearest[place]): place for place in np.flatnonzero(is_one)[::-1]}  # the surest of several stays
-    named = sum(scene_object(true[number]).name == said[place]["name"] for number, place in pairs.items())
+    named = sum(true[number].name == said[place]["name"] for number, place in pairs.items())
     numbers = dict.fromkeys(NUMBERS, math.nan)
     numbers |= {"objects": len(true), "seen": len(pairs), "named": named, "phantoms": int((~is_one).sum())}
     chosen = plan.get("chosen")
     numbers["chosen"] = float(chosen is not None)
     if chosen is not None:
         error = float(apart[chosen].min(initial=math.inf))
-        is_right = bool(is_one[chosen]) and true[int(nearest[chosen])].target
+        is_right = bool(is_one[chosen]) and int(nearest[chosen]) == scene.target_object
         numbers |= {"wrong": float(not is_right), "error_m": error}
         numbers |= {f"in_{share}": float(error <= said[chosen][f"error_{share}_m"]) for share in (50, 90)}
     return numbers

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -49,6 +49,8 @@ class PerceptionConfig(PreTrainedConfig):
         optimizer_grad_clip_norm: largest norm of the gradient.
         scheduler_warmup_steps: steps of the warm-up, after which the learning rate goes to 0 along a cosine.
     """
+
+    learns_true_poses: ClassVar[bool] = True
 
     camera: str = "scene"
     camera_position: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.position))

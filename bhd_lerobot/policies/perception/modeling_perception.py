@@ -318,7 +318,7 @@ class PerceptionPolicy(PreTrainedPolicy):
             images: shape (batch, 3, height, width), 0 to 1.
 
         Raises:
-            ConfigError: the policy was not calibrated.
+            ConfigError: the policy was not calibrated, or its weights are broken.
         """
         if not bool(torch.isfinite(self.factor)):
             raise ConfigError(
@@ -328,7 +328,10 @@ class PerceptionPolicy(PreTrainedPolicy):
                 "on with it."
             )
         self.eval()
-        return self._found(self.look(self.checked({self.config.image_key: images}))[1], float(self.factor))
+        answers = self.look(self.checked({self.config.image_key: images}))[1]
+        if not all(bool(torch.isfinite(values).all()) for values in answers.values()):
+            raise ConfigError("This bhd_perception answers with numbers that are not finite. Use another checkpoint.")
+        return self._found(answers, float(self.factor))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Raise an error: there are no actions.
@@ -457,7 +460,7 @@ class _Network(nn.Module):
         self.middle = nn.Sequential(_Residual(coarse, 1), _Residual(coarse, 2))
         self.up = _Convolution(coarse, fine, 1)
         self.join = _convolution(2 * fine, fine, 3)
-        width, height = (math.ceil(size / 32) for size in config.image_size)
+        width, height = (math.ceil(size // 2 / 16) for size in config.image_size)
         self.overview = nn.Sequential(
             nn.AvgPool2d(2),
             _convolution(3, 16, 5, stride=2),

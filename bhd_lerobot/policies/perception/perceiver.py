@@ -32,18 +32,22 @@ class PerceptionOptions:
         max_error_m: an object whose place is not known better than this, with 90 % probability, is not grasped [m].
         min_certainty: nothing is taken for an object of a kind and colour that is less certain than this. The default
             was chosen on episodes of the split `validation` (docs/reference/policies.md has what others cost).
+        threads: CPU threads; more than one make a network of this size slower beside anything else.
     """
 
     path: str = ""
     device: str = "cpu"
     max_error_m: float = 0.03
     min_certainty: float = 0.2
+    threads: int = 1
 
     def __post_init__(self) -> None:
         if not 0 < self.max_error_m < float("inf"):
             raise ConfigError(f"brain.perception.max_error_m is {self.max_error_m}; it must be positive [m].")
         if not 0 <= self.min_certainty < 1:
             raise ConfigError(f"brain.perception.min_certainty is {self.min_certainty}; it must be from 0 to below 1.")
+        if self.threads < 1:
+            raise ConfigError(f"brain.perception.threads is {self.threads}; it must be at least 1.")
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ class Perceiver:
         self.dataset = dict(PolicyContract.load(folder).dataset or {})
         self._policy = load_perception(folder, options.device)
         self.weights = weights_digest(folder)
-        self._device, self._least = options.device, options.min_certainty
+        self._device, self._least, self._threads = options.device, options.min_certainty, options.threads
         self.camera: str = self._policy.config.camera
 
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
@@ -101,6 +105,8 @@ class Perceiver:
             PerceptionError: the image shows nothing at all.
         """
         import torch
+
+        from bhd_lerobot.policies.learned.inference import use_threads
 
         if self.camera not in images:
             width, height = self._policy.config.image_size
@@ -121,7 +127,9 @@ class Perceiver:
         if int(channels.max()) < _DARK or float(channels.std(axis=1, dtype=np.float32).max()) < _FLAT:
             raise PerceptionError(f"the camera {self.camera!r} shows nothing: its image has one colour only")
         values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self._device).float() / 255
-        return _objects(self._policy.detect(values)[0], self._least)
+        with use_threads(self._threads):
+            found = self._policy.detect(values)[0]
+        return _objects(found, self._least)
 
 
 def _objects(found: "Detections", least: float) -> list[PerceivedObject]:

@@ -37,7 +37,8 @@ _SAME = (
 _SHAPE = ("channels", "hidden", "context")
 _SHARPNESS = 4  # attention is to fall off from an object's centre as this power of how near a cell is
 _WITHIN = 0.03  # [m] cells whose places are so near to each other's are about the same object
-_THUMBNAIL = 8  # every so many pixels of an image, by which it is known again
+_THUMBNAIL = 8  # every so many pixels of an image, by which it is known again, with the sum of all
+_KEPT = 16_384  # images of which it is kept what is known of their cells, some 35 kB each
 
 
 class PixelsPolicy(PreTrainedPolicy):
@@ -94,7 +95,7 @@ class PixelsPolicy(PreTrainedPolicy):
             self.residual = Residual(config.residual_columns, None, config.min_std)
         if kwargs.get("dataset_stats"):
             self.use_statistics(kwargs["dataset_stats"])
-        self._looked: dict[bytes, tuple[Tensor, Tensor]] = {}
+        self._looked: dict[tuple[bytes, int], tuple[Tensor, Tensor]] = {}
         self.reset()
 
     @classmethod
@@ -253,13 +254,18 @@ class PixelsPolicy(PreTrainedPolicy):
         if not (self.training and self.config.is_frozen):
             return self._look(image)
         # In a training the same first images come again and again.
-        keys = [one.tobytes() for one in image[..., ::_THUMBNAIL, ::_THUMBNAIL].cpu().numpy()]
+        thumbnails = image[..., ::_THUMBNAIL, ::_THUMBNAIL].cpu().numpy()
+        # Every pixel counts: integers, whose sum does not depend on the order.
+        sums = image.float().contiguous().view(torch.int32).flatten(1).sum(1, dtype=torch.int64).tolist()
+        keys = [(one.tobytes(), number) for one, number in zip(thumbnails, sums, strict=True)]
         new = {key: row for row, key in enumerate(keys) if key not in self._looked}
         if new:
             with torch.no_grad():
                 cells, where = self._look(image[list(new.values())])
             self._looked.update(zip(new, zip(cells, where, strict=True), strict=True))
         found = [self._looked[key] for key in keys]
+        for key in list(self._looked)[: max(0, len(self._looked) - _KEPT)]:
+            del self._looked[key]  # images that are varied anew each time would fill the memory
         return torch.stack([cells for cells, _ in found]), torch.stack([where for _, where in found])
 
     def _look(self, image: Tensor) -> tuple[Tensor, Tensor]:

@@ -57,7 +57,10 @@ class InstructionProcessorStep(ObservationProcessorStep):
 
 @lru_cache(maxsize=4096)
 def _tokens(text: str, length: int) -> Tensor:
-    encoded = text.strip().lower().encode()
+    try:
+        encoded = text.strip().lower().encode()
+    except UnicodeEncodeError as error:
+        raise ConfigError(f"The instruction {text!r} is no text that UTF-8 can write: {error.reason}.") from None
     if len(encoded) > length:
         raise ConfigError(
             f"The instruction {text!r} takes {len(encoded)} bytes; this bhd_pixels reads {length}. Say it shorter, or "

@@ -76,6 +76,11 @@ class AggregationConfig:
     validation_episodes: int = 200
     seed: int = 0
 
+    @property
+    def stages(self) -> tuple[StageConfig, ...]:
+        """The programs of a round, in their order, and before them the expert."""
+        return self.expert, self.learner, self.policy, self.evaluation
+
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured.
 
@@ -131,6 +136,12 @@ def read_stages(config: AggregationConfig) -> Stages:
             f"learner.config is {config.learner.config!r}, whose brain is {kinds[1]!r}; it must be 'dagger', in which "
             "a policy drives and an expert helps."
         )
+    for stage, parsed in ((config.expert, expert), (config.learner, learner)):
+        if parsed.split != "train":
+            raise ConfigError(
+                f"split is {parsed.split!r} in {stage.config!r}: its episodes are not for learning from, but for "
+                "judging what was learned. Leave it out."
+            )
     policy = parse_train(command(config.policy, {})).config
     weight = "selection.learner_weight"
     if not learner.dataset.expert_action and weight in _names(config.policy):

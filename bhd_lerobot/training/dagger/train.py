@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bhd_lerobot.datasets.edit.edits import delete, merge
+from bhd_lerobot.datasets.format.features import EXPERT_ACTION
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
@@ -33,7 +34,7 @@ from bhd_lerobot.training.dagger.config import (
 from bhd_lerobot.training.dagger.curve import draw_curve
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
-_CONFIG, _DONE = "config.yaml", "done.json"
+_CONFIG, _FILES, _DONE = "config.yaml", "files.yaml", "done.json"
 _OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
     "bhd-record": record.main,
@@ -109,10 +110,17 @@ def _check_data(config: AggregationConfig, stages: Stages) -> None:
                 f"expert of {config.expert.config!r} drives a {stages.robot} with {stages.fps}. Name datasets of that "
                 "robot and frame rate."
             )
+        if stages.has_advice and EXPERT_ACTION not in found.features:
+            raise ConfigError(
+                f"data names {root}, which has no {EXPERT_ACTION}, from which is learned here. Record it with "
+                "--dataset.expert_action=true, or leave it out."
+            )
 
 
 def _keep_to(folder: Path, config: AggregationConfig) -> None:
-    """Note the configuration in the folder; refuse one that differs in more than how many rounds there are.
+    """Note the configuration in the folder, and what the files in it say.
+
+    Refuse one that differs in more than how many rounds there are.
 
     Raises:
         ConfigError: it differs, or the folder holds something else.
@@ -127,11 +135,33 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
                 f"The rounds in {folder} were made with {name} = {before.get(name)}, and now it is {values[name]}. Go "
                 "on with the same, or set another --output_dir."
             )
+    files = {stage.config: _content(stage.config) for stage in config.stages}
+    if (folder / _FILES).exists():
+        for name, content in _content(folder / _FILES).items():
+            if name in files and files[name] != content:
+                raise ConfigError(
+                    f"{name} says something else than when the rounds in {folder} were made: "
+                    f"{', '.join(_differing(content, files[name]))}. Undo that, or set another --output_dir."
+                )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        Disk().publish(folder / _CONFIG, yaml.safe_dump(values, sort_keys=False, allow_unicode=True).encode())
+        for name, what in ((_CONFIG, values), (_FILES, files)):
+            Disk().publish(folder / name, yaml.safe_dump(what, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+
+
+def _content(path: str | Path) -> Any:
+    return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+
+
+def _differing(before: Any, now: Any, name: str = "") -> list[str]:
+    """Return what differs between two configurations, each with both values."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return [] if before == now else [f"{name} was {before}, and is {now}"]
+    keys = dict.fromkeys([*before, *now])
+    pairs = ((f"{name}.{key}" if name else str(key), before.get(key), now.get(key)) for key in keys)
+    return [one for key, old, new in pairs for one in _differing(old, new, key)]
 
 
 class _Rounds:
@@ -316,11 +346,12 @@ class _Rounds:
         summary = dataset_info(folder / "data")
         driven = sum(episode.metadata.get("intervened_frames") or 0 for episode in summary.episodes)
         share = driven / summary.frames if number else None
-        before = self._rows[-1] if self._rows else {"episodes": 0, "frames": 0}
+        merged = folder / "all"
+        learned = dataset_info(merged) if merged.exists() else summary
         return {
             "round": number,
-            "episodes": before["episodes"] + len(summary.episodes),
-            "frames": before["frames"] + summary.frames,
+            "episodes": len(learned.episodes),
+            "frames": learned.frames,
             "expert_share": share,
             "seconds": None if math.isnan(self._seconds) else self._seconds,
             **_level(results["policy"]),

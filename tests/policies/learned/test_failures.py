@@ -152,8 +152,13 @@ def test_without_a_contract_the_shapes_are_checked_and_it_says_so(
             brain.bind(RobotFeatures(*arguments))
 
 
-def test_a_camera_that_the_robot_does_not_have(tmp_path: Path) -> None:
-    brain = rig.make_brain(rig.save_policy(tmp_path / "act", "act_image"))
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_camera_that_the_robot_does_not_have(is_known: bool, tmp_path: Path) -> None:
+    """Also where only the policy itself tells which images it takes."""
+    folder = rig.save_policy(tmp_path / "act", "act_image")
+    if not is_known:
+        (folder / CONTRACT_FILE).unlink()
+    brain = rig.make_brain(folder)
     brain.reset(np.arange(1), [0], 1)
     seen = next(rig.observations(1, 1))
     with pytest.raises(ConfigError, match=r"camera 'front'.*There is: none.*--robot.camera=true.*camera_width=48"):

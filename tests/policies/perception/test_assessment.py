@@ -3,10 +3,9 @@
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.tabletop import TableObject, TableScene
 from bhd_lerobot.evaluation.perception import summarise_perception
 from bhd_lerobot.evaluation.text import perception_sentence
 from bhd_lerobot.policies.perception.assessment import NUMBERS, assess
@@ -14,12 +13,11 @@ from bhd_lerobot.policies.perception.assessment import NUMBERS, assess
 RED_CUP, BLUE_BOX = (0.4, 0.1), (0.5, -0.2)  # where they stand
 
 
-def table() -> np.ndarray:
-    """Return what the task says of a red cup, which is meant, and a blue box."""
-    places = np.zeros((MAX_OBJECTS, len(OBJECT_FIELDS)))
-    for place, target, box, (x, y), colour in ((1, 1, 0, RED_CUP, "red"), (3, 0, 1, BLUE_BOX, "blue")):
-        places[place] = [1, target, box, x, y, 0.05, 1, 0, 0, 0, 0.07, 0.07, 0.1, *COLOURS[colour]]
-    return places.ravel()
+def table() -> TableScene:
+    """Return a table with a blue box and a red cup, which is meant."""
+    box = TableObject("box", "blue", 0.035, 0.035, 0.1, *BLUE_BOX)
+    cup = TableObject("cup", "red", 0.035, 0.035, 0.1, *RED_CUP)
+    return TableScene("pick", (box, cup), (0.0,) * 7, target_object=1)
 
 
 def seen(name: str, at: tuple[float, float], off_m: float = 0.0) -> dict[str, Any]:

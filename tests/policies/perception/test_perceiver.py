@@ -1,11 +1,14 @@
 """From a recorded dataset to a checkpoint to a brain that sees with it: every command, and what each refuses."""
 
 import json
+import math
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -133,6 +136,16 @@ def test_checkpoints_that_are_none(run: Path, tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             Perceiver(options)
+    broken = tmp_path / "broken"
+    shutil.copytree(run / "checkpoints/last/pretrained_model", broken)
+    weights = load_file(broken / "model.safetensors")
+    weights["network.stem.0.0.weight"][...] = math.nan
+    save_file(weights, broken / "model.safetensors")
+    with pytest.raises(ConfigError, match="answers with numbers that are not finite"):
+        Perceiver(PerceptionOptions(str(broken))).look(images(), 0)
+    (broken / "model.safetensors").rename(broken / "adapter_model.safetensors")
+    with pytest.raises(ConfigError, match="cannot be loaded"):
+        Perceiver(PerceptionOptions(str(broken)))
     with pytest.raises(ConfigError, match=r"gives no 'action'; it gives observation.environment_state"):
         load_policy(run / "checkpoints/last/pretrained_model")
 
@@ -160,6 +173,15 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
     root = make_dataset(tmp_path / "data")
     with pytest.raises((ConfigError, DatasetError), match="true poses of objects"):
         train(root, tmp_path / "run")
+    for option, value, name in (
+        ("task__report__noise_m", 0.01, "report.noise_m"),
+        ("task__randomisation__camera_error_m", "[0.03,0,0]", "randomisation.camera_error_m"),
+    ):
+        told = tmp_path / name
+        wrong = {option: value, "task__randomisation__enabled": "true", "dataset__num_episodes": 1, "n_envs": 1}
+        run_record(told, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, **wrong)
+        with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn to say that"):
+            train(told, tmp_path / "run")
 
 
 def test_without_held_out_episodes_the_checkpoint_refuses_to_see(looks: Path, tmp_path: Path) -> None:

@@ -370,3 +370,11 @@ def test_too_few_objects_are_no_reason_to_move_a_camera(trained: PerceptionPolic
     with pytest.raises(ConfigError, match=r"were seen; .* 12 are needed. Record more tables"):
         policy.fit_camera([{IMAGE: painted(values), OBS_ENV_STATE: torch.from_numpy(values).float()}])
     assert policy.config.view == before
+
+
+def test_images_of_any_size_are_looked_at() -> None:
+    for width, height in ((96, 72), (97, 73), (129, 97), (161, 120), (320, 240)):
+        one = config()
+        one.input_features[IMAGE] = PolicyFeature(FeatureType.VISUAL, (3, height, width))
+        features, answers = PerceptionPolicy(one).eval().look(torch.rand(2, 3, height, width))
+        assert features.shape[2:] == answers["presence"].shape[1:]

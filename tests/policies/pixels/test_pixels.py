@@ -15,6 +15,7 @@ from torch import Tensor
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
+from bhd_lerobot.policies.pixels import modeling_pixels
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
@@ -123,6 +124,23 @@ def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytes
     assert {"reader.said.weight", "named.key.weight", "others.key.weight", "actor.0.weight"} <= changed
     # Without weights that were read, there is nothing to keep: it learns to see.
     assert all(one.requires_grad for one in PixelsPolicy(made()).perception.parameters())
+
+
+def test_an_image_that_differs_anywhere_is_another_and_not_all_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, samples = PixelsPolicy(made(perception="read before"), initialise=False).train(), batch()
+    looks: list[int] = []
+    look = policy._look
+    monkeypatch.setattr(policy, "_look", lambda image: looks.append(len(image)) or look(image))
+    monkeypatch.setattr(modeling_pixels, "_KEPT", 20)
+    image = samples[IMAGE][:, 0]
+    policy._cells(image)
+    for pixel in ((0, 1), (3, 5), (image.shape[-2] - 1, image.shape[-1] - 1)):
+        image[2, 1, *pixel] += 0.01
+        policy._cells(image)
+    assert looks == [8, 1, 1, 1]
+    for number in range(1, 5):
+        policy._cells(image + number / 100)
+    assert len(policy._looked) == 20
 
 
 def test_actions_behind_the_end_do_not_count() -> None:
@@ -260,6 +278,8 @@ def test_an_instruction_is_needed_and_never_cut_off() -> None:
     before, _ = make_pre_post_processors(made(longest_instruction=16))
     with pytest.raises(ConfigError, match=r"takes 18 bytes; this bhd_pixels reads 16\. Say it shorter"):
         before({"task": ["拿起红色杯"[:3] + "123456789"], OBS_STATE: torch.zeros(1, 14)})
+    with pytest.raises(ConfigError, match=r"'\\udcff' is no text that UTF-8 can write"):
+        before({"task": ["\udcff"], OBS_STATE: torch.zeros(1, 14)})
     with pytest.raises(ConfigError, match="the batch has none"):
         before({OBS_STATE: torch.zeros(1, 14)})
 

@@ -16,6 +16,7 @@ from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.dagger import train as dagger
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
+from tests.recording.support import run_record
 
 CONFIGS = Path("configs").absolute()
 BRIEF = ["--robot.beams=36", "--task.duration_s=2"]
@@ -122,6 +123,29 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert results(tmp_path)["rounds"] == [{**row, "seconds": None} for row in found["rounds"]]
     assert main([argument, "--seed=1"]) == 2
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
+
+
+def test_files_that_say_something_else_than_before_are_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda _: 130))
+    argument = f"--config_path={settings(tmp_path)}"
+    stages = yaml.safe_load((tmp_path / "dagger.yaml").read_text())
+    policy = tmp_path / "policy.yaml"
+    shutil.copy(stages["policy"]["config"], policy)
+    stages["policy"]["config"] = str(policy)
+    (tmp_path / "dagger.yaml").write_text(yaml.safe_dump(stages))
+    assert main([argument]) == 130
+    values = yaml.safe_load(policy.read_text())
+    policy.write_text(yaml.safe_dump({**values, "log_freq": values["log_freq"]}))  # in another order, without comments
+    assert main([argument]) == 130
+    capsys.readouterr()
+    policy.write_text(yaml.safe_dump({**values, "policy": {**values["policy"], "optimizer_lr": 0.5}}))
+    before = values["policy"].get("optimizer_lr")
+    assert main([argument]) == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"policy.yaml says something else than when the rounds in {tmp_path / 'run'} were made" in printed
+    assert f"policy.optimizer_lr was {before}, and is 0.5." in printed
 
 
 def test_a_training_that_had_ended_before_it_was_noted_is_not_gone_on_with(
@@ -232,6 +256,11 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             for name in ("split", "brains.policy.path", "brains.expert.margin_m")
         ),
         (
+            {"expert": {"config": "held_out.yaml", "options": BRIEF}},
+            "split is 'held_out' in 'held_out.yaml': its episodes are not for learning from",
+        ),
+        ({"data": ["without"]}, r"data names without, which has no expert\.action"),
+        (
             {"evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []}},
             "robot.type is 'ur5' in evaluation.config, .*ur5_pick.yaml', and 'turtlebot3' in that of the expert",
         ),
@@ -261,8 +290,17 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     ],
 )
 def test_what_cannot_be_is_said_before_the_first_round(
-    changed: dict[str, Any], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    changed: dict[str, Any],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    held_out = yaml.safe_load((CONFIGS / "record/turtlebot3_avoid.yaml").read_text())
+    Path("held_out.yaml").write_text(yaml.safe_dump({**held_out, "split": "held_out"}))
+    if changed == {"data": ["without"]}:
+        run_record(tmp_path / "without", dataset__episode_time_s=0.5, n_envs=1, dataset__num_episodes=1)
     assert main([f"--config_path={settings(tmp_path, **changed)}"]) == 2
     assert re.search(message, " ".join(capsys.readouterr().err.split()))
     assert not (tmp_path / "run").exists()
