@@ -100,7 +100,8 @@ def each(
 def _making(commands: Sequence[Ran]) -> float:
     """Return the processor time of the commands that recorded and trained, each of them once [s]."""
     once = {one.command: one.cpu_seconds for one in commands}
-    return sum(seconds for command, seconds in once.items() if not command.startswith("bhd-eval"))
+    making = ("bhd-record", "bhd-train", "bhd-data")
+    return sum(seconds for command, seconds in once.items() if command.startswith(making))
 
 
 def first_of(made: Mapping[int, Any]) -> tuple[int, ...]:

@@ -39,6 +39,7 @@ class LanguageBrainConfig(PickBrainConfig):
     perception: PerceptionOptions = field(default_factory=PerceptionOptions)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.perception.path and any(self.camera_error_m):
             raise ConfigError(
                 f"brain.camera_error_m is {list(self.camera_error_m)}, by which the task is wrong, and with "

@@ -72,6 +72,7 @@ class Perceiver:
 
     Attributes:
         camera: name of the camera that it looks through.
+        image_size: width and height of its images [px].
         dataset: what it was trained on.
         weights: which weights it has.
 
@@ -92,6 +93,7 @@ class Perceiver:
         self.weights = weights_digest(folder)
         self._device, self._least, self._threads = options.device, options.min_certainty, options.threads
         self.camera: str = self._policy.config.camera
+        self.image_size: tuple[int, int] = self._policy.config.image_size
 
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
         """Return the objects that one robot's camera shows, the surest first.
@@ -108,15 +110,14 @@ class Perceiver:
 
         from bhd_lerobot.policies.learned.inference import use_threads
 
+        width, height = self.image_size
         if self.camera not in images:
-            width, height = self._policy.config.image_size
             raise ConfigError(
                 f"{self.who} looks through the camera {self.camera!r}, which this robot does not have. There is: "
                 f"{', '.join(images) or 'none'}. Set --robot.camera=true --robot.camera_width={width} "
                 f"--robot.camera_height={height}."
             )
         image = images[self.camera][sim]
-        width, height = self._policy.config.image_size
         if image.shape != (height, width, 3):
             raise ConfigError(
                 f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
