@@ -226,6 +226,9 @@ class Pretended(Runner):
             rate = {"value": 0.9, "low": 0.8, "high": 0.99}
             rounds = [{"round": number, "episodes": 10 * number, "success": rate} for number in (0, 1)]
             return {"rounds": [{**one, "seconds": 30.0} for one in rounds]}
+        if parts[-1].endswith("refusals.json"):
+            counts = {"tables": 10, "went": 1, "right": 0}
+            return {"nominal": {"there": {**counts, "right": 1}, "absent": counts, "several": {**counts, "tables": 0}}}
         return self._results["/".join(parts[:-1])]
 
     _results: dict[str, Any]
