@@ -45,17 +45,15 @@ def questions(scene: TableScene, rng: np.random.Generator) -> dict[str, str]:
     return asked | ({"several": str(rng.choice(several))} if several else {})
 
 
-def ask(path: str, world: str, episodes: int, seed: int, split: str) -> dict[str, Any]:
+def ask(perception: PerceptionOptions, world: str, seeds: Sequence[int]) -> dict[str, Any]:
     """Return how often the brain went for an object, and how often for the right one, by kind of question.
 
     Args:
-        path: the perception's checkpoint.
+        perception: how the brain sees.
         world: `nominal`, `randomised`, or `unseen`: randomised, with objects of a style that was not learned from.
-        episodes: how many tables.
-        seed: which.
-        split: `held_out` or `validation`.
+        seeds: of the tables.
     """
-    brain = LanguageBrain(LanguageBrainConfig(perception=PerceptionOptions(path)))
+    brain = LanguageBrain(LanguageBrainConfig(perception=perception))
     assert brain.perceiver is not None
     width, height = brain.perceiver.image_size
     robot = UR5Config(camera=True, camera_width=width, camera_height=height)
@@ -65,8 +63,7 @@ def ask(path: str, world: str, episodes: int, seed: int, split: str) -> dict[str
     simulation = stage.simulation
     brain.bind(RobotFeatures(simulation.observation_names, simulation.action_names, robot.fps, ()))
     counts = {kind: {"tables": 0, "went": 0, "right": 0} for kind in QUESTIONS}
-    for episode in range(episodes):
-        number = episode_seed(seed, episode, split)
+    for number in seeds:
         stage.reset(one, [number])
         seen, scene = stage.observe(), stage.scenes[0]
         for kind, name in questions(scene, np.random.default_rng(number)).items():
@@ -89,11 +86,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=500, help="tables")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--split", choices=("held_out", "validation"), default="held_out")
+    parser.add_argument(
+        "--min_certainty", type=float, help="as brain.perception.min_certainty; its default if left out"
+    )
     parser.add_argument("--json", type=Path, help="file for the numbers")
     options = parser.parse_args(arguments)
+    perception = PerceptionOptions(options.path)
+    if options.min_certainty is not None:
+        perception = PerceptionOptions(options.path, min_certainty=options.min_certainty)
+    seeds = [episode_seed(options.seed, episode, options.split) for episode in range(options.episodes)]
     found = {}
     for world in options.worlds:
-        found[world] = ask(options.path, world, options.episodes, options.seed, options.split)
+        found[world] = ask(perception, world, seeds)
         for kind, count in found[world].items():
             if not count["tables"]:
                 continue
