@@ -5,18 +5,20 @@ Child processes inherit it.
 """
 
 import contextlib
+import gc
 import os
 import shutil
 import signal
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import settings
 
+from tests import quick
+
+gc.disable()  # until everything is imported, or it is looked through again and again for what can go
 pytest_plugins = ["tests.recorded_datasets"]
 
 _HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))
@@ -44,26 +46,28 @@ def pytest_unconfigure() -> None:
     shutil.rmtree(_HF_HOME, ignore_errors=True)
 
 
+def pytest_collection_finish() -> None:
+    quick.install()
+    _freeze()
+    gc.enable()
+
+
+def _freeze() -> None:
+    """Spare the collector what has been imported; a collection would take a third of a second."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let what runs in this process draw its charts, a third of a second each, for tests marked `figures` only.
-
-    Elsewhere a chart is an empty file, so that a test which looks at one without the mark fails. A hook, because
-    fixtures of any scope train and record.
-    """
-    module = sys.modules.get("matplotlib.figure")
-    if module is not None:
-        _SAVEFIG.setdefault("original", module.Figure.savefig)
-        is_drawn = item.get_closest_marker("figures") is not None
-        module.Figure.savefig = _SAVEFIG["original"] if is_drawn else _save_nothing
+    """Draw charts for tests marked `figures` only. A hook, because fixtures of any scope train and record."""
+    quick.draw(item.get_closest_marker("figures") is not None)
 
 
-_SAVEFIG: dict[str, Any] = {}
-
-
-def _save_nothing(_figure: Any, file: Any, **_options: Any) -> None:
-    if not hasattr(file, "write"):
-        Path(file).write_bytes(b"")
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Freeze again what a test has thawed, or imported, before the tests of the next module."""
+    if nextitem is not None and nextitem.module is not item.module and gc.get_freeze_count() == 0:
+        _freeze()
 
 
 @pytest.fixture(autouse=True)

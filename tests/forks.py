@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from tests import quick
+
 _CONTEXT = multiprocessing.get_context("forkserver")
 
 
@@ -72,4 +74,5 @@ def _run(
     file = os.open(output or os.devnull, os.O_WRONLY | os.O_APPEND)
     os.dup2(file, 1)
     os.dup2(file, 2)
+    quick.draw(False)
     sys.exit(function(*arguments))

@@ -21,6 +21,7 @@ from bhd_lerobot.recording import record
 from bhd_lerobot.rosbag.messages.types import type_store
 from bhd_lerobot.training import train
 from bhd_lerobot.training.rl import train as rl
+from tests import quick
 from tests.datasets import corruption_jobs, kill_jobs
 from tests.datasets.sweeps import faults
 
@@ -32,5 +33,6 @@ __all__ = [
 
 type_store()
 main._parser()  # imports every command
+quick.install()
 gc.collect()
 gc.freeze()  # or a child that collects garbage copies every page

@@ -2,17 +2,21 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.apps.view.support import Served, served
-from tests.datasets.loader.support import record_stock
-from tests.recording.support import run_record
+if TYPE_CHECKING:
+    from tests.apps.view.support import Served
+
+# What records is imported by what needs it: the process that deals the tests out to others reads this file as well.
 
 
 @pytest.fixture(scope="session")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A base with a camera: three episodes of 20 frames."""
+    from tests.recording.support import run_record
+
     root = tmp_path_factory.mktemp("looked_at") / "base"
     small = {"robot__camera": "true", "robot__camera_width": 64, "robot__camera_height": 48, "n_envs": 2}
     run_record(root, **small, dataset__num_episodes=3, dataset__episode_time_s=2, seed=4)
@@ -22,6 +26,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An arm that picks up what it is told to: two episodes."""
+    from tests.recording.support import run_record
+
     root = tmp_path_factory.mktemp("looked_at") / "arm"
     kinds = {"robot__type": "ur5", "brain__type": "pick", "task__type": "pick", "robot__beams": None}
     run_record(root, **kinds, dataset__num_episodes=2, dataset__episode_time_s=20, n_envs=2, seed=4)
@@ -31,11 +37,15 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What LeRobot's own recorder writes, with cameras."""
+    from tests.datasets.loader.support import record_stock
+
     return record_stock(tmp_path_factory.mktemp("looked_at") / "stock", cameras=True)
 
 
 @pytest.fixture(scope="module")
-def base_server(base: Path) -> Iterator[Served]:
+def base_server(base: Path) -> Iterator["Served"]:
     """The base's dataset, served."""
+    from tests.apps.view.support import served
+
     with served(base) as server:
         yield server
