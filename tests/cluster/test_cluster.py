@@ -337,6 +337,13 @@ class TestOnePool:
 # --- the pool, with workers that cost nothing -------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def driver(cluster):
+    """Keep this process a driver of the cluster, which takes a second to become one."""
+    with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())):
+        yield
+
+
 def run_pool(cluster, specs, *, fingerprint=fakes.FINGERPRINT, stop=lambda: False, **settings):
     """Run episodes with the fake server, one in a task; return their numbers as they come, and what was printed."""
     console = Console(file=io.StringIO(), width=400)
@@ -352,6 +359,7 @@ def run_pool(cluster, specs, *, fingerprint=fakes.FINGERPRINT, stop=lambda: Fals
     return got, console.file.getvalue(), None
 
 
+@pytest.mark.usefixtures("driver")
 def test_what_a_worker_raises_ends_the_run_after_what_comes_before(cluster):
     specs = [fakes.SLOW, *[fakes.ECHO] * 4, fakes.RAISE, *[fakes.ECHO] * 50]
     got, _, error = run_pool(cluster, specs)
@@ -362,6 +370,7 @@ def test_what_a_worker_raises_ends_the_run_after_what_comes_before(cluster):
     assert any("fakes.py" in note for note in error.__notes__)
 
 
+@pytest.mark.usefixtures("driver")
 def test_an_episode_that_kills_every_worker_is_given_up(cluster):
     got, printed, error = run_pool(cluster, [fakes.ECHO, fakes.DIE, fakes.ECHO], num_workers=1)
     assert got == [0]
@@ -370,6 +379,7 @@ def test_an_episode_that_kills_every_worker_is_given_up(cluster):
     assert printed.count("A worker was lost") >= 2
 
 
+@pytest.mark.usefixtures("driver")
 def test_what_workers_print_is_prefixed_and_bounded(cluster):
     got, printed, error = run_pool(cluster, [fakes.PRINT] * 8)
     assert (got, error) == (list(range(8)), None)
@@ -379,6 +389,7 @@ def test_what_workers_print_is_prefixed_and_bounded(cluster):
     assert "30 more lines" in lines[-1]
 
 
+@pytest.mark.usefixtures("driver")
 def test_a_worker_with_other_versions_is_refused_by_name(cluster, monkeypatch):
     version = metadata.version
     monkeypatch.setattr(metadata, "version", lambda name: "9.9.9" if name == "numpy" else version(name))
@@ -389,6 +400,7 @@ def test_a_worker_with_other_versions_is_refused_by_name(cluster, monkeypatch):
     assert "mujoco" not in str(error)
 
 
+@pytest.mark.usefixtures("driver")
 def test_a_machine_that_computes_something_else_is_refused(cluster):
     got, _, error = run_pool(cluster, [fakes.ECHO], fingerprint="other")
     assert got == []
@@ -396,12 +408,14 @@ def test_a_machine_that_computes_something_else_is_refused(cluster):
     assert "other numbers for the same episode" in str(error)
 
 
+@pytest.mark.usefixtures("driver")
 def test_workers_that_no_machine_has_room_for_are_refused(cluster):
     _, _, error = run_pool(cluster, [fakes.ECHO], cpus_per_worker=64)
     assert isinstance(error, ClusterError)
     assert "No machine of the cluster has 64 CPUs" in str(error)
 
 
+@pytest.mark.usefixtures("driver")
 def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
     got, printed, error = run_pool(cluster, [fakes.ECHO] * 6, num_workers=5)
     assert (got, error) == (list(range(6)), None)
@@ -430,6 +444,7 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
     assert "No worker could be started within 1 s" in str(error)
 
 
+@pytest.mark.usefixtures("driver")
 def test_the_run_stops_when_it_is_told_to(cluster):
     stopped = threading.Event()
     threading.Timer(2, stopped.set).start()

@@ -114,7 +114,7 @@ def test_the_block_of_memory_has_the_stated_size(n: int) -> None:
 
 
 def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path) -> None:
-    count = 3000
+    count = 1000
     path = tmp_path / "block"
     reader = CommandFifo(
         *support.FIFO_SHAPE, buffer=support.shared_block(path, CommandFifo.nbytes(*support.FIFO_SHAPE))

@@ -186,13 +186,13 @@ def parse_training(arguments: list[str]) -> None:
 
 def test_every_quoted_command_parses(monkeypatch: pytest.MonkeyPatch) -> None:
     programs, wrong = set(), []
-    for path in [*DOCUMENTS, *CONFIGURATIONS]:
-        for line in quoted_commands(path):
-            programs.add(line.split()[0])
-            try:
-                parse_command(line, monkeypatch)
-            except (Exception, SystemExit) as error:
-                wrong.append(f"{by_name(path)}: {line}: {error}")
+    quoted = {line: path for path in [*DOCUMENTS, *CONFIGURATIONS] for line in quoted_commands(path)}
+    for line, path in quoted.items():
+        programs.add(line.split()[0])
+        try:
+            parse_command(line, monkeypatch)
+        except (Exception, SystemExit) as error:
+            wrong.append(f"{by_name(path)}: {line}: {error}")
     assert wrong == []
     assert programs == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval"}
 

@@ -22,7 +22,7 @@ from tests.datasets import support
 from tests.datasets.loader import support as loader_support
 from tests.recording.support import run_record
 
-SEEDS = {"": range(100), "full": range(6000)}
+SEEDS = {"": range(60), "full": range(6000)}
 
 GRANT = ("name", "wanted", "granted", "detail", "remedy")
 READS: Mapping[str, Sequence[str]] = {

@@ -58,7 +58,7 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
 
 
 @given(
-    targets=arrays(np.float64, (12, N, 2), elements=st.sampled_from([-0.3, 0.0, 0.3]) | st.floats(-0.3, 0.3)),
+    targets=arrays(np.float64, (6, N, 2), elements=st.sampled_from([-0.3, 0.0, 0.3]) | st.floats(-0.3, 0.3)),
     ticks=st.integers(1, 60),
     jerk=arrays(np.float64, (2,), elements=st.floats(1e-4, 1e-2)),
     largest=arrays(np.float64, (2,), elements=st.floats(1e-3, 0.05)),

@@ -26,7 +26,7 @@ from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.policies.perception.rig import FEATURES, HEIGHT, IMAGE, SMALL, WIDTH, config, painted, states
 
-STEPS = 300
+STEPS = 150
 
 
 def batch(count: int = 16) -> dict[str, Tensor]:
@@ -49,13 +49,13 @@ def trained() -> PerceptionPolicy:
     torch.manual_seed(0)
     torch.set_num_threads(1)
     policy = PerceptionPolicy(config(channels=16, hidden=16, context=8))
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), 1e-2)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     values = states(500, max_objects=2)
     images, labels = painted(values), torch.from_numpy(values).float()
     policy.train()
     for step in range(STEPS):
-        rows = torch.arange(step * 16, step * 16 + 16) % 300
+        rows = torch.arange(step * 8, step * 8 + 8) % 300
         loss, _ = policy.forward({IMAGE: images[rows], OBS_ENV_STATE: labels[rows]})
         optimizer.zero_grad()
         loss.backward()

@@ -75,8 +75,8 @@ def test_it_learns_to_look_at_what_is_named() -> None:
     optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 90)
     task = {"min_objects": 2, "max_objects": 2}
-    samples = batch(10, **task)
-    other = batch(10, **task, swap=True)  # the same tables, and it is asked for the other object
+    samples = batch(5, **task)
+    other = batch(5, **task, swap=True)  # the same tables, and it is asked for the other object
     assert torch.equal(samples[IMAGE][:, 0].sum((2, 3)), other[IMAGE][:, 0].sum((2, 3)))
     both = {key: torch.cat([samples[key], other[key]]) for key in samples}
     policy.train()
@@ -91,13 +91,13 @@ def test_it_learns_to_look_at_what_is_named() -> None:
     for asked in (samples, other):
         cells, where = policy._cells(asked[IMAGE][:, 0])
         _, attention = policy._see(cells, asked[OBS_LANGUAGE_TOKENS])
-        cell = where[torch.arange(10), attention.argmax(1)]
+        cell = where[torch.arange(5), attention.argmax(1)]
         columns = policy.perception._pixels.shape[1]
         pixel = policy.perception._pixels[cell // columns, cell % columns]
-        table = asked[OBS_ENV_STATE][:, 0].reshape(10, 5, 16)
-        true = table[torch.arange(10), table[..., 1].argmax(1), 3:6].double().numpy()
+        table = asked[OBS_ENV_STATE][:, 0].reshape(5, 5, 16)
+        true = table[torch.arange(5), table[..., 1].argmax(1), 3:6].double().numpy()
         apart = np.linalg.norm(policy.config.projection.pixels(true) - pixel.numpy(), axis=-1)
-        assert np.mean(apart < 8) >= 0.9
+        assert np.all(apart < 8)
 
 
 def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytest.MonkeyPatch) -> None:
