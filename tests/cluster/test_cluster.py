@@ -416,13 +416,14 @@ def test_workers_that_no_machine_has_room_for_are_refused(cluster):
 
 
 @pytest.mark.usefixtures("driver")
-def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
+def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster, monkeypatch):
     got, printed, error = run_pool(cluster, [fakes.ECHO] * 6, num_workers=5)
     assert (got, error) == (list(range(6)), None)
     assert "ray.num_workers is 5, and the cluster has room for 2 of 1 CPU: 2 run at a time." in printed
     assert printed.count("1 CPUs and 0 GPUs") == 2  # the machines that have room, by name
     with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())) as pool:
         # No message about workers without a task, nor where no number was asked for.
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})  # whatever this machine has
         for config, tasks in ((RayConfig(num_workers=5), 2), (RayConfig(), 6)):
             pool._config = config
             assert describe_crowding(config, pool.workers_for(tasks)) == ""
