@@ -20,7 +20,9 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import DatasetError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.recording import record
 from bhd_lerobot.rollout.replay import Replay
+from tests.forks import Fork
 from tests.waiting import until
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "network_arm"
@@ -104,59 +106,68 @@ def network_arm(arms: Callable[[], Arm]) -> Arm:
 
 
 @pytest.fixture
-def installed(tmp_path: Path) -> dict[str, str]:
-    """Return the environment of a process that finds the example as if it were installed."""
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Let processes find the example as if it were installed; return where it is, for those that are forked."""
     about = tmp_path / "site" / "lerobot_robot_network_arm-0.1.0.dist-info" / "METADATA"
     about.parent.mkdir(parents=True)
     about.write_text("Metadata-Version: 2.1\nName: lerobot_robot_network_arm\nVersion: 0.1.0\n", encoding="utf-8")
-    return {**os.environ, "PYTHONPATH": f"{EXAMPLE}{os.pathsep}{tmp_path / 'site'}"}
+    folders = [str(EXAMPLE), str(tmp_path / "site")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+    return folders
+
+
+def start(program: Callable[..., Any], folders: list[str], arguments: list[str], output: Path) -> Fork:
+    """Run a command in a process that finds the example."""
+    return Fork(_find_and_run, program, folders, arguments, output=output)
+
+
+def _find_and_run(program: Callable[..., Any], folders: list[str], arguments: list[str]) -> Any:
+    sys.path[:0] = folders
+    return program(arguments)
+
+
+def record_with_lerobot(arguments: list[str]) -> None:
+    from lerobot.scripts.lerobot_record import main
+
+    sys.argv[1:] = arguments
+    main()
 
 
 def recording(arm: Arm, root: Path, *options: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "bhd_lerobot.recording.record"),
         "--robot.type=network_arm",
         *(f"--robot.address={arm.address}", *PATIENT, "--task.type=reach", "--brain.type=reach"),
         *("--dataset.repo_id=me/arm", f"--dataset.root={root}", f"--output_dir={root}-run", *options),
     ]
 
 
-def test_it_is_recorded(arms: Callable[[], Arm], installed: dict[str, str], tmp_path: Path) -> None:
+def test_it_is_recorded(arms: Callable[[], Arm], installed: list[str], tmp_path: Path) -> None:
     for number in itertools.count():
-        root = tmp_path / f"data_{number}"
-        done = subprocess.run(
-            recording(arms(), root, "--dataset.num_episodes=2"),
-            env=installed,
-            check=False,
-            capture_output=True,
-            text=True,
-        )
-        if done.returncode == 0:
+        root, output = tmp_path / f"data_{number}", tmp_path / f"output_{number}"
+        if start(record.main, installed, recording(arms(), root, "--dataset.num_episodes=2"), output).wait() == 0:
             break
-        assert re.search(STALLED, " ".join(done.stderr.split())), done.stderr
+        assert re.search(STALLED, " ".join(output.read_text().split())), output.read_text()
     assert check_dataset(root).is_valid
     with pytest.raises(DatasetError, match="not simulated, by the plant network_arm:NetworkPlant"):
         Replay(root, 0)
 
 
 def test_its_death_ends_the_episode_with_the_reason(
-    arms: Callable[[], Arm], installed: dict[str, str], tmp_path: Path
+    arms: Callable[[], Arm], installed: list[str], tmp_path: Path
 ) -> None:
     # The time is over before the tool has been at the target for so long: the next episode goes on until it is ended.
     longer = ("--task.hold_s=500", "--task.duration_s=600", "--task.start_spread_rad=0", "--dataset.num_episodes=2")
     for number in itertools.count():
         arm, root, name = arms(), tmp_path / f"data_{number}", f"dies_{number}"
-        process = subprocess.Popen(
-            [*recording(arm, root, *longer), f"--robot.id={name}"], env=installed, stderr=subprocess.PIPE, text=True
-        )
+        output = tmp_path / f"output_{number}"
+        process = start(record.main, installed, [*recording(arm, root, *longer), f"--robot.id={name}"], output)
         if _runs(process, name):
             break
-        said = process.communicate()[1]
-        assert re.search(STALLED, " ".join(said.split())), said
+        process.wait()
+        assert re.search(STALLED, " ".join(output.read_text().split())), output.read_text()
     arm.signal(signal.SIGKILL)
-    _, errors = process.communicate()
-    assert process.returncode == 4, errors
-    said = " ".join(errors.split())
+    assert process.wait() == 4, output.read_text()
+    said = " ".join(output.read_text().split())
     assert re.search(r"stopped by a fault: its newest reading is \d+\.\d\d s old", said), said
     assert check_dataset(root).is_valid
     info = dataset_info(root)
@@ -169,7 +180,7 @@ def test_its_death_ends_the_episode_with_the_reason(
     assert "address" not in info.recording["robot"]  # which is nobody else's business
 
 
-def _runs(process: "subprocess.Popen[str]", name: str) -> bool:
+def _runs(process: Fork, name: str) -> bool:
     """Wait until a recorder's first episode runs; return False if the recorder ended before."""
     block = until(lambda: _block(name) or process.poll() is not None, "its block is there, or it ended")
     if block is True:
@@ -189,10 +200,10 @@ def _block(name: str) -> Any:
         return None
 
 
-def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm, installed: dict[str, str]) -> None:
+@pytest.mark.usefixtures("installed")
+def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", ALONE, network_arm.address],
-        env=installed,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -232,22 +243,15 @@ def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm,
     assert process.wait() == 0
 
 
-def test_the_stock_recorder_drives_it(network_arm: Arm, installed: dict[str, str], tmp_path: Path) -> None:
-    options = [option for option in PATIENT if "most" not in option]
-    code = "import sys; from lerobot.scripts.lerobot_record import main; main()"
-    done = subprocess.run(
-        [
-            *(sys.executable, "-c", code),
-            *("--robot.type=network_arm", f"--robot.address={network_arm.address}", *options),
-            *("--teleop.type=bhd_brain", "--teleop.brain.type=noop", "--dataset.repo_id=me/arm", "--dataset.fps=25"),
-            *(f"--dataset.root={tmp_path / 'data'}", "--dataset.num_episodes=1", "--dataset.episode_time_s=2"),
-            *("--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--dataset.single_task=nothing"),
-            *("--play_sounds=false", "--dataset.video=false"),
-        ],
-        env=installed,
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+def test_the_stock_recorder_drives_it(network_arm: Arm, installed: list[str], tmp_path: Path) -> None:
+    arguments = [
+        *("--robot.type=network_arm", f"--robot.address={network_arm.address}"),
+        *(option for option in PATIENT if "most" not in option),
+        *("--teleop.type=bhd_brain", "--teleop.brain.type=noop", "--dataset.repo_id=me/arm", "--dataset.fps=25"),
+        *(f"--dataset.root={tmp_path / 'data'}", "--dataset.num_episodes=1", "--dataset.episode_time_s=2"),
+        *("--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--dataset.single_task=nothing"),
+        *("--play_sounds=false", "--dataset.video=false"),
+    ]
+    process = start(record_with_lerobot, installed, arguments, tmp_path / "output")
+    assert process.wait() == 0, (tmp_path / "output").read_text()[-2000:]
     assert dataset_info(tmp_path / "data").frames > 10

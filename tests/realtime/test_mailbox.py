@@ -59,7 +59,7 @@ def test_the_block_of_memory_has_the_stated_size() -> None:
 
 
 def test_between_two_processes_nothing_is_lost_reordered_or_torn(tmp_path: Path) -> None:
-    count, path = 3000, tmp_path / "block"
+    count, path = 1000, tmp_path / "block"
     mailbox = Mailbox(RECORD, CAPACITY, shared_block(path, Mailbox.nbytes(RECORD, CAPACITY)))
     process = start("post_numbers", path, count)
     for number in range(count):
