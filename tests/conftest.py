@@ -64,8 +64,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     quick.draw(item.get_closest_marker("figures") is not None)
 
 
-def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Freeze again what a test has thawed, or imported, before the tests of the next module."""
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Freeze again what a test has thawed before the tests of the next module."""
+    yield
     if nextitem is not None and nextitem.module is not item.module and gc.get_freeze_count() == 0:
         _freeze()
 

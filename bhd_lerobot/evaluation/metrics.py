@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.perception.assessment import assess
@@ -168,7 +167,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         details=dict(outcome.details),
         initial_state=_digest(episode.initial_state) if episode.initial_state.size else "",
         digest=_digest(*(columns[key] for key in _REPEATED if key in columns)),
-        perception=assess(episode.plan, episode.scene) if isinstance(episode.scene, TableScene) else {},
+        perception=assess(episode.plan, episode.scene),
         wall=_wall(episode),
     )
 

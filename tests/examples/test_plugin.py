@@ -41,7 +41,7 @@ replayed = replay.replay(
 assert replayed and all(one.identical for one in replayed)
 assert evaluate.main(
     [*chosen, "--brains.mine.type=wall_follower", "--brains.gaps.type=gap_follower", "--n_episodes=2", "--n_envs=2",
-     f"--output_dir={folder / 'eval'}"]
+     f"--output_dir={folder / 'eval'}", "--videos=0"]
 ) == 0
 for command in (["check"], ["info"], ["export", "--output", str(folder / "bag"), "--episodes=0"]):
     assert data.main([command[0], str(folder / "d"), *command[1:]]) == 0, command
