@@ -38,7 +38,7 @@ class PerceptionOptions:
     path: str = ""
     device: str = "cpu"
     max_error_m: float = 0.03
-    min_certainty: float = 0.2
+    min_certainty: float = 0.1
     threads: int = 1
 
     def __post_init__(self) -> None:
