@@ -18,7 +18,8 @@ from hypothesis import settings
 
 from tests import quick
 
-gc.disable()  # until everything is imported, or it is looked through again and again for what can go
+if "PYTEST_XDIST_WORKER" in os.environ:
+    gc.disable()  # until everything is imported, or it is looked through again and again for what can go
 pytest_plugins = ["tests.recorded_datasets"]
 
 _HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))

@@ -55,7 +55,7 @@ def see(run: Runner, section: Section) -> None:
     def others(seed: int) -> dict[str, Any]:
         train_perception(run, seed)
         inner = {"type": "language", "perception.path": _path(run, seed)}
-        return blanked(run, "see_eval/others", "ur5_pick", inner)
+        return blanked(run, "see_eval/others", "ur5_pick", inner, _FRESH)
 
     made = each(run, section, "see", SEEDS, learn)
     beside = each(run, section, "see_others", first_of(made), others)
@@ -172,7 +172,7 @@ def pixels(run: Runner, section: Section) -> None:
 
 
 def _asked(run: Runner, name: str, seed: int) -> Any:
-    """Ask for what is there, for what is not, and for what is there twice; return the counts."""
+    """Ask for what is there, for what is not, and for what is there several times; return the counts."""
     worlds, numbers = _ASKED[: run.size(len(_ASKED), 1)], run.path(f"{name}.json")
     command = ["python", "-m", "benchmarks.refusals", f"--path={_path(run, seed)}", "--worlds", *worlds]
     command += [f"--episodes={run.size(EPISODES, 30)}", *_FRESH, f"--json={numbers}"]
@@ -188,7 +188,7 @@ def _refusal_rows(name: str, asked: Mapping[str, Any]) -> list[Row]:
             count = counts[kind]
             if count["tables"]:
                 found = asdict(statistics.wilson(count["went"], count["tables"]))
-                what = f"{name}, {world} world, asked for what {words}: goes for something, in {count['tables']}"
+                what = f"{name}, {world} world, asked for what {words}: goes for something, in {count['tables']} tables"
                 rows.append(Row(what, rate(found, {})))
     return rows
 

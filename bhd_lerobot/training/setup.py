@@ -1,6 +1,7 @@
 """What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
@@ -25,6 +26,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMisma
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
 from bhd_lerobot.policies.mlp.processor_mlp import floored
+from bhd_lerobot.tasks.report import ReportConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 
 
@@ -132,6 +134,9 @@ def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, renam
             )
 
 
+_DIFFERS = "several values, in recordings that were merged"
+
+
 def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
     """Refuse a dataset whose task told something else than the truth, for a policy that learns to say what is true.
 
@@ -139,12 +144,14 @@ def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
         DatasetError: names the option that it was recorded with.
     """
     task: Any = PolicyContract.from_dataset(meta).task or {}
-    wrong = {f"report.{name}": value for name, value in (task.get("report") or {}).items()}
+    given = {}
+    if "report" in task:  # there was none in earlier versions
+        given = {f"report.{one.name}": task["report"].get(one.name, _DIFFERS) for one in fields(ReportConfig)}
     randomisation = task.get("randomisation") or {}
-    if randomisation.get("enabled"):
-        wrong["randomisation.camera_error_m"] = randomisation.get("camera_error_m")
-    for name, value in wrong.items():
-        if np.any(np.asarray(value, float)):
+    if randomisation.get("enabled", True):
+        given["randomisation.camera_error_m"] = randomisation.get("camera_error_m", 0.0)
+    for name, value in given.items():
+        if value is _DIFFERS or np.any(np.asarray(value, float)):
             raise DatasetError(
                 f"{meta.root} was recorded with task.{name} = {value}: what it says of the objects is not true, and a "
                 f"{policy.type!r} would learn to say that. Record it without."
@@ -274,7 +281,8 @@ def _build_processors(
     active: Any = config.policy
     if active.pretrained_path is None:
         return make_pre_post_processors(active, dataset_stats=meta.stats)
-    stats: Any = floored(meta.stats, active.min_std) if hasattr(active, "min_std") else meta.stats
+    is_ours = hasattr(policy, "use_statistics")
+    stats: Any = floored(meta.stats, active.min_std) if is_ours else meta.stats
     features = {**policy.config.input_features, **policy.config.output_features}
     norm_map = policy.config.normalization_mapping
     before: dict[str, dict[str, Any]] = {

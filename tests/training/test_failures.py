@@ -156,7 +156,10 @@ def test_fine_tuning_keeps_or_renews_the_statistics(
 def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(
     data: Path, tmp_path: Path
 ) -> None:
-    """What it says nothing about stays as it is observed: by `bhd-train` in all ways, and by LeRobot's own factory."""
+    """What it says nothing about stays as it is observed: by `bhd-train` in all ways.
+
+    LeRobot's programs do not tell the policy which statistics count: it learns where they are the same only.
+    """
     first = tmp_path / "first"
     run_train(options(data, first, {**MLP, "policy.residual": "['*.pos']"}, steps=1))
     other = make_dataset(tmp_path / "set", episodes=3, shift=5.0)
@@ -171,16 +174,14 @@ def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_s
     assert result.checkpoint is not None
     folders.append(result.checkpoint / "pretrained_model")
     made = [(one.policy, one.before, one.after) for one in map(load_policy, folders)]
-    # As `lerobot-train --policy.path` makes them.
-    meta = LeRobotDatasetMetadata("t/t", root=other)
     config = PreTrainedConfig.from_pretrained(folders[0])
     config.pretrained_path = folders[0]
-    stats = {"stats": meta.stats}
-    overrides = {"preprocessor_overrides": {"normalizer_processor": stats}}
-    overrides["postprocessor_overrides"] = {"unnormalizer_processor": stats}
-    made.append(
-        (make_policy(config, meta), *make_pre_post_processors(config, pretrained_path=str(folders[0]), **overrides))
-    )
+    before, after = make_pre_post_processors(config, pretrained_path=str(folders[0]))
+    made.append((make_policy(config, LeRobotDatasetMetadata("t/t", root=data)).train(), before, after))
+    unlike = make_policy(config, LeRobotDatasetMetadata("t/t", root=other))
+    with pytest.raises(ConfigError, match=r"this dataset has others. Fine-tune it by bhd-train"):
+        unlike.train()
+    made.append((unlike, before, after))  # as it was loaded
     generator = torch.Generator().manual_seed(0)
     state, goal = torch.randn(10, 4, generator=generator), torch.zeros(10, 2)
     for policy, before, after in made:

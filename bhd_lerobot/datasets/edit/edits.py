@@ -323,7 +323,7 @@ def _edited(state: DatasetState, edit: Mapping[str, Any]) -> dict[str, Any] | No
     return {**state.identity, "recording": {**recording, "edited": dict(edit)}}
 
 
-def _common(recordings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = False) -> dict[str, Any]:
     """Return what all recordings share; of a robot or a task of one type, the options that are the same."""
     shared: dict[str, Any] = {}
     for name, value in recordings[0].items():
@@ -331,8 +331,8 @@ def _common(recordings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if all(other == value for other in others):
             shared[name] = value
         elif isinstance(value, dict) and all(isinstance(other, dict) for other in others):
-            options = _common([value, *(other for other in others if isinstance(other, dict))])
-            if "type" in options:
+            options = _common([value, *(other for other in others if isinstance(other, dict))], of_one_type=True)
+            if of_one_type or "type" in options:
                 shared[name] = options
     return shared
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.policies.learned.inference import Rows
 
 _STATE, _ENVIRONMENT, _ACTION = "observation.state", "observation.environment_state", "action"
-_RESIZES = ("resize_shape", "resize_imgs_with_padding", "image_resolution")  # options of policies that scale images
+_FIXED = ("bhd_cnn", "bhd_pixels", "act", "diffusion")  # policies that do not scale images to a size of their own
 _log = logging.getLogger(__name__)
 
 
@@ -252,12 +252,11 @@ class LearnedBrain:
         return images
 
     def _own_shape(self, key: str) -> tuple[int, ...]:
-        """Return the shape of images that the policy itself says it takes, channels last; empty if it takes any."""
-        config = self.loaded.config
-        feature = (config.input_features or {}).get(key)
-        if feature is None or any(getattr(config, name, None) for name in _RESIZES):
+        """Return the shape of images that the policy itself says it takes, channels last; empty if it may take any."""
+        is_fixed = self.loaded.kind in _FIXED and not getattr(self.loaded.config, "resize_shape", None)
+        if not is_fixed:
             return ()
-        channels, *size = feature.shape
+        channels, *size = self.loaded.shapes[key]
         return (*size, channels)
 
     def _remember(self, rows: "Rows", running: NDArray[np.intp]) -> "Rows":

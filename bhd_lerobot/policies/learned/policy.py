@@ -39,6 +39,7 @@ class LoadedPolicy:
         after: what gives its actions their units back.
         inputs: keys of the observations that it takes, under the names that they have before `before`.
         cameras: camera names of those inputs that are images, by key.
+        shapes: of these images (channels, height, width), as the policy's configuration says; by key.
     """
 
     folder: Path
@@ -47,6 +48,7 @@ class LoadedPolicy:
     after: Any
     inputs: tuple[str, ...]
     cameras: dict[str, str]
+    shapes: dict[str, tuple[int, ...]]
 
     @property
     def config(self) -> Any:
@@ -192,18 +194,18 @@ def _set_action_steps(config: Any, steps: int) -> None:
     config.n_action_steps = steps
 
 
-def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the inputs under the robot's names, and which are cameras."""
+def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str], dict[str, tuple[int, ...]]]:
+    """Return the inputs under the robot's names, which are cameras, and the shapes of their images."""
     renamed: dict[str, str] = {}
     for step in before.steps:
         if isinstance(step, RenameObservationsProcessorStep):
             renamed |= {new: old for old, new in step.rename_map.items()}
-    inputs, cameras = [], {}
+    inputs, cameras, shapes = [], {}, {}
     for key, feature in (config.input_features or {}).items():
         own = renamed.get(key, key)
         inputs.append(own)
         if feature.type == FeatureType.VISUAL:
-            cameras[own] = camera_name(own)
+            cameras[own], shapes[own] = camera_name(own), tuple(feature.shape)
         elif own not in (OBS_STATE, OBS_ENV_STATE):
             raise ConfigError(
                 f"The policy reads {own!r}, which no robot here gives. There is {OBS_STATE}, {OBS_ENV_STATE} and "
@@ -213,7 +215,7 @@ def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str]]:
         raise ConfigError(
             f"The policy gives no {ACTION!r}; it gives {', '.join(config.output_features or {}) or 'nothing'}."
         )
-    return tuple(inputs), cameras
+    return tuple(inputs), cameras, shapes
 
 
 def torch_device(loaded: LoadedPolicy) -> torch.device:

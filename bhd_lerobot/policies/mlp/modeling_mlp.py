@@ -2,8 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -16,6 +15,7 @@ from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.objects_mlp import OBS_RELATIVE, relative_features, relative_size
 from bhd_lerobot.policies.mlp.residual_mlp import Residual
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
+from bhd_lerobot.policies.mlp.statistics_mlp import KeepsStatistics, Statistics
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW, harmonics
 
 ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
@@ -36,7 +36,7 @@ _HINTS = {
 }
 
 
-class MlpPolicy(PreTrainedPolicy):
+class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
     """The policy type ``bhd_mlp``.
 
     `features` turns a preprocessed batch into one vector a row, and `net`, a `torch.nn.Sequential` of linear layers and
@@ -86,19 +86,8 @@ class MlpPolicy(PreTrainedPolicy):
             self.log_std = nn.Parameter(torch.full(shape, float(config.initial_log_std)))
         self.reset()
 
-    @classmethod
-    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
-        """Return the policy of a checkpoint; arguments are LeRobot's.
-
-        With `dataset_stats`, which LeRobot gives for a training only, states and actions are normalised by these.
-        """
-        policy = super().from_pretrained(*args, **kwargs)
-        if kwargs.get("dataset_stats"):
-            policy.use_statistics(kwargs["dataset_stats"])
-        return policy
-
-    def use_statistics(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
-        """Take other statistics, which states and actions are normalised by from now on."""
+    def set_statistics(self, stats: Statistics) -> None:
+        """Set what actions begin at."""
         if self.residual is not None:
             self.residual.use_statistics(stats)
 

@@ -22,6 +22,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
 from bhd_lerobot.policies.mlp.objects_mlp import relative_features, relative_size
 from bhd_lerobot.policies.mlp.residual_mlp import Residual
+from bhd_lerobot.policies.mlp.statistics_mlp import KeepsStatistics, Statistics
 from bhd_lerobot.policies.mlp.yaw_mlp import yaw
 from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
@@ -41,7 +42,7 @@ _THUMBNAIL = 8  # every so many pixels of an image, by which it is known again, 
 _KEPT = 16_384  # images of which it is kept what is known of their cells, some 35 kB each
 
 
-class PixelsPolicy(PreTrainedPolicy):
+class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
     """The policy type ``bhd_pixels``.
 
     Args:
@@ -100,17 +101,11 @@ class PixelsPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> "PixelsPolicy":
-        """Return the policy of a checkpoint, with the checkpoint's own weights only; arguments are LeRobot's.
+        """Return the policy of a checkpoint, with the checkpoint's own weights only; arguments are LeRobot's."""
+        return super().from_pretrained(*args, **{**kwargs, "initialise": False})
 
-        With `dataset_stats`, which LeRobot gives for a training only, states and actions are normalised by these.
-        """
-        policy = super().from_pretrained(*args, **{**kwargs, "initialise": False})
-        if kwargs.get("dataset_stats"):
-            policy.use_statistics(kwargs["dataset_stats"])
-        return policy
-
-    def use_statistics(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
-        """Take other statistics, which states and actions are normalised by from now on."""
+    def set_statistics(self, stats: Statistics) -> None:
+        """Set what states are given their units back by, and what actions begin at."""
         mean, std = (torch.as_tensor(stats[OBS_STATE][name], dtype=torch.float32) for name in ("mean", "std"))
         self._state_mean.copy_(mean)
         self._state_std.copy_(std.clamp(min=self.config.min_std))

@@ -13,7 +13,7 @@ from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.arguments import parse_train
 
 ALGORITHM = "dagger"
-_OWN = frozenset(
+OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
         *("policy.push_to_hub", "selection.expert_action", "resume", "output_dir", "seed"),
@@ -188,7 +188,7 @@ def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:
         ConfigError: an option of the stage is one that a round sets itself.
     """
     # The curve compares with the expert that teaches, not with one that another option changed.
-    if taken := sorted(name for name in _names(stage) if name in _OWN or name.startswith("brains.expert.")):
+    if taken := sorted(name for name in _names(stage) if name in OWN or name.startswith("brains.expert.")):
         raise ConfigError(
             f"The option --{taken[0]} of {stage.config!r} is set by the rounds themselves; leave it out of its options."
         )

@@ -20,9 +20,10 @@ from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.recording import record
-from bhd_lerobot.rollout.configuration import encode, run
+from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
+    OWN,
     AggregationConfig,
     StageConfig,
     Stages,
@@ -135,14 +136,13 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
                 f"The rounds in {folder} were made with {name} = {before.get(name)}, and now it is {values[name]}. Go "
                 "on with the same, or set another --output_dir."
             )
-    files = {stage.config: _content(stage.config) for stage in config.stages}
-    if (folder / _FILES).exists():
-        for name, content in _content(folder / _FILES).items():
-            if name in files and files[name] != content:
-                raise ConfigError(
-                    f"{name} says something else than when the rounds in {folder} were made: "
-                    f"{', '.join(_differing(content, files[name]))}. Undo that, or set another --output_dir."
-                )
+    files = {stage.config: read_file(Path(stage.config).expanduser()) for stage in config.stages}
+    for name, content in (read_file(folder / _FILES) if (folder / _FILES).exists() else {}).items():
+        if differing := _differing(content, files.get(name, content)):
+            raise ConfigError(
+                f"{name} says something else than when the rounds in {folder} were made: {', '.join(differing)}. Undo "
+                "that, or set another --output_dir."
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, what in ((_CONFIG, values), (_FILES, files)):
@@ -151,12 +151,10 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
 
 
-def _content(path: str | Path) -> Any:
-    return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-
-
 def _differing(before: Any, now: Any, name: str = "") -> list[str]:
-    """Return what differs between two configurations, each with both values."""
+    """Return what differs between two configurations and is not set by the rounds, each with both values."""
+    if name in OWN:
+        return []
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return [] if before == now else [f"{name} was {before}, and is {now}"]
     keys = dict.fromkeys([*before, *now])

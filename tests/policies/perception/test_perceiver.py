@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import evaluate
@@ -182,6 +183,9 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
         run_record(told, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, **wrong)
         with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn to say that"):
             train(told, tmp_path / "run")
+    merge([looks, tmp_path / "report.noise_m"], tmp_path / "merged")
+    with pytest.raises(DatasetError, match=r"recorded with task\.report\.noise_m = several values"):
+        train(tmp_path / "merged", tmp_path / "run")
 
 
 def test_without_held_out_episodes_the_checkpoint_refuses_to_see(looks: Path, tmp_path: Path) -> None:
