@@ -8,7 +8,6 @@ not show a brain that takes anything.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from benchmarks._turns import write
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, TableScene
 from bhd_lerobot.control.commands import Goals
 from bhd_lerobot.envs.stage import Stage
+from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
@@ -91,13 +91,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--json", type=Path, help="file for the numbers")
     options = parser.parse_args(arguments)
-    perception = PerceptionOptions(options.path)
-    if options.min_certainty is not None:
-        perception = PerceptionOptions(options.path, min_certainty=options.min_certainty)
+    certainty = {} if options.min_certainty is None else {"min_certainty": options.min_certainty}
     seeds = [episode_seed(options.seed, episode, options.split) for episode in range(options.episodes)]
     found = {}
     for world in options.worlds:
-        found[world] = ask(perception, world, seeds)
+        try:
+            found[world] = ask(PerceptionOptions(options.path, **certainty), world, seeds)
+        except BhdError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
         for kind, count in found[world].items():
             if not count["tables"]:
                 continue
@@ -108,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f"{world}, asked for what is {kind}: {words} {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of "
                 f"{count['tables']}"
             )
-    write(options.json, json.loads(json.dumps(found)))
+    write(options.json, found)
     return 0
 
 
