@@ -151,6 +151,8 @@ def rendering(frames: int, turns: int) -> dict[str, Any]:
 def main() -> int:
     """Print the table; return 1 if a goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
+    policies = list(RECORDINGS)
+    parser.add_argument("--policies", nargs="+", choices=policies, default=policies, help="which of them learn")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--steps", type=int, default=500, help="of the longer training; the shorter has a fifth")
     parser.add_argument("--turns", type=int, default=3)
@@ -164,7 +166,7 @@ def main() -> int:
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
     results["training"] = {}
     try:
-        for policy in RECORDINGS:
+        for policy in options.policies:
             found = training(folder, policy, options.episodes, options.steps, options.turns)
             results["training"][policy] = found
             for what, label, goal in (

@@ -20,7 +20,7 @@ from benchmarks.results.trainings import SEEDS, each, first_of
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, ROUNDS = 500, 2
-_SHORT, _STEPS = (24, 12, 8), 400
+_SHORT, _STEPS = (20, 10, 6), 400
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
 _RULE, _TEACHER = "avoidance", "gap_follower"
 _BLANKED = 100  # episodes of the driver that is blind
@@ -101,7 +101,7 @@ def _evaluate(
 ) -> dict[str, Any]:
     output = f"camera_drive_eval/{name}"
     command = ["bhd-eval", "--config_path=configs/eval/turtlebot3_avoid_camera.yaml", *brain]
-    command += [f"--only=[{','.join(names)}]", "--videos=0", f"--n_episodes={run.size(episodes, 8)}"]
+    command += [f"--only=[{','.join(names)}]", "--videos=0", f"--n_episodes={run.size(episodes, 6)}"]
     command += [f"--output_dir={run.path(output)}", *(SHORTER if run.is_short else ())]
     run.run(output, command, makes=(output,))
     return summary(run.read(output, "results.json"), *names)

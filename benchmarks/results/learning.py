@@ -26,8 +26,8 @@ _FEW_REACH = (
 _FEW = ("--steps=800", "--eval_steps=800")
 # Too few to learn anything by: they show that the commands work.
 FEW_PPO = (
-    *("--steps=20000", "--critic_warmup=8192", "--env.n_envs=32"),
-    *("--validation.freq=10000", "--validation.n_episodes=8"),
+    *("--steps=16000", "--critic_warmup=8192", "--env.n_envs=32"),
+    *("--validation.freq=8000", "--validation.n_episodes=8"),
 )
 SHORTER = ("--task.duration_s=30",)  # episodes of a short run
 _AVOID_TRAIN_S, _PPO_TRAIN_S = 120, 1200

@@ -27,7 +27,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
 _AS_IT_IS, _OTHER_SENTENCES = 0, 3  # of these
 _WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
-_FEW = ("--steps=600", "--eval_steps=600")
+_FEW = ("--steps=500", "--eval_steps=500")
 _OTHERS = ("act", "diffusion")
 SENSES = {"deaf": "instruction", "blind": "images"}
 # What the perception was trained with was chosen on the held-out episodes of seed 0; these nobody had looked at before.
@@ -113,7 +113,7 @@ def pixels(run: Runner, section: Section) -> None:
     def end_to_end(seed: int) -> tuple[str, float]:
         seeing, policy = train_perception(run, seed), f"pixels/seed_{seed}"
         options = (f"--seed={seed}", f"--policy.perception={run.path(perception_folder(seed))}")
-        name, short = f"pixels_train_{seed}", ("--steps=800", "--eval_steps=800")
+        name, short = f"pixels_train_{seed}", ("--steps=600", "--eval_steps=600")
         seconds = train(run, name, "pixels_ur5_pick", policy, "pixels/all", options=options, short=short)
         return policy, recorded + seeing + seconds
 
@@ -140,7 +140,7 @@ def pixels(run: Runner, section: Section) -> None:
             brains += _without(f"blind_{name}", "images", inner)
         names, options = (*_OTHERS, *(f"blind_{name}" for name in _OTHERS)), (_ANY, *small)
         output = "pixels_eval/others"
-        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE)
+        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
         return summary(results, *names)
 
     made = each(run, section, "pixels", SEEDS, learn)
@@ -261,9 +261,10 @@ def _evaluate(
     *,
     names: Sequence[str],
     episodes: int = EPISODES,
+    few: int = 10,
 ) -> Any:
     command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
-    command += [f"--only=[{','.join(names)}]", f"--n_episodes={run.size(episodes, 12)}", "--videos=0"]
+    command += [f"--only=[{','.join(names)}]", f"--n_episodes={run.size(episodes, few)}", "--videos=0"]
     run.run(output, [*command, f"--output_dir={run.path(output)}"], makes=(output,))
     return run.read(output, "results.json")
 

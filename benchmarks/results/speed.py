@@ -36,7 +36,9 @@ def speed(run: Runner, section: Section) -> None:
     """Loader, environments and evaluation, each beside its peers in one run."""
     for measure in (
         benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-epoch")),
-        benchmark("images", images_rows, short=("--episodes=4", "--steps=20", "--turns=1")),
+        benchmark(
+            "images", images_rows, short=("--policies=bhd_perception", "--episodes=4", "--steps=20", "--turns=1")
+        ),
         benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=2")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
         benchmark("evaluate", evaluate_rows, short=("--episodes=4", "--n_envs=4", "--turns=1")),
