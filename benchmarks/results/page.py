@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.results.provenance import provenance
+from benchmarks.results.runner import REPOSITORY
 from benchmarks.results.section import Section
 from bhd_lerobot.datasets.storage.disk import Disk
 
@@ -32,7 +33,8 @@ def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *
     texts = {} if not path.exists() else _kept(path.read_text(encoding="utf-8"))
     for section in sections:
         first, *rest = section.markdown()
-        made = max((one.made for one in section.commands if one.made), default=provenance())  # begins with the date
+        # It begins with the date.
+        made = max((one.made for one in section.commands if one.made), default=provenance(REPOSITORY))
         texts[section.title] = "\n".join([first, "", f"Made {made}.", *rest])
     lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
     lines += ["\n" + texts[title].strip() for title in titles if title in texts]

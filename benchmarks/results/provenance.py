@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Iterable
 from datetime import datetime
 from importlib.metadata import version
@@ -13,13 +14,19 @@ from pathlib import Path
 import torch
 import yaml
 
+# What the numbers depend on, beside the packages. No configuration tells that a default in the code has changed.
+_SOURCES = ("bhd_lerobot", "benchmarks", "configs")
 _PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
 
 
-def provenance() -> str:
-    """Return the date, the machine and the versions, as they follow on "made"."""
+def provenance(root: Path) -> str:
+    """Return the date, the machine and the versions, as they follow on "made".
+
+    Args:
+        root: folder of the repository, whose commit is named; it is left out where git does not know one.
+    """
     versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
-    return f"on {datetime.now():%Y-%m-%d}, on {_machine()}, with {versions}"
+    return f"on {datetime.now():%Y-%m-%d}, on {_machine()}, with {_commit(root)}{versions}"
 
 
 def digests(commands: Iterable[str], root: Path) -> dict[str, str]:
@@ -39,6 +46,18 @@ def digests(commands: Iterable[str], root: Path) -> dict[str, str]:
                 found[path] = hashlib.sha256(text.encode()).hexdigest()
                 texts.append(text)
     return found
+
+
+def _commit(root: Path) -> str:
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        is_changed = git("status", "--porcelain", "--", *_SOURCES)
+        return f"commit {git('rev-parse', '--short=10', 'HEAD')}{' and changes' if is_changed else ''}, "
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def _machine() -> str:

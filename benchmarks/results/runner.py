@@ -142,7 +142,7 @@ class Runner:
                 shutil.rmtree(left)
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
-        started, configs, made_by = time.perf_counter(), digests([command], REPOSITORY), provenance()
+        started, configs, made_by = time.perf_counter(), digests([command], REPOSITORY), provenance(REPOSITORY)
         with log.open("w", encoding="utf-8") as file:
             process = subprocess.Popen(
                 _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=self._held

@@ -28,7 +28,7 @@ from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
-from benchmarks.results.provenance import digests
+from benchmarks.results.provenance import digests, provenance
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
 from benchmarks.results.section import Row, Section, mean, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
@@ -196,6 +196,29 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
         "with the collision monitor, ppo_7",
     ]
     assert rows[3].value == str(failures)
+
+
+def test_what_was_measured_names_the_commit_that_it_was_measured_with(tmp_path: Path) -> None:
+    assert "commit" not in provenance(tmp_path)  # a folder that git knows nothing of
+
+    def git(*arguments: str) -> str:
+        name = ("-c", "user.name=one", "-c", "user.email=one@example.org")
+        command = ["git", "-C", str(tmp_path), *name, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    git("init", "--quiet")
+    assert "commit" not in provenance(tmp_path)  # nothing was committed yet
+    (tmp_path / "bhd_lerobot").mkdir()
+    source = tmp_path / "bhd_lerobot" / "brain.py"
+    source.write_text("A = 1\n", encoding="utf-8")
+    git("add", "--all")
+    git("commit", "--quiet", "--message=first")
+    (tmp_path / "README.md").write_text("No number depends on it.", encoding="utf-8")
+    first = re.search(r", with commit ([0-9a-f]+), lerobot_robot_bhd ", provenance(tmp_path))
+    assert first is not None
+    assert git("rev-parse", "HEAD").startswith(first[1])
+    source.write_text("A = 2\n", encoding="utf-8")
+    assert f"commit {first[1]} and changes, " in provenance(tmp_path)
 
 
 # --- sections ---------------------------------------------------------------------------------------------------------
