@@ -130,7 +130,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=3.0, help="length of one measurement [s]")
-    parser.add_argument("--epoch", action=argparse.BooleanOptionalAction, default=True, help="time a whole epoch, too")
+    parser.add_argument("--start", action=argparse.BooleanOptionalAction, default=True, help="time starts, too")
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
@@ -169,7 +169,7 @@ def main() -> int:
                 lambda root=root, fps=fps: Ours(root, fps),
                 *(lambda root=root, fps=fps, workers=workers: LeRobots(root, fps, workers) for workers in WORKERS),
             ]
-            for what, batches in (("first batch", 1), ("first epoch", None))[: 2 if options.epoch else 1]:
+            for what, batches in (("first batch", 1), ("first epoch", None)) if options.start else ():
                 rows = [[timed(start, batches) for start in starts] for _ in range(1 if batches is None else 3)]
                 medians = [statistics.median(column) for column in zip(*rows, strict=True)]
                 ratio = statistics.median(min(theirs) / mine for mine, *theirs in rows)

@@ -29,7 +29,7 @@ Measure = Callable[[Runner, Section], None]
 
 # Name, title, and what runs the commands and fills the section; in groups of which one section uses what another made.
 GROUPS: tuple[tuple[tuple[str, str, Measure], ...], ...] = (
-    (("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),),
+    (("avoid", "Avoid: a TurtleBot3 roams without touching anything, cloned from the simple rule", avoid),),
     (
         ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
         ("monitored", "Avoid, by aggregation and then PPO, with the collision monitor", monitored),

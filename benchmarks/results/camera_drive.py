@@ -20,7 +20,7 @@ from benchmarks.results.trainings import SEEDS, each, first_of
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, ROUNDS = 500, 2
-_SHORT, _STEPS = (20, 10, 6), 400
+_SHORT, _STEPS = (20, 10, 6), 300
 _SUCCESS_GOAL, _TIME_GOAL_S = 0.9, 7200
 _RULE, _TEACHER = "avoidance", "gap_follower"
 _BLANKED = 100  # episodes of the driver that is blind

@@ -11,11 +11,11 @@ import yaml
 from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds, rate
 from benchmarks.results.trainings import SEEDS, each
-from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
+from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
-_RULE, _TEACHER = "avoidance", "gap_follower"
+_RULE = "avoidance"
 _REACH_EPISODES, _FEW_EPISODES = (250, 750, 1500), (60, 240)
 # A short run learns less exactly, and is asked for less.
 _COARSE = ("--task.tolerance_m=0.02", "--task.tolerance_deg=10")
@@ -24,121 +24,69 @@ _FEW_REACH = (
     *("--policy.hidden_dims=[256,256,256]", "--policy.optimizer_lr=2e-3"),
 )
 _FEW = ("--steps=800", "--eval_steps=800")
-# Too few to learn anything by: they show that the commands work.
-FEW_PPO = (
-    *("--steps=16000", "--critic_warmup=8192", "--env.n_envs=32"),
-    *("--validation.freq=8000", "--validation.n_episodes=8"),
-)
 SHORTER = ("--task.duration_s=30",)  # episodes of a short run
-_AVOID_TRAIN_S, _PPO_TRAIN_S = 120, 1200
+_AVOID_TRAIN_S = 120
 _HELPED = "dagger"
-_REACH_GOAL, _PPO_GOAL = 0.97, 1.2
+_REACH_GOAL = 0.97
 
 
 def avoid(run: Runner, section: Section) -> None:
-    """Cloning rules, and reinforcement learning, on the avoid task."""
+    """Clone the simple rule of the avoid task."""
     shorter = SHORTER if run.is_short else ()
     options = ("--seed=100", *shorter)
-    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 20), options=options)
-    gap = ("--seed=100", f"--brain.type={_TEACHER}", *roaming(run))
-    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=run.size(400, 40), options=gap)
+    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=run.size(200, 60), options=options)
 
     def learn(seed: int) -> dict[str, Any]:
-        names = {name: f"{name}_{seed}" for name in ("bc", "gap_bc", "ppo")}
-        own, folder, seconds = (f"--seed={seed}",), f"avoid/seed_{seed}", {}
-        for name, data in (("bc", "avoid/data"), ("gap_bc", "avoid/gap_data")):
-            seconds[name] = train(
-                run, f"avoid_{names[name]}", "bc_turtlebot3_avoid", f"{folder}/{name}", data, options=own, short=_FEW
-            )
-        warmup = () if run.is_short else ("--critic_warmup=65536",)
-        start = (
-            *(f"--start_from={run.path(folder, 'gap_bc')}", "--see_ignored=true"),
-            *(*warmup, "--ppo.log_std_init=-1.0", *own),
+        policy, own, name = f"avoid/seed_{seed}", (f"--seed={seed}",), f"seed_{seed}"
+        seconds = train(
+            run, f"avoid_train_{seed}", "bc_turtlebot3_avoid", policy, "avoid/data", options=own, short=_FEW
         )
-        seconds["ppo"] = train(
-            run, f"avoid_{names['ppo']}", "ppo_turtlebot3", f"{folder}/ppo", options=start, short=FEW_PPO
+        results = evaluate(
+            run,
+            f"avoid_eval/{name}",
+            "turtlebot3_avoid",
+            {name: policy},
+            rules=(_RULE,),
+            baseline=_RULE,
+            options=shorter,
         )
-        brains = {"gap_bc": f"{folder}/gap_bc", "ppo": f"{folder}/ppo/checkpoints/best"}
-        found: dict[str, Any] = {}
-        # The task reports more to the second ones; the episodes are the same.
-        for part, learned, rule, more in (
-            ("bc", {"bc": f"{folder}/bc"}, _RULE, shorter),
-            ("trail", brains, _TEACHER, roaming(run)),
-        ):
-            results = evaluate(
-                run,
-                f"avoid_eval/seed_{seed}/{part}",
-                "turtlebot3_avoid",
-                learned,
-                rules=(rule,),
-                baseline=rule,
-                options=more,
-            )
-            found |= summary(results, rule, *learned)["brains"]
-        return {"brains": found, "seconds": seconds}
+        return {**summary(results, _RULE, name), "seconds": seconds}
 
     made = each(run, section, "avoid", SEEDS, learn)
     first, *_ = made.values()
-    for name in (_TEACHER, _RULE):
-        section.rows += [success_row(first, name), _score_row(first, name, name)]
+    section.rows += [success_row(first, _RULE), _score_row(first, _RULE)]
     for seed, results in made.items():
-        section.rows += _driving_rows(results, seed)
-    for name in ("bc", "gap_bc", "ppo"):
-        section.rows += seeds_rows(made, f"{name}, all seeds", name)
-    section.remarks.append(
-        "Each seed N is one of the training. `bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule "
-        "remembers where it has been; a network does not, so the task reports to `gap_bc` and `ppo`, which starts "
-        "from it, what ground around them they have visited (`task.trail`, privileged: from the robot's true pose)."
-    )
+        section.rows += _driving_rows(results, f"seed_{seed}")
+    section.rows += seeds_rows(made)
+    section.remarks.append("Each seed is one of training, on the same episodes of `avoidance`.")
 
 
-def _driving_rows(results: Any, seed: int) -> list[Row]:
-    """Return the rows of a seed of the section `avoid`."""
-    rows, seconds = [], results["seconds"]
-    for name in ("bc", "gap_bc", "ppo"):
-        row = success_row(results, name)
-        rows += [
-            replace(row, what=row.what.replace(name, f"{name}_{seed}", 1)),
-            _score_row(results, name, f"{name}_{seed}"),
-        ]
-    teacher, rule, bc, ppo = (scores(results, name) for name in (_TEACHER, _RULE, "bc", "ppo"))
-    lost = {name: int(brain["episodes"] - brain["successes"]) for name, brain in results["brains"].items()}
-    difference, more = mean_difference(bc, rule), lost["bc"] - lost[_RULE]
-    ratio, over = ratio_of_means(ppo, teacher), ratio_of_means(ppo, rule)
+def _driving_rows(results: Any, name: str) -> list[Row]:
+    """Return the rows of a training seed of the section `avoid`."""
+    lost = {one: int(brain["episodes"] - brain["successes"]) for one, brain in results["brains"].items()}
+    difference, more = mean_difference(scores(results, name), scores(results, _RULE)), lost[name] - lost[_RULE]
+    seconds = results["seconds"]
     return [
-        *rows,
+        success_row(results, name),
+        _score_row(results, name),
         Row(
-            f"bc_{seed}: time of training",
-            f"{seconds['bc']:.0f} s",
+            f"{name}: time of training",
+            f"{seconds:.0f} s",
             f"at most {_AVOID_TRAIN_S} s",
-            seconds["bc"] <= _AVOID_TRAIN_S,
+            seconds <= _AVOID_TRAIN_S,
         ),
         Row(
-            f"bc_{seed} - avoidance, its teacher: mean score, paired",
+            f"{name} - avoidance, its teacher: mean score, paired",
             mean(asdict(difference), "+"),
             "not below 0 for certain",
             math.isnan(difference.high) or difference.high >= 0,
         ),
-        Row(f"bc_{seed}: failures beyond its teacher's", str(more), "at most 0", more <= 0),
-        Row(
-            f"ppo_{seed}: time of training",
-            f"{seconds['ppo']:.0f} s",
-            f"at most {_PPO_TRAIN_S} s",
-            seconds["ppo"] <= _PPO_TRAIN_S,
-        ),
-        Row(f"ppo_{seed}: failures", str(lost["ppo"]), f"at most {lost[_TEACHER]}", lost["ppo"] <= lost[_TEACHER]),
-        Row(
-            f"ppo_{seed} / {_TEACHER}: mean score, paired",
-            mean(asdict(ratio)),
-            f"at least {_PPO_GOAL}, its interval above 1",
-            ratio.value >= _PPO_GOAL and ratio.low > 1,
-        ),
-        Row(f"ppo_{seed} / avoidance, the simple rule: mean score, paired", mean(asdict(over))),
+        Row(f"{name}: failures beyond its teacher's", str(more), "at most 0", more <= 0),
     ]
 
 
-def _score_row(results: Any, name: str, shown: str) -> Row:
-    return Row(f"{shown}: mean score", mean(results["brains"][name]["means"]["score"]))
+def _score_row(results: Any, name: str) -> Row:
+    return Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"]))
 
 
 def reach(run: Runner, section: Section) -> None:
@@ -334,7 +282,7 @@ def evaluate(
     episodes: int = EPISODES,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = run.size(episodes, 16)
+    episodes = run.size(episodes, 12)
     learned = [
         option
         for label, folder in brains.items()

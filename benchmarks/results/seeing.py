@@ -101,7 +101,7 @@ def pixels(run: Runner, section: Section) -> None:
     # Of most only the first frame: what is meant is learned from many tables, and picking from fewer.
     parts = {
         "picks": (run.size(800, 60), ("--seed=21",)),
-        "firsts": (run.size(6_000, 400), ("--seed=500", "--task.duration_s=0.1")),
+        "firsts": (run.size(6_000, 300), ("--seed=500", "--task.duration_s=0.1")),
     }
     for name, (episodes, options) in parts.items():
         data = f"pixels/{name}"
@@ -113,7 +113,7 @@ def pixels(run: Runner, section: Section) -> None:
     def end_to_end(seed: int) -> tuple[str, float]:
         seeing, policy = train_perception(run, seed), f"pixels/seed_{seed}"
         options = (f"--seed={seed}", f"--policy.perception={run.path(perception_folder(seed))}")
-        name, short = f"pixels_train_{seed}", ("--steps=600", "--eval_steps=600")
+        name, short = f"pixels_train_{seed}", ("--steps=800", "--eval_steps=800")
         seconds = train(run, name, "pixels_ur5_pick", policy, "pixels/all", options=options, short=short)
         return policy, recorded + seeing + seconds
 
@@ -140,7 +140,7 @@ def pixels(run: Runner, section: Section) -> None:
             brains += _without(f"blind_{name}", "images", inner)
         names, options = (*_OTHERS, *(f"blind_{name}" for name in _OTHERS)), (_ANY, *small)
         output = "pixels_eval/others"
-        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
+        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=2)
         return summary(results, *names)
 
     made = each(run, section, "pixels", SEEDS, learn)

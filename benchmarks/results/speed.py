@@ -35,7 +35,7 @@ def benchmark(
 def speed(run: Runner, section: Section) -> None:
     """Loader, environments and evaluation, each beside its peers in one run."""
     for measure in (
-        benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-epoch")),
+        benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-start")),
         benchmark(
             "images", images_rows, short=("--policies=bhd_perception", "--episodes=4", "--steps=20", "--turns=1")
         ),

@@ -176,9 +176,14 @@ def test_outcomes_are_in_the_order_of_the_episodes() -> None:
 
 @each_case(
     ("failures", "score", "met"),
-    [(5, 0.2, [True, True, True]), (6, 0.19, [False, False, True]), (0, 0.18, [True, False, False])],
+    [
+        (5, 0.2, [True, True, True, False]),
+        (6, 0.19, [False, False, True, False]),
+        (0, 0.18, [True, False, False, False]),
+        (0, 0.24, [True, True, True, True]),
+    ],
 )
-def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
+def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_both_rules(
     failures: int, score: float, met: list[bool]
 ) -> None:
     def results(scores: dict[str, float], failed: int = 0) -> dict[str, Any]:
@@ -188,7 +193,8 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
         return {"brains": {name: {**brain, "scores": values} for name, values in around.items()}}
 
     alone = results({"avoidance": 0.126, "clone": 0.2})
-    rows = monitored_rows(alone, results({"clone": 0.15, "ppo": score}, failures), 7)
+    behind, teacher = results({"clone": 0.15, "ppo": score}, failures), results({"gap_follower": 0.2})
+    rows = monitored_rows(alone, behind, teacher, 7)
     assert [row.met for row in rows] == [None, None, None, *met]
     assert [row.what.partition(":")[0] for row in rows[:3]] == [
         "clone_7",
