@@ -56,17 +56,13 @@ class Section:
         lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in (*self.rows, *spent)]
         for remark in self.remarks:
             lines += ["", remark]
-        lines += [
-            "",
-            "```bash",
-            *(
-                f"{command.command}   # {command.seconds:.0f} s, {command.cpu_seconds:.0f} s of processor time"
-                for command in self.commands
-            ),
-            "```",
-            "",
+        once: dict[str, Ran] = {}  # a training, and what is shown beside it, may have commands in common
+        for one in self.commands:
+            once.setdefault(one.command, one)
+        commands = [
+            f"{one.command}   # {one.seconds:.0f} s, {one.cpu_seconds:.0f} s of processor time" for one in once.values()
         ]
-        return lines
+        return [*lines, "", "```bash", *commands, "```", ""]
 
 
 def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> str:

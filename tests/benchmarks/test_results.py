@@ -562,7 +562,8 @@ def test_a_run_that_is_stopped_begins_nothing_else_and_says_how_to_go_on(
 
 def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> None:
     section = Section("speed", "Speed", [Row("a", "1 x"), Row("b", "2 x", "at least 3 x", met=False)], ["A remark."])
-    section.commands = [Runner(tmp_path, is_short=True).run("note", ["python", "-c", "pass"])]
+    ran = Runner(tmp_path, is_short=True).run("note", ["python", "-c", "pass"])
+    section.commands = [ran, replace(ran, command="bhd-train"), ran]
     page = tmp_path / "results.md"
     write_page(page, [section], ["Speed"], is_short=True)
     text = page.read_text(encoding="utf-8")
@@ -570,7 +571,7 @@ def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> N
     assert "| a | 1 x |  |  |" in text
     assert "| b | 2 x | at least 3 x | **missed** |" in text
     assert "A remark." in text
-    assert "python -c pass   # " in text
+    assert re.findall(r"^(.*)   # ", text, re.MULTILINE) == ["python -c pass", "bhd-train"]
     assert "not to be quoted" in text
     write_page(page, [section], ["Speed"], is_short=False)
     assert "not to be quoted" not in page.read_text(encoding="utf-8")
