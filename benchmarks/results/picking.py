@@ -20,7 +20,7 @@ EPISODES, ROUNDS = 500, 3
 _GOAL = 0.97
 _ANY_ORDER = "--task.order=random"
 _OTHERS = ("pick", "servo", "clone")
-_SHORT, _STEPS = (100, 50, 8), 2000
+_SHORT, _STEPS = (100, 50, 8), 3000
 
 
 def pick(run: Runner, section: Section) -> None:
