@@ -35,6 +35,7 @@ class Section:
         rows: the numbers.
         remarks: sentences under the table.
         commands: what was run for it.
+        made_before: training seeds that are from earlier runs, by when, where and with what they were made, in words.
         processor_s: of all that was recorded and trained for each training seed, how much processor time it took [s].
     """
 
@@ -43,6 +44,7 @@ class Section:
     rows: list[Row] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     commands: list[Ran] = field(default_factory=list)
+    made_before: dict[str, set[int]] = field(default_factory=dict)
     processor_s: dict[int, float] = field(default_factory=dict)
 
     def markdown(self) -> list[str]:
@@ -54,6 +56,10 @@ class Section:
             for seed, seconds in sorted(self.processor_s.items())
         ]
         lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in (*self.rows, *spent)]
+        for made, seeds in self.made_before.items():
+            *others, last = sorted(seeds)
+            which = f"Seeds {', '.join(map(str, others))} and {last} were" if others else f"Seed {last} was"
+            lines += ["", f"{which} made {made}."]
         for remark in self.remarks:
             lines += ["", remark]
         once: dict[str, Ran] = {}  # a training, and what is shown beside it, may have commands in common

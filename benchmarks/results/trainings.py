@@ -78,7 +78,7 @@ def each(
             run.kept.mkdir(parents=True, exist_ok=True)
             text = json.dumps(asdict(trainings[seed])) + "\n"
             Disk().publish(run.kept / f"{name}_{seed}.json", text.encode())
-    for seed in () if run.is_short else set(seeds).difference(asked):
+    for seed in () if run.is_short else sorted(set(seeds).difference(asked)):
         kept = _read(run.kept / f"{name}_{seed}.json")
         if kept is None:
             continue
@@ -87,8 +87,7 @@ def each(
             print(f"-- {name}: seed {seed} was made by another recipe and is left out; make it with --seeds {seed}")
             continue
         trainings[seed] = kept
-        remark = f"Seed {seed} was made {kept.made}."
-        section.remarks += () if remark in section.remarks else (remark,)
+        section.made_before.setdefault(kept.made, set()).add(seed)
     order = sorted(trainings)
     if name == section.name:
         shared = run.commands[:before]

@@ -153,7 +153,8 @@ def test_a_share_of_nothing_is_not_defined() -> None:
 def test_processor_time_counts_recordings_and_trainings_once_and_no_evaluation() -> None:
     record, train = Ran("bhd-record x", 20.0, 0, 10.0), Ran("bhd-train y", 20.0, 0, 5.0)
     assert trainings._making([record, train, Ran("bhd-eval z", 20.0, 0, 100.0), record]) == 15.0
-    section = Section("see", "See", processor_s={1: 15.0, 0: 7.0})
+    section = Section("see", "See", made_before={"here": {2, 0, 1}}, processor_s={1: 15.0, 0: 7.0})
+    assert "Seeds 0, 1 and 2 were made here." in section.markdown()
     shown = [line for line in section.markdown() if "processor time of all" in line]
     assert [line.split("|")[2].strip() for line in shown] == ["7 s", "15 s"]
 
@@ -337,13 +338,13 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
 
     made, section, run = sitting(1)
     assert made == {1: {"rate": 0.1, "series": [1.5, None]}}
-    assert section.remarks == []
+    assert section.made_before == {}
     made, section, run = sitting(0, 12)
     assert list(made) == [0, 1, 12]
     assert made[1] == {"rate": 0.1, "series": [1.5, None]}
     assert [re.findall(r"seed=(\d+)", one.command) for one in run.commands] == [["0"], ["1"], ["12"]]
-    assert len(section.remarks) == 1
-    assert section.remarks[0].startswith("Seed 1 was made on ")
+    assert list(section.made_before.values()) == [{1}]
+    assert sum(line.startswith("Seed 1 was made on ") for line in section.markdown()) == 1
     # What is short, or was made in another way, is not mixed with what was made before.
     assert list(sitting(0, 1, 12, short=True)[0]) == [0]
     assert list(sitting(1, option="--steps=2")[0]) == [1]
