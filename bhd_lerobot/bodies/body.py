@@ -4,12 +4,17 @@ Nothing here computes and nothing here knows a physics engine. Every other room 
 it from a `Body`, so that a simulated and a real robot are limited by the same figures.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from bhd_lerobot.errors import ConfigError
 
 _NO_JERK_LIMIT = 1e12
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Rates:
 
     def __post_init__(self) -> None:
         for name, value in (("physics_hz", self.physics_hz), ("control_hz", self.control_hz), ("fps", self.fps)):
-            if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
+            if not _is_count(value):
                 raise ConfigError(f"{name} is {value!r}; it must be a positive whole number of Hz.")
         for slow_name, slow, fast_name, fast in (
             ("control_hz", self.control_hz, "physics_hz", self.physics_hz),
@@ -127,6 +132,9 @@ class LidarSpec:
         rate_hz: scans a second.
         noise_std: standard deviation of the Gaussian range noise [m]; 0 turns it off.
         ahead: where the site is, ahead of the wheel axis [m].
+
+    Raises:
+        ConfigError: a value is out of range.
     """
 
     site: str
@@ -137,6 +145,22 @@ class LidarSpec:
     noise_std: float
     ahead: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name, value in (("beams", self.beams), ("rate_hz", self.rate_hz)):
+            if not _is_count(value):
+                raise ConfigError(f"{name} of the lidar is {value!r}; it must be a positive whole number.")
+        if not 0 <= self.range_min < self.range_max < math.inf:
+            raise ConfigError(
+                f"range_min of the lidar is {self.range_min} m and range_max {self.range_max} m; "
+                "0 <= range_min < range_max is needed, both finite."
+            )
+        if not 0 <= self.noise_std < math.inf:
+            raise ConfigError(
+                f"noise_std of the lidar is {self.noise_std}; it must be 0 (off) or a positive number of metres."
+            )
+        if not math.isfinite(self.ahead):
+            raise ConfigError(f"ahead of the lidar is {self.ahead}; it must be a finite number of metres.")
+
 
 @dataclass(frozen=True)
 class CameraSpec:
@@ -146,11 +170,21 @@ class CameraSpec:
         name: camera name in the model.
         width: image width [px].
         height: image height [px].
+
+    Raises:
+        ConfigError: a side of the image is not a positive whole number.
     """
 
     name: str
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        if not (_is_count(self.width) and _is_count(self.height)):
+            raise ConfigError(
+                f"The image of camera {self.name!r} is {self.width!r} x {self.height!r} px; "
+                "both must be positive whole numbers."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

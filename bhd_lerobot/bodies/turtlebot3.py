@@ -21,11 +21,9 @@ Estimates of ours: servo gain, reflected rotor inertia (armature), tyre friction
 is what the tyres can carry (a yaw deceleration of 20 rad/s^2 needs 0.5 N at each tyre, and 3 N are there).
 """
 
-import math
 from importlib import resources
 
 from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, MobileBase, WheelDrive
-from bhd_lerobot.errors import ConfigError
 
 WHEEL_RADIUS = 0.033  # [m], [urdf]
 WHEEL_SEPARATION = 0.160  # [m], [urdf]
@@ -59,10 +57,6 @@ def turtlebot3_burger(
     Raises:
         ConfigError: a value is out of range.
     """
-    if not 0 <= lidar_noise_std < math.inf:
-        raise ConfigError(f"lidar_noise_std is {lidar_noise_std}; it must be 0 (off) or a positive number of metres.")
-    if camera_width <= 0 or camera_height <= 0:
-        raise ConfigError(f"The camera image is {camera_width} x {camera_height} px; both must be positive.")
     return MobileBase(
         name="turtlebot3_burger",
         mjcf=resources.files(__package__).joinpath("turtlebot3_burger.xml").read_text(encoding="utf-8"),

@@ -88,8 +88,6 @@ def ur5(
     """
     if actuation not in ("position", "torque"):
         raise ConfigError(unknown_name("actuation", actuation, ("position", "torque")))
-    if camera_width <= 0 or camera_height <= 0:
-        raise ConfigError(f"The camera image is {camera_width} x {camera_height} px; both must be positive.")
     if not 0.0 <= load <= _PAYLOAD:
         raise ConfigError(f"The load (robot.payload) is {load} kg; a UR5 carries between 0 and {_PAYLOAD:g} kg.")
     turn = 2 * math.pi

@@ -1,10 +1,17 @@
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.body import CommandLimits, Rates, Shape
+from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, Rates, Shape
+from bhd_lerobot.bodies.differential_base import differential_base
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import BhdError, ConfigError
 from tests.cases import each_case
 
@@ -72,3 +79,45 @@ def test_a_shape_is_a_box_or_a_cylinder_of_positive_size(change: dict[str, objec
     values = {"kind": "box", "x": 0.0, "y": 0.0, "yaw": 0.0, "size_x": 0.1, "size_y": 0.1, **change}
     with pytest.raises(BhdError):
         Shape(**values)  # type: ignore[arg-type]
+
+
+LIDAR = LidarSpec(site="lidar", beams=360, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=0.01)
+
+
+@each_case(
+    ("change", "message"),
+    [
+        *(({name: bad}, f"{name} of the lidar is") for name in ("beams", "rate_hz") for bad in (0, -5, 1.5, True)),
+        *(({"noise_std": bad}, "noise_std of the lidar is .*0 .off.") for bad in (-0.01, math.inf, math.nan)),
+        *(({"range_min": bad}, "range_min of the lidar is") for bad in (-0.1, 3.5, math.nan)),
+        *(({"range_max": bad}, "range_max") for bad in (0.12, math.inf, math.nan)),
+        ({"ahead": math.nan}, "ahead of the lidar is nan"),
+    ],
+)
+def test_a_lidar_that_cannot_be_built_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(LIDAR, **change)
+
+
+@each_case("bad", [0, -1, 320.0, True, math.nan])
+def test_the_image_of_a_camera_has_positive_whole_sides(bad: Any) -> None:
+    for size in ((bad, 240), (320, bad)):
+        with pytest.raises(ConfigError, match=rf"camera 'front' is {size[0]} x {size[1]} px"):
+            CameraSpec("front", *size)
+
+
+@each_case(
+    ("option", "message"),
+    [({"lidar_noise_std": math.nan}, "noise_std"), ({"camera_width": 0}, "camera"), ({"camera_height": -1}, "camera")],
+)
+def test_every_body_refuses_a_sensor_that_cannot_be_built(option: dict[str, Any], message: str) -> None:
+    base = {"wheel_radius": 0.03, "wheel_separation": 0.2, "size": (0.2, 0.15, 0.1), "mass": 1.0}
+    builders: list[Callable[..., object]] = [
+        turtlebot3_burger,
+        partial(differential_base, "box", **base, max_velocity=(0.5, 2.0)),
+    ]
+    if "lidar_noise_std" not in option:
+        builders.append(ur5)
+    for build in builders:
+        with pytest.raises(ConfigError, match=message):
+            build(**option)

@@ -8,8 +8,6 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import BURGER_RADIUS
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.errors import ConfigError
-from tests.cases import each_case
 
 BODY = turtlebot3_burger()
 
@@ -146,15 +144,3 @@ def test_the_inertia_is_that_of_a_possible_body(model: mujoco.MjModel) -> None:
         a, b, c = sorted(inertia)
         assert a > 0
         assert a + b >= c * (1 - 1e-6)
-
-
-@each_case("noise", [-0.01, math.inf, math.nan])
-def test_impossible_noise_is_refused(noise: float) -> None:
-    with pytest.raises(ConfigError, match="lidar_noise_std"):
-        turtlebot3_burger(lidar_noise_std=noise)
-
-
-@pytest.mark.parametrize("size", [(0, 240), (320, -1)])
-def test_an_impossible_image_is_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ConfigError, match="camera image"):
-        turtlebot3_burger(camera_width=size[0], camera_height=size[1])

@@ -162,10 +162,10 @@ def test_emergency_stop_is_latched_until_reset_and_activate(robot):
         ({"beams": 0}, "must divide 360"),
         ({"clock": "lockstop"}, "Did you mean 'lockstep'"),
         ({"arena": "randm"}, "Did you mean 'random'"),
-        ({"lidar_noise_std": -0.1}, "lidar_noise_std"),
-        ({"lidar_noise_std": math.nan}, "lidar_noise_std"),
+        ({"lidar_noise_std": -0.1}, "noise_std of the lidar"),
+        ({"lidar_noise_std": math.nan}, "noise_std of the lidar"),
         ({"command_timeout_s": 0}, "does not mean 'off'"),
-        ({"camera_width": 0}, "must be positive"),
+        ({"camera_width": 0}, "must be positive whole numbers"),
         ({"seed": -1}, "seeds start at 0"),
     ],
 )
