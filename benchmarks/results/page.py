@@ -13,10 +13,13 @@ _HEAD = (
     "",
     "Written by `make results`, which runs the commands below each table; no number was typed by hand. Rates are",
     "with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness (bootstrap",
-    "intervals where a section says so), over the same held-out episodes for all brains of a table. Times of training",
-    "include the start of the program. Where several training seeds are shown, each has to meet the goal by itself, so",
-    "intervals are not corrected for their number; learned rows without a seed (clones, ablations, ACT, Diffusion) are",
-    "of the first seed that was made. Each section says when and where it was made.",
+    "intervals where a section says so), over the same held-out episodes for all brains of a table; that of a mean",
+    "score also holds what the mean would be if 3 / n of the episodes had scored 0, or 1. Intervals over trainings are",
+    "plain Student's. Times of training include the start of the program; those of aggregation are its rounds'. A goal",
+    "is for the estimate, unless it names an end of the interval. Where several training seeds are shown, each has to",
+    "meet the goal by itself, so intervals are not corrected for their number; learned rows without a seed (clones,",
+    "ablations, ACT, Diffusion) are of the first seed that was made. Privileged state is what the simulator tells and",
+    "no robot measures. Each section says when and where it was made, and with which commit if that is known.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 
@@ -33,8 +36,9 @@ def write_page(path: Path, sections: Sequence[Section], titles: Sequence[str], *
     texts = {} if not path.exists() else _kept(path.read_text(encoding="utf-8"))
     for section in sections:
         first, *rest = section.markdown()
-        # It begins with the date.
-        made = max((one.made for one in section.commands if one.made), default=provenance(REPOSITORY))
+        # Each begins with the date. What an earlier version kept of a training does not say it for each command.
+        known = [*(one.made for one in section.commands if one.made), *section.made_before]
+        made = max(known, default=provenance(REPOSITORY))
         texts[section.title] = "\n".join([first, "", f"Made {made}.", *rest])
     lines = [*_HEAD, *(("", _SHORT) if is_short else ())]
     lines += ["\n" + texts[title].strip() for title in titles if title in texts]

@@ -11,6 +11,7 @@ from benchmarks.results.learning import (
     seeds_rows,
     success_row,
     summary,
+    time_rows,
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
@@ -49,21 +50,20 @@ def pick(run: Runner, section: Section) -> None:
 
     made = each(run, section, "pick", SEEDS, learn)
     beside = each(run, section, "pick_others", first_of(made), others)
-    section.rows += [success_row(one, name) for one in beside.values() for name in _OTHERS]
+    section.rows += [success_row(one, name, privileged=True) for one in beside.values() for name in _OTHERS]
     for seed, results in made.items():
-        row, low = success_row(results, f"seed_{seed}"), results["brains"][f"seed_{seed}"]["success"]["low"]
+        row = success_row(results, f"seed_{seed}", privileged=True)
+        low = results["brains"][f"seed_{seed}"]["success"]["low"]
         section.rows.append(Row(row.what, row.value, f"lower end at least {_GOAL:.0%}", low >= _GOAL))
     section.rows += seeds_rows(made)
     section.rows += rounds_rows(made)
-    section.rows += [
-        Row(f"seed_{seed}: time from nothing", f"{results['seconds']:.0f} s") for seed, results in made.items()
-    ]
+    section.rows += time_rows(made)
     section.remarks.append(
         "Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
-        "says which is meant; none has seen an image or read a word. Each seed is one of recording and "
-        f"training. `clone` learned from episodes of `pick_servo` alone. In {run.size(ROUNDS, 1)} further rounds the "
-        "last policy drove, and the rule said in every frame what it would do. A `fault` is a stop by the cerebellum; "
-        "the report gives its reason."
+        "says which is meant; none has seen an image or read a word: deaf and blind by construction. Each seed is one "
+        "of recording and training. `clone` learned from episodes of `pick_servo` alone. In "
+        f"{run.size(ROUNDS, 1)} further rounds the last policy drove, and the rule said in every frame what it would "
+        "do. A `fault` is a stop by the cerebellum; the report gives its reason."
     )
 
 

@@ -4,8 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from scipy.stats import sem
+from scipy.stats import t as student
+
 from benchmarks.results.runner import Ran
-from bhd_lerobot.evaluation import statistics
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,14 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
 def over_seeds(rates: Sequence[float]) -> str:
     """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds.
 
-    It takes trainings that fail now and then for improbable, if none of these did: three cannot tell. Where all are the
-    same, or there is one, there is no interval.
+    It is not corrected for skewness, which three values do not tell, and takes trainings that fail now and then for
+    improbable, if none of these did. Where all are the same, or there is one, there is no interval.
     """
-    one = statistics.mean(rates)
-    interval = "" if math.isnan(one.low) else f" ({max(0.0, one.low):.1%} to {min(1.0, one.high):.1%})"
-    return f"{one.value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
+    value, interval = sum(rates) / len(rates), ""
+    if max(rates) > min(rates):
+        low, high = student.interval(0.95, len(rates) - 1, value, sem(rates))
+        interval = f" ({max(0.0, low):.1%} to {min(1.0, high):.1%})"
+    return f"{value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
 
 
 def mean(estimate: Mapping[str, float | None], sign: str = "") -> str:

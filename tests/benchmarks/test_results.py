@@ -120,6 +120,9 @@ def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
 def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
     assert over_seeds([0.9, 0.9, 0.9]) == "90.0%; 90.0%, 90.0%, 90.0%"
     assert over_seeds([0.9]) == "90.0%; 90.0%"
+    # Student's: 4.3027 / sqrt(3) deviations to either side, within what a rate can be.
+    assert over_seeds([0.1, 0.2, 0.3]) == "20.0% (0.0% to 44.8%); 10.0%, 20.0%, 30.0%"
+    assert over_seeds([0.97, 0.99, 1.0]) == "98.7% (94.9% to 100.0%); 97.0%, 99.0%, 100.0%"
     for nothing in (math.nan, None):
         assert "1.000 (no interval" in mean({"value": 1.0, "low": nothing, "high": nothing})
     assert mean({"value": None, "low": None, "high": None}) == "–"
@@ -195,14 +198,19 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_both_rules(
 
     alone = results({"avoidance": 0.126, "clone": 0.2})
     behind, teacher = results({"clone": 0.15, "ppo": score}, failures), results({"gap_follower": 0.2})
-    rows = monitored_rows(alone, behind, teacher, 7)
-    assert [row.met for row in rows] == [None, None, None, *met]
+    rows = monitored_rows(alone, behind, teacher, 7, is_start=False)
+    assert [row.met for row in rows] == [None, None, None, *met[:2], None, *met[2:]]
     assert [row.what.partition(":")[0] for row in rows[:3]] == [
-        "clone_7",
-        "with the collision monitor, clone_7",
-        "with the collision monitor, ppo_7",
+        "clone_7, from privileged state",
+        "with the collision monitor, clone_7, from privileged state",
+        "with the collision monitor, ppo_7, from privileged state",
     ]
     assert rows[3].value == str(failures)
+    assert not any("kept the start" in row.value for row in rows)
+    kept = monitored_rows(alone, behind, teacher, 7, is_start=True)
+    assert [row.what.partition(":")[0] for row in kept if "PPO kept the start" in row.value] == [
+        "ppo_7 / clone_7, both with the monitor"
+    ]
 
 
 def test_what_was_measured_names_the_commit_that_it_was_measured_with(tmp_path: Path) -> None:
@@ -298,6 +306,9 @@ def test_every_section_fills_its_table_from_what_its_commands_write(tmp_path: Pa
             text = "\n".join(section.markdown())
             assert "nan" not in text, name
             assert section.rows, name
+            # Both ablations were measured, or it is said that there is nothing to be deaf or blind to.
+            assert re.search(r"(?i)\bdeaf\b", text), name
+            assert re.search(r"(?i)\bblind\b", text), name
             assert len({row.what for row in section.rows}) == len(section.rows), name
             commands = [one.command for one in run.commands]
             made = {int(seed) for command in commands for seed in re.findall(r"--seed=([012])\b", command)}
@@ -363,6 +374,12 @@ def test_training_seeds_are_made_in_any_sittings_and_shown_together(
     assert list(made) == [12]
     assert run.commands[-1].seconds != before.seconds
     assert json.loads((tmp_path / "kept/part_12.json").read_text())["configs"] == run.commands[-1].configs
+
+
+def test_a_section_of_earlier_trainings_says_nothing_of_this_checkout(tmp_path: Path) -> None:
+    before = Section("one", "One", commands=[Ran("train", 1.0, 0)], made_before={"on 2020-01-01, with version 1": {0}})
+    write_page(tmp_path / "page.md", [before], ["One"], is_short=False)
+    assert "\nMade on 2020-01-01, with version 1.\n" in (tmp_path / "page.md").read_text(encoding="utf-8")
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------
