@@ -144,9 +144,9 @@ def meaning_of(key: str, feature: dict[str, Any]) -> str:
     if key in _LEROBOT_COLUMNS:
         return _LEROBOT_COLUMNS[key]
     names = feature.get("names") or []
-    if isinstance(names, list) and len(names) > 6:
-        return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
-    return ", ".join(map(str, names)) if isinstance(names, list) else ""
+    told = [str(name) for name in names] if isinstance(names, list) else []
+    text = f"{', '.join(told[:3])}, … {told[-1]}" if len(told) > 6 else ", ".join(told)
+    return f"privileged, the simulator's truth: {text}" if key == ENVIRONMENT_STATE else text
 
 
 _LEROBOT_COLUMNS = {

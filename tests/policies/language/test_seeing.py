@@ -51,6 +51,19 @@ class Eyes:
         return list(shown)
 
 
+class Forbidden:
+    """True poses, which nothing may read: whoever takes the trouble to look whether they are there fails, too."""
+
+    def __getattribute__(self, name: str) -> Any:
+        raise AssertionError(f"privileged state was read: {name}")
+
+    def _read(self, *_: object) -> Any:
+        raise AssertionError("privileged state was read")
+
+    __getitem__ = __len__ = __iter__ = __bool__ = __array__ = __eq__ = _read  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]
+
+
 class Table:
     """One arm, its brain, and a camera. Reading what the task tells fails."""
 
@@ -61,6 +74,7 @@ class Table:
         self.brain.perceiver = self.eyes  # type: ignore[assignment]
         self.brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
         assert self.brain.uses_images
+        assert not self.brain.uses_privileged_state
         self.brain.reset(np.array([0]), [0], 1, [instruction])
         self.given: list[BrainCommand] = []
         self.opening, self.images_wanted = MAX_OPENING, []
@@ -76,7 +90,8 @@ class Table:
             self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
         self.images_wanted.append(wanted)
         state = np.array([[0.0, self.opening]])
-        goals = self.brain.act(Observation(OBSERVED, state, {"scene": self._image} if wanted else {}, None, results))
+        truth: Any = Forbidden()
+        goals = self.brain.act(Observation(OBSERVED, state, {"scene": self._image} if wanted else {}, truth, results))
         assert isinstance(goals, Goals)
         for command in goals.commands.get(0, []):
             self.given.append(command)

@@ -86,6 +86,7 @@ def test_it_is_evaluated_by_itself_and_reports_how_well_it_saw(run: Path, tmp_pa
         f"--output_dir={tmp_path / 'eval'}",
     ]
     result = evaluate(parse(EvalConfig, arguments))
+    assert not result.results.brains["language"].privileged
     saw = result.results.brains["language"].perception
     assert saw is not None
     assert saw.episodes == 3
