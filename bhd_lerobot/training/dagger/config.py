@@ -142,6 +142,9 @@ def read_stages(config: AggregationConfig) -> Stages:
                 f"split is {parsed.split!r} in {stage.config!r}: its episodes are not for learning from, but for "
                 "judging what was learned. Leave it out."
             )
+    evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
+    for other, name in ((learner, "learner"), (evaluation, "evaluation")):
+        _check_same(expert, other, f"{name}.config, {getattr(config, name).config!r}", config.expert.config)
     policy = parse_train(command(config.policy, {})).config
     weight = "selection.learner_weight"
     if not learner.dataset.expert_action and weight in _names(config.policy):
@@ -150,9 +153,6 @@ def read_stages(config: AggregationConfig) -> Stages:
             "not record what the expert would have done (dataset.expert_action is false): they are not learned from. "
             "Leave it out of its options."
         )
-    evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
-    for other, name in ((learner, "learner"), (evaluation, "evaluation")):
-        _check_same(expert, other, f"{name}.config, {getattr(config, name).config!r}", config.expert.config)
     return Stages(
         expert=str(kinds[0]),
         brain=configuration.encode(expert)["brain"],

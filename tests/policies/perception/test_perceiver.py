@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from safetensors.numpy import load_file, save_file
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.evaluation.evaluate import evaluate, main
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
 from bhd_lerobot.registry import make_brain
@@ -129,6 +130,25 @@ def images(value: Any = None, height: int = HEIGHT, width: int = WIDTH, camera: 
 def test_images_that_it_cannot_use(run: Path, given: dict[str, np.ndarray], kind: type, message: str) -> None:
     with pytest.raises(kind, match=message):
         Perceiver(PerceptionOptions(str(run))).look(given, 0)
+
+
+@each_case(
+    ("robot", "message"),
+    [
+        (["--robot.camera=false"], "looks through the camera 'scene', .* There is: none. Set --robot.camera=true"),
+        (
+            ["--robot.camera_width=96", "--robot.camera_height=48"],
+            "images of 96 x 72 px; .* are 96 x 48. Set --robot.camera_width=96 --robot.camera_height=72",
+        ),
+    ],
+)
+def test_an_evaluation_without_the_images_that_it_needs_ends_with_the_remedy(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], robot: list[str], message: str
+) -> None:
+    arguments = ["--config_path=configs/eval/ur5_look.yaml", f"--brain.perception.path={run}", *robot]
+    assert main([*arguments, "--n_episodes=1", f"--output_dir={tmp_path / 'eval'}"]) == 2
+    assert re.search(message, " ".join(capsys.readouterr().err.split()))
+    assert not list((tmp_path / "eval").rglob("report.html"))
 
 
 def test_checkpoints_that_are_none(run: Path, tmp_path: Path) -> None:

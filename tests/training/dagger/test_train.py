@@ -37,7 +37,10 @@ def settings(folder: Path, **changed: Any) -> Path:
         },
         "policy": {
             "config": str(CONFIGS / "train/bc_turtlebot3_avoid.yaml"),
-            "options": ["--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]"],
+            "options": [
+                *("--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]"),
+                "--selection.learner_weight=0.5",
+            ],
         },
         "evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [*BRIEF, "--n_envs=2"]},
         "output_dir": str(folder / "run"),
@@ -84,7 +87,7 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     called.clear()
     assert main([argument]) == 0
     assert [name for name, _ in called] == ["bhd-train", "bhd-eval"]
-    assert "--selection.expert_action=true" in called[0][1]
+    assert {"--selection.expert_action=true", "--selection.learner_weight=0.5"} <= set(called[0][1])
 
     run = tmp_path / "run"
     first, second = (dataset_info(run / f"round_{number}" / "data") for number in (0, 1))
@@ -269,6 +272,10 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             "task.type is 'navigate' in evaluation.config, .* and 'avoid' in that of the expert",
         ),
         (
+            {"learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []}},
+            "robot.type is 'ur5' in learner.config, .*ur5_pick_dagger.yaml', and 'turtlebot3' in that of the expert",
+        ),
+        (
             {
                 "learner": {
                     "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
@@ -279,6 +286,8 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
         ),
         (
             {
+                "expert": {"config": str(CONFIGS / "record/ur5_pick.yaml"), "options": []},
+                "evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []},
                 "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
                 "policy": {
                     "config": str(CONFIGS / "train/bc_ur5_pick_servo.yaml"),
