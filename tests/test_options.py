@@ -45,7 +45,8 @@ OUT_OF_RANGE: dict[Any, dict[str, tuple[float, ...]]] = {
     RandomisationConfig: {
         "size": (1.0, -0.1),
         "light": (1.0,),
-        **dict.fromkeys(("mass", "friction", "colour", "light_direction", "camera_m", "camera_rad"), (-0.1,)),
+        **dict.fromkeys(("mass", "friction", "colour", "surface"), (-0.1,)),
+        **dict.fromkeys(("light_direction", "camera_m", "camera_rad"), (-0.1,)),
         **dict.fromkeys(("sensor_noise_rad", "latency_s", "latency_min_s"), (-0.1,)),
     },
     AvoidanceConfig: {"front_sector_deg": (0.0, 181.0)},

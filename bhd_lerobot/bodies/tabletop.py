@@ -127,6 +127,7 @@ class Variation:
         finger_friction: factor on the fingers' friction.
         camera_error: added to every position that the task reports, x, y, z in the base frame [m]: in front of a real
             arm these come from a camera, whose place may be known wrongly. Images stay as they are.
+        surface: what is added to the red, green and blue of the table's top, which are between 0 and 1.
     """
 
     light: float = 1.0
@@ -138,6 +139,7 @@ class Variation:
     latency_s: float = 0.0
     finger_friction: float = 1.0
     camera_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    surface: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 MAX_CAMERA_ERROR = 0.2  # [m] along an axis; a camera that is off by more was set up wrongly, not calibrated badly

@@ -22,6 +22,7 @@ PADS = ("pad_left", "pad_right")
 PARKED = tuple((3.0 * number, 0.0, 100.0) for number in range(MAX_OBJECTS))
 FLOOR = -0.75  # [m]
 _OVERVIEW = CameraView((1.75, -1.30, 0.95), (0.30, 0.0, 0.20), 29.0)
+TABLE_TOP = "table_top"  # what is seen of it
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 
 
@@ -114,7 +115,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
     )
     back, front, half = _TABLE
     middle, length = (back + front) / 2, (front - back) / 2
-    _visual(table, "box", (middle, 0, -0.02), (length, half, 0.02), material="table")
+    _visual(table, "box", (middle, 0, -0.02), (length, half, 0.02), name=TABLE_TOP, material="table")
     _visual(table, "box", (0, 0, 0.0005), (0.11, 0.11, 0.0015), material="leg")  # the mounting plate
     for x in (back + 0.06, front - 0.06):
         for y in (-half + 0.06, half - 0.06):

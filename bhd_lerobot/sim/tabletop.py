@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.engine import mujoco
-from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PADS, PARKED
+from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PADS, PARKED, TABLE_TOP
 from bhd_lerobot.sim.world import Ids, World
 
 _TYPES = {name: int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")) for name in ("box", "capsule", "cylinder")}
@@ -75,6 +75,8 @@ class Tabletop:
         self._target = model.body("target").id
         self._wrist = model.camera("wrist").id
         self._scene, self._light = model.camera("scene").id, model.light("main").id
+        self._top = model.geom(TABLE_TOP).id
+        self._wood = model.mat_rgba[model.geom_matid[self._top], :3].copy()
         self._tool_pos, self._tool_quat = world.site("tool")
         self._any = world.sensor("touch_any")[:, 0]
         self._table = world.sensor("touch_table")[:, 0]
@@ -126,7 +128,7 @@ class Tabletop:
         world.hold(ids)
 
     def _surroundings(self, sim: int, scene: TableScene) -> None:
-        """Set light, camera, pads and marker."""
+        """Set light, camera, the table's colour, pads and marker."""
         field, model, variation = self._field, self.world.model, scene.variation
         field["light_diffuse"][sim] = model.light_diffuse * variation.light
         field["light_ambient"][sim] = model.light_ambient * variation.light
@@ -138,6 +140,7 @@ class Tabletop:
         field["cam_quat"][sim] = model.cam_quat
         for camera, turn in ((self._scene, variation.camera_turn), (self._wrist, variation.wrist_turn)):
             field["cam_quat"][sim, camera] = _turned(model.cam_quat[camera], turn)
+        field["geom_rgba"][sim, self._top, :3] = np.clip(self._wood + variation.surface, 0.0, 1.0)
         field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]
         field["geom_friction"][sim, self._pads, 0] *= variation.finger_friction
         pose = (*PARKED[0], *_UPRIGHT) if scene.target_pose is None else scene.target_pose

@@ -27,6 +27,7 @@ class RandomisationConfig:
         plain: probability that an object lacks what others of its kind have: a cup its handle, a box its tape.
         marked: probability that it has neither of these, but a stripe around it and a patch on its top, light or dark.
         across: probability that a box has its tape across, not along its length.
+        surface: up to this is added to or taken from each of the red, green and blue of the table's top.
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
@@ -50,6 +51,7 @@ class RandomisationConfig:
     plain: float = 0.0
     marked: float = 0.0
     across: float = 0.0
+    surface: float = 0.0
     light: float = 0.4
     light_direction: float = 0.3
     camera_m: float = 0.02
@@ -113,6 +115,8 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
         latency_s=float(uniform(config.latency_min_s, config.latency_s)),
         finger_friction=_factor(config.friction, rng),
         camera_error=_floats(config.camera_error_m),
+        # Where it is 0, nothing is drawn: worlds stay what they were before this option.
+        surface=_floats(uniform(-1, 1, 3) * config.surface) if config.surface > 0 else (0.0, 0.0, 0.0),
     )
 
 

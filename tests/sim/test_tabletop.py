@@ -52,6 +52,7 @@ def random_scene(seed: int, count: int | None = None) -> TableScene:
         light_direction=tuple(rng.uniform(-0.3, 0.3, 2)),
         camera_shift=tuple(rng.uniform(-0.05, 0.05, 3)),
         finger_friction=rng.uniform(0.5, 1.5),
+        surface=tuple(rng.uniform(-0.6, 0.6, 3)),
     )
     return TableScene("random", tuple(things), posture, variation=variation)
 
@@ -243,6 +244,9 @@ def test_variations_reach_light_camera_and_fingers() -> None:
             np.testing.assert_array_equal(model.camera("wrist").pos, nominal.camera("wrist").pos)
             turned = nominal.light("main").dir + np.array([*variation.light_direction, 0])
             np.testing.assert_allclose(model.light("main").dir, turned / np.linalg.norm(turned), atol=1e-6)
+            top = model.geom("table_top")
+            wood = nominal.mat_rgba[top.matid[0]] + [*variation.surface, 0.0]
+            np.testing.assert_allclose(top.rgba, np.clip(wood, 0, 1), atol=1e-6)
             pads = [world_model.geom("pad_left").friction[0] for world_model in (model, nominal)]
             assert pads[0] == pytest.approx(pads[1] * variation.finger_friction)
         table.place(scenes)
@@ -292,6 +296,9 @@ def test_a_camera_sees_each_table_as_it_is_laid_now() -> None:
         table.place([full, dim])
         assert (camera.render(0, "scene") != empty).any(axis=2).mean() > 0.02
         assert camera.render(1, "scene").mean() < 0.7 * empty.mean()
+        table.place([TableScene("", (), tuple(HOME), variation=Variation(surface=(-0.7, -0.5, 0.6)))], [1])
+        red, green, blue = camera.render(1, "scene")[60:, 60:100].reshape(-1, 3).mean(axis=0)
+        assert blue > 2 * max(red, green)  # the table before the arm, which is brown otherwise
         table.place([TableScene("", (), tuple(HOME))], [1])
         np.testing.assert_array_equal(camera.render(1, "scene"), empty)
         assert camera.render(0, "wrist").std() > 10

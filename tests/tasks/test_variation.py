@@ -66,7 +66,14 @@ def test_on_with_ranges_of_nothing_is_nominal_too() -> None:
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.99), st.floats(0, 2), st.floats(0, 0.05))
 def test_what_is_drawn_lies_in_the_ranges(seed: int, share: float, factor: float, latency: float) -> None:
     config = RandomisationConfig(
-        enabled=True, mass=factor, friction=factor, size=share, light=share, latency_s=latency, sensor_noise_rad=share
+        enabled=True,
+        mass=factor,
+        friction=factor,
+        size=share,
+        light=share,
+        latency_s=latency,
+        sensor_noise_rad=share,
+        surface=share,
     )
     rng = np.random.default_rng(seed)
     drawn, changes = draw_variation(config, rng), draw_object_changes(config, rng)
@@ -75,12 +82,23 @@ def test_what_is_drawn_lies_in_the_ranges(seed: int, share: float, factor: float
     assert max(map(abs, drawn.light_direction)) <= config.light_direction
     assert max(map(abs, drawn.camera_shift)) <= config.camera_m
     assert max(map(abs, (*drawn.camera_turn, *drawn.wrist_turn))) <= config.camera_rad
+    assert max(map(abs, drawn.surface)) <= share
     assert 0 <= drawn.sensor_noise <= share
     assert 0 <= drawn.latency_s <= latency
     for value in (drawn.finger_friction, changes["mass"], changes["friction"]):
         assert 1 / (1 + factor) / slack <= value <= (1 + factor) * slack
     assert all((1 - share) / slack <= value <= (1 + share) * slack for value in changes["size"])
     assert all(abs(value) <= config.colour for value in changes["shade"])
+
+
+def test_a_table_that_keeps_its_colour_leaves_all_other_worlds_as_they_were() -> None:
+    rng, again = np.random.default_rng(3), np.random.default_rng(3)
+    before = draw_variation(ON, rng)
+    assert before.surface == (0.0, 0.0, 0.0)
+    after = draw_variation(dataclasses.replace(ON, surface=0.2), again)
+    assert dataclasses.replace(after, surface=before.surface) == before
+    again.bit_generator.state = rng.bit_generator.state
+    assert draw_object_changes(ON, rng) == draw_object_changes(ON, again)
 
 
 def test_the_ranges_are_used_to_their_ends_both_ways_alike() -> None:
