@@ -168,9 +168,10 @@ def pixels(run: Runner, section: Section) -> None:
         section.remarks.append("A deaf policy gets an empty instruction, a blind one black images.")
     if beside:
         section.remarks.append(
-            "LeRobot's ACT and Diffusion, with a "
-            "ResNet18 that begins from nothing, learn from every frame of the rule's episodes, of 160 x 120 pixels; "
-            "they have no input for words, and can do no better than to pick any one of the objects."
+            "LeRobot's ACT and Diffusion, with a ResNet18 that begins from nothing, learn from every frame of as many "
+            "episodes of the rule, of 160 x 120 pixels, without the first frames of further tables and without labels; "
+            "they have no input for words, and can do no better than to pick any one of the objects. A `blind_…` gets "
+            "black images."
         )
 
 
