@@ -141,6 +141,9 @@ def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, desc
         return 2
     missed = [f"{section.name}: {row.what}" for section in sections for row in section.rows if row.met is False]
     where = page.relative_to(REPOSITORY) if page.is_relative_to(REPOSITORY) else page
+    if options.short:
+        print(f"Written: {where}. Its goals are those of a full run: {len(missed)} are missed.")
+        return 0
     print(f"Written: {where}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
     return 1 if missed else 0
 

@@ -23,7 +23,7 @@ _FEW_REACH = (
     *("--steps=1500", "--eval_steps=1500", "--batch_size=256"),
     *("--policy.hidden_dims=[256,256,256]", "--policy.optimizer_lr=2e-3"),
 )
-_FEW = ("--steps=800", "--eval_steps=800")
+_FEW = ("--steps=2500", "--eval_steps=2500")
 SHORTER = ("--task.duration_s=30",)  # episodes of a short run
 _AVOID_TRAIN_S = 120
 _HELPED = "dagger"

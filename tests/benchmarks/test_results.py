@@ -448,6 +448,22 @@ def test_what_reads_something_that_was_made_anew_is_made_anew(tmp_path: Path) ->
     assert {name: (tmp_path / "notes" / f"{name}.json").stat().st_mtime_ns for name in ended} == ended
 
 
+def test_a_missed_goal_is_the_exit_status_of_a_full_run_and_only_counted_in_a_short_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def measure(_: Runner, section: Section) -> None:
+        section.rows.append(Row("a number", "1", "at least 2", met=False))
+
+    monkeypatch.setattr(program, "GROUPS", ())
+    monkeypatch.setattr(program, "LAST", ("one", "One", measure))
+    monkeypatch.setattr(program, "MEASURES", (program.LAST,))
+    for options, status, words in (([], 1, "Missed: one: a number."), (["--short"], 0, "full run: 1 are missed")):
+        folder = tmp_path / f"run_{status}"
+        assert program.main([f"--folder={folder}", f"--page={folder}.md", *options]) == status
+        assert words in capsys.readouterr().out
+        assert "**missed**" in Path(f"{folder}.md").read_text(encoding="utf-8")
+
+
 def test_sections_run_side_by_side_and_one_that_fails_stops_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
