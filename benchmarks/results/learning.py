@@ -131,9 +131,9 @@ def reach(run: Runner, section: Section) -> None:
     section.remarks.append(
         "`bc_N` learned from N episodes, all with the same number of steps; each seed is one of the training. `dagger` "
         f"learned from {numbers[-1]} others and from those in which the first policy drove and the rule took over "
-        f"where that got stuck, {run.size(800, numbers[0])}; each seed is one of recording, too. What as many further "
-        "episodes of the rule alone would do was not measured. All are told where the target is by the simulator "
-        "(privileged state). There is no image and no instruction: deaf and blind by construction."
+        "where that got stuck; each seed is one of recording, too. What as many further episodes of the rule alone "
+        "would do was not measured. All are told where the target is by the simulator (privileged state). There is no "
+        "image and no instruction: deaf and blind by construction."
     )
 
 
