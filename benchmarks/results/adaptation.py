@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.learning import (
+    beside_rows,
     evaluate,
     reach_folder,
     reach_numbers,
@@ -24,7 +25,7 @@ from benchmarks.results.learning import (
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
 from benchmarks.results.seeing import SENSES, blanked, perception_folder, record_tables, train_perception
-from benchmarks.results.trainings import SEEDS, each, first_of
+from benchmarks.results.trainings import SEEDS, each
 
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
@@ -110,15 +111,15 @@ def move_camera(run: Runner, section: Section) -> None:
 
     def senseless(seed: int) -> dict[str, Any]:
         inner = {"type": "language", "perception.path": str(run.path(f"camera/seed_{seed}"))}
-        return blanked(run, "camera_eval/blanked", "ur5_pick", inner, (*_STILL, *_MOVED))
+        return blanked(run, f"camera_eval/blanked/seed_{seed}", "ur5_pick", inner, (*_STILL, *_MOVED))
 
     made = each(run, section, "move_camera", SEEDS, learn)
-    without = each(run, section, "move_camera_blanked", first_of(made), senseless)
+    without = each(run, section, "move_camera_blanked", SEEDS, senseless)
     for seed, results in made.items():
         section.rows += _recovery_rows(results, seed, f"{TABLES} tables", _ELSEWHERE, _CAMERA_GOAL)
     elsewhere = {seed: one[_ELSEWHERE] for seed, one in made.items()}
     section.rows += seeds_rows(elsewhere, f"tuned, {_ELSEWHERE}", "tuned")
-    section.rows += [success_row(one, name) for one in without.values() for name in SENSES]
+    section.rows += beside_rows(without, *SENSES)
     section.remarks.append(
         f"A table is one image with the true poses of what stands there; {TABLES} were seen through the camera where "
         "it is now. From them was found where that is (`fine_tune_camera`); then the weights were trained further. The "

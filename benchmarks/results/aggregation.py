@@ -7,6 +7,7 @@ from benchmarks.results.learning import (
     SHORTER,
     Aggregated,
     aggregation,
+    beside_rows,
     evaluate,
     roaming,
     rounds_rows,
@@ -18,7 +19,7 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
-from benchmarks.results.trainings import SEEDS, each, first_of
+from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, ROUNDS = 1000, 3
@@ -35,13 +36,13 @@ def aggregate(run: Runner, section: Section) -> None:
         return {**_evaluate(run, f"seed_{seed}", policy, _RULE), "seconds": seconds, "rounds": rounds}
 
     def clone(seed: int) -> dict[str, Any]:
-        return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy")
+        return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy", where=f"clone/seed_{seed}")
 
     made = each(run, section, "aggregate", SEEDS, learn)
-    clones = each(run, section, "aggregate_clone", first_of(made), clone)
+    clones = each(run, section, "aggregate_clone", SEEDS, clone)
     first, *_ = made.values()
     section.rows.append(success_row(first, _RULE))
-    section.rows += [success_row(one, "clone", privileged=True) for one in clones.values()]
+    section.rows += beside_rows(clones, "clone", privileged=True)
     for seed, results in made.items():
         name = f"seed_{seed}"
         row, success = success_row(results, name, privileged=True), results["brains"][name]["success"]
@@ -54,14 +55,14 @@ def aggregate(run: Runner, section: Section) -> None:
     section.rows += rounds_rows(made)
     section.rows += time_rows(made)
     section.remarks.append(
-        "Each seed is one of recording and training. "
-        "`clone` learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule "
-        "took over before collisions and said in every frame what it would do; the others learned that, from all "
-        "episodes so far. The rule that taught them keeps 0.08 m away from things, `gap_follower` of this table 0.05 m."
-        " Privileged is what ground they have visited (`task.trail`), which the task computes from the robot's true "
-        "pose; of obstacles they know what the lidar measures. There is no image and no instruction: deaf and blind by "
-        "construction. The policy's modes and how far the rule keeps away were chosen after policies had failed in "
-        "some of these episodes, which favours the numbers (docs/how_to/dagger.md)."
+        "Each seed is one of recording and training. `clone_N` learned from episodes of `gap_follower` alone. In the "
+        "further rounds the last policy drove, the rule took over before collisions and said in every frame what it "
+        "would do; the others learned that, from all episodes so far. The rule that taught them keeps 0.08 m away "
+        "from things, `gap_follower` of this table 0.05 m. Privileged is what ground they have visited "
+        "(`task.trail`), which the task computes from the robot's true pose; of obstacles they know what the lidar "
+        "measures. There is no image and no instruction: deaf and blind by construction. The policy's modes and how "
+        "far the rule keeps away were chosen after policies had failed in some of these episodes, which favours the "
+        "numbers (docs/how_to/dagger.md)."
     )
 
 
@@ -73,10 +74,10 @@ def aggregated(run: Runner, seed: int) -> Aggregated:
     )
 
 
-def _evaluate(run: Runner, name: str, policy: str, *rules: str) -> dict[str, Any]:
+def _evaluate(run: Runner, name: str, policy: str, *rules: str, where: str = "") -> dict[str, Any]:
     results = evaluate(
         run,
-        f"aggregate_eval/{name}",
+        f"aggregate_eval/{where or name}",
         "turtlebot3_avoid",
         {name: policy},
         rules=rules,

@@ -1,7 +1,7 @@
 """The section about driving by the front camera: what its rounds of aggregation make of a driver, from three seeds."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from benchmarks.results.learning import (
@@ -17,13 +17,14 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
-from benchmarks.results.trainings import SEEDS, each, first_of
+from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, ROUNDS = 500, 2
 _SHORT, _STEPS = (20, 10, 6), 300
 _SUCCESS_GOAL = 0.9
 _RULE, _TEACHER = "avoidance", "gap_follower"
+_BESIDE = ("clone", "blind")
 _BLANKED = 100  # episodes of the driver that is blind
 
 
@@ -40,19 +41,22 @@ def camera_drive(run: Runner, section: Section) -> None:
         inner = _brain(run, "blind.brain", policy)
         blind = ("--brains.blind.type=blanked", "--brains.blind.images=true", *inner)
         clone = _brain(run, "clone", f"{_folder(seed)}/round_0/policy")
-        beside = _evaluate(run, "clone", clone, (_TEACHER, "clone"))
-        return {"brains": beside["brains"] | _evaluate(run, "blind", blind, ("blind",), _BLANKED)["brains"]}
+        beside = _evaluate(run, f"clone/seed_{seed}", clone, (_TEACHER, "clone"))
+        return {
+            "brains": beside["brains"] | _evaluate(run, f"blind/seed_{seed}", blind, ("blind",), _BLANKED)["brains"]
+        }
 
     made = each(run, section, "camera_drive", SEEDS, learn)
-    beside = each(run, section, "camera_drive_others", first_of(made), others)
-    first, *_ = made.values()
-    levels = [(first, _RULE), *((one, name) for one in beside.values() for name in one["brains"])]
-    for results, name in (*levels, *((results, f"seed_{seed}") for seed, results in made.items())):
-        row, brain = success_row(results, name), results["brains"][name]
-        score = Row(f"{name}: mean score", mean(brain["means"]["score"]))
-        if not name.startswith("seed_"):
-            section.rows += [row, score]
-            continue
+    beside = each(run, section, "camera_drive_others", SEEDS, others)
+    section.rows += _level_rows(next(iter(made.values())), _RULE, _RULE)
+    section.rows += _level_rows(next(iter(beside.values())), _TEACHER, _TEACHER)
+    for name in _BESIDE:
+        for seed, results in beside.items():
+            section.rows += _level_rows(results, name, f"{name}_{seed}")
+        section.rows += seeds_rows(beside, name, name)
+    for seed, results in made.items():
+        name = f"seed_{seed}"
+        (row, score), brain = _level_rows(results, name, name), results["brains"][name]
         more = mean_difference(scores(results, name), scores(results, _RULE))
         is_met = brain["success"]["low"] >= _SUCCESS_GOAL
         section.rows += [
@@ -72,14 +76,20 @@ def camera_drive(run: Runner, section: Section) -> None:
         "`bhd_cnn`; each seed is one of recording and training. It sees images of 64 x 48 pixels from the front "
         "camera, and the wheels' odometry. The "
         "lidar's ranges taught it how far away things are; they are no input, and neither is what ground it has "
-        f"visited. Policies drove in {run.size(ROUNDS, 1)} further rounds, corrected by the rule; `clone` learned from "
-        "the rule's episodes alone. There is no instruction: deaf by construction."
+        f"visited. Policies drove in {run.size(ROUNDS, 1)} further rounds, corrected by the rule; `clone_N` learned "
+        "from the rule's episodes alone. There is no instruction: deaf by construction."
     )
-    if beside:
-        section.remarks.append(
-            f"`blind` is seed {min(beside)} with black images: it drives a small circle, on which it touches nothing "
-            "and gets nowhere, so success alone says little here, and the score counts."
-        )
+    section.remarks.append(
+        "`blind_N` is seed N with black images: success alone says little of it, as one that drives a small circle "
+        "touches nothing and gets nowhere, and the score counts."
+    )
+
+
+def _level_rows(results: Any, name: str, shown: str) -> list[Row]:
+    """Return the rows of a brain's success and of its score, by the name that it is shown with."""
+    row = success_row(results, name)
+    score = Row(f"{shown}: mean score", mean(results["brains"][name]["means"]["score"]))
+    return [replace(row, what=row.what.replace(name, shown, 1)), score]
 
 
 def _learned(run: Runner, seed: int) -> Aggregated:

@@ -360,6 +360,23 @@ def time_rows(made: Mapping[int, Any]) -> list[Row]:
     ]
 
 
+def beside_rows(made: Mapping[int, Any], *names: str, privileged: bool = False) -> list[Row]:
+    """Return the rows of brains that a section shows beside its own: of every training seed, and of all together.
+
+    Args:
+        made: what `summary` returned, by seed.
+        names: of the brains in each.
+        privileged: as `success_row` has it.
+    """
+    rows = []
+    for name in names:
+        for seed, results in made.items():
+            row = success_row(results, name, privileged=privileged)
+            rows.append(replace(row, what=row.what.replace(name, f"{name}_{seed}", 1)))
+        rows += seeds_rows(made, name, name)
+    return rows
+
+
 def rounds_rows(made: Mapping[int, Any]) -> list[Row]:
     """Return the rows of the curve over the rounds, by seed; none of trainings whose rounds were not kept."""
     return [

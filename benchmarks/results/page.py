@@ -17,9 +17,8 @@ _HEAD = (
     "score also holds what the mean would be if 3 / n of the episodes had scored 0, or 1. Intervals over trainings are",
     "plain Student's. Times of training include the start of the program; those of aggregation are its rounds'. A goal",
     "is for the estimate, unless it names an end of the interval. Where several training seeds are shown, each has to",
-    "meet the goal by itself, so intervals are not corrected for their number; learned rows without a seed (clones,",
-    "ablations, ACT, Diffusion) are of the first seed that was made. Privileged state is what the simulator tells and",
-    "no robot measures. Each section says when and where it was made, and with which commit if that is known.",
+    "meet the goal by itself, so intervals are not corrected for their number. Privileged state is what the simulator",
+    "tells and no robot measures. Each section says when and where it was made, and with which commit, if known.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 

@@ -6,6 +6,7 @@ from benchmarks.results.learning import (
     TOOL,
     Aggregated,
     aggregation,
+    beside_rows,
     evaluate,
     rounds_rows,
     seeds_rows,
@@ -15,12 +16,12 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
-from benchmarks.results.trainings import SEEDS, each, first_of
+from benchmarks.results.trainings import SEEDS, each
 
 EPISODES, ROUNDS = 500, 3
 _GOAL = 0.97
 _ANY_ORDER = "--task.order=random"
-_OTHERS = ("pick", "servo", "clone")
+_RULES = ("pick", "servo")
 _SHORT, _STEPS = (100, 50, 8), 3000
 
 
@@ -39,18 +40,20 @@ def pick(run: Runner, section: Section) -> None:
         _learned(run, seed)
         results = evaluate(
             run,
-            "pick_eval/others",
+            f"pick_eval/others/seed_{seed}",
             "ur5_pick",
             {"clone": f"{_folder(seed)}/round_0/policy"},
-            rules=("pick", "servo"),
+            rules=_RULES,
             options=(*TOOL, _ANY_ORDER, "--brains.servo.type=pick_servo"),
             episodes=EPISODES,
         )
-        return summary(results, *_OTHERS)
+        return summary(results, *_RULES, "clone")
 
     made = each(run, section, "pick", SEEDS, learn)
-    beside = each(run, section, "pick_others", first_of(made), others)
-    section.rows += [success_row(one, name, privileged=True) for one in beside.values() for name in _OTHERS]
+    beside = each(run, section, "pick_others", SEEDS, others)
+    first, *_ = beside.values()
+    section.rows += [success_row(first, name, privileged=True) for name in _RULES]
+    section.rows += beside_rows(beside, "clone", privileged=True)
     for seed, results in made.items():
         row = success_row(results, f"seed_{seed}", privileged=True)
         low = results["brains"][f"seed_{seed}"]["success"]["low"]
@@ -61,7 +64,7 @@ def pick(run: Runner, section: Section) -> None:
     section.remarks.append(
         "Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
         "says which is meant; none has seen an image or read a word: deaf and blind by construction. Each seed is one "
-        "of recording and training. `clone` learned from episodes of `pick_servo` alone. In "
+        "of recording and training. `clone_N` learned from episodes of `pick_servo` alone. In "
         f"{run.size(ROUNDS, 1)} further rounds the last policy drove, and the rule said in every frame what it would "
         "do. A `fault` is a stop by the cerebellum; the report gives its reason."
     )

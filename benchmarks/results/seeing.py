@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from benchmarks.results.learning import record, scores, seeds_rows, success_row, summary, time_rows, train
+from benchmarks.results.learning import beside_rows, record, scores, seeds_rows, success_row, summary, time_rows, train
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
-from benchmarks.results.trainings import SEEDS, each, first_of
+from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation import statistics
 
 EPISODES = 500
@@ -59,17 +59,17 @@ def see(run: Runner, section: Section) -> None:
     def others(seed: int) -> dict[str, Any]:
         train_perception(run, seed)
         inner = {"type": "language", "perception.path": _path(run, seed)}
-        return blanked(run, "see_eval/others", "ur5_pick", inner, _FRESH)
+        return blanked(run, f"see_eval/others/seed_{seed}", "ur5_pick", inner, _FRESH)
 
     made = each(run, section, "see", SEEDS, learn)
-    beside = each(run, section, "see_others", first_of(made), others)
+    beside = each(run, section, "see_others", SEEDS, others)
     for seed, results in made.items():
         _perceived(section, f"seed_{seed}", results["look"])
     _rows(run, section, made, [goal for _, _, goal in WORLDS])
     if not run.is_short:
         section.rows += [_wording_row(f"seed_{seed}", results["worlds"]) for seed, results in made.items()]
     section.rows += [row for seed, results in made.items() for row in _refusal_rows(f"seed_{seed}", results["asked"])]
-    section.rows += [success_row(one, name) for one in beside.values() for name in SENSES]
+    section.rows += beside_rows(beside, *SENSES)
     section.rows += time_rows(made)
     section.remarks.append(
         "The episodes are others (`--seed=202`) than those (`--seed=0`) on which the recipe of the training was chosen."
@@ -128,34 +128,33 @@ def pixels(run: Runner, section: Section) -> None:
 
     def senseless(seed: int) -> dict[str, Any]:
         inner = {"type": "learned", "path": str(run.path(end_to_end(seed)[0]))}
-        return blanked(run, "pixels_eval/blanked", "ur5_pick_pixels", inner)
+        return blanked(run, f"pixels_eval/blanked/seed_{seed}", "ur5_pick_pixels", inner)
 
-    def others(_: int) -> dict[str, Any]:
+    def others(seed: int) -> dict[str, Any]:
         small = ("--robot.camera_width=160", "--robot.camera_height=120")
         episodes, options = run.size(800, 60), ("--seed=21", *small)
         data, brains = "pixels/small", []
         record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
         for name in _OTHERS:
-            folder = f"pixels/{name}"
-            train(run, f"pixels_{name}", f"{name}_ur5_pixels", folder, data, short=("--steps=4", "--batch_size=8"))
+            folder, own, few = f"pixels/{name}/seed_{seed}", (f"--seed={seed}",), ("--steps=4", "--batch_size=8")
+            train(run, f"pixels_{name}_{seed}", f"{name}_ur5_pixels", folder, data, options=own, short=few)
             inner = {"type": "learned", "path": str(run.path(folder))}
             brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]
             brains += _without(f"blind_{name}", "images", inner)
         # After the few steps of a short run they see next to nothing, with images or without.
         names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
-        output, options = "pixels_eval/others", (_ANY, *small)
+        output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small)
         results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
         return summary(results, *names)
 
     made = each(run, section, "pixels", SEEDS, learn)
-    without = each(run, section, "pixels_blanked", first_of(made), senseless)
-    beside = each(run, section, "pixels_others", SEEDS[:1], others)
+    without = each(run, section, "pixels_blanked", SEEDS, senseless)
+    beside = each(run, section, "pixels_others", SEEDS, others)
     _rows(run, section, made, [_PIXELS_GOAL, *[None] * len(WORLDS[1:])])
-    section.rows += [success_row(one, name) for one in without.values() for name in SENSES]
+    section.rows += beside_rows(without, *SENSES)
+    names = next(iter(beside.values()))["brains"] if beside else ()
     section.rows += [
-        replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}")
-        for one in beside.values()
-        for row in (success_row(one, name) for name in one["brains"])
+        replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}") for row in beside_rows(beside, *names)
     ]
     section.rows += time_rows(made)
     section.remarks.append(

@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,11 +101,6 @@ def _making(commands: Sequence[Ran]) -> float:
     once = {one.command: one.cpu_seconds for one in commands}
     making = ("bhd-record", "bhd-train", "bhd-data")
     return sum(seconds for command, seconds in once.items() if command.startswith(making))
-
-
-def first_of(made: Mapping[int, Any]) -> tuple[int, ...]:
-    """Return the first training seed that was made, beside which a section shows other things."""
-    return tuple(sorted(made)[:1])
 
 
 def _read(path: Path) -> Training | None:
