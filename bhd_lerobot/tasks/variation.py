@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ class RandomisationConfig:
     """Ranges of domain randomisation, and what is off in every episode. It is recorded with each, in its scene.
 
     Attributes:
-        enabled: whether anything of this is done.
+        enabled: whether anything of this is done. Where it is not said, nothing is, and none of the others may be set;
+            false switches off what a configuration sets: they are at their defaults then.
         mass: an object's mass is multiplied by up to 1 + this, or divided by it.
         friction: an object's friction is multiplied by up to 1 + this, or divided by it; so is that of the fingers.
         size: an object's measures are multiplied by 1 - this to 1 + this.
@@ -43,7 +44,7 @@ class RandomisationConfig:
             frame, x right, y up, z backwards [rad].
     """
 
-    enabled: bool = False
+    enabled: bool | None = None
     mass: float = 0.5
     friction: float = 0.25
     size: float = 0.1
@@ -93,6 +94,22 @@ class RandomisationConfig:
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
+        if not self.enabled:
+            self._switch_off()
+
+    def _switch_off(self) -> None:
+        """Set ranges to their defaults, or refuse them where nobody said that they are to be off."""
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if one.name in ("enabled", *_FIXED) or value == one.default:
+                continue
+            if self.enabled is None:
+                raise ConfigError(
+                    f"randomisation.{one.name} is {value}, but randomisation.enabled is not set, so that nothing "
+                    "would vary; set --task.randomisation.enabled=true, or =false if that is what you mean."
+                )
+            setattr(self, one.name, one.default)  # what is recorded is what was in force
+        self.enabled = False
 
 
 def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Variation:

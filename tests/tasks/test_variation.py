@@ -252,3 +252,14 @@ def test_a_camera_error_that_would_not_be_honoured_is_refused() -> None:
         ConfigError, match=r"camera_error_m is \[0.0, 0.01, 0.0\], but .* --task.randomisation.enabled=true"
     ):
         RandomisationConfig(camera_error_m=[0.0, 0.01, 0.0])
+
+
+def test_a_range_without_randomisation_is_refused_unless_it_is_switched_off() -> None:
+    for name in RANGES:
+        range_ = {name: 0.04}
+        more = {"latency_s": 0.05} if name == "latency_min_s" else {}
+        with pytest.raises(ConfigError, match=r"randomisation\.\w+ is 0\.0\d, but randomisation\.enabled is not set"):
+            RandomisationConfig(**range_, **more)
+        off = RandomisationConfig(enabled=False, **range_, **more)
+        assert off == RandomisationConfig(), "what is recorded is what was in force"
+        assert off.enabled is False
