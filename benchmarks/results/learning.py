@@ -108,12 +108,12 @@ def reach(run: Runner, section: Section) -> None:
             f"reach/seed_{seed}/dagger",
             seed=seed,
             rounds=1,
-            short=(numbers[-1], numbers[0], 8),
+            short=(numbers[-1], numbers[-1], 8),  # from fewer nothing is seen to be learned
             policy=_FEW_REACH if run.is_short else (),
             options=_COARSE,
         )
         results = evaluate(
-            run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run)
+            run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run), few=48
         )
         return {**summary(results, "reach", *folders), "seconds": seconds}
 
@@ -285,9 +285,10 @@ def evaluate(
     rules: Sequence[str] = (),
     options: Sequence[str] = (),
     episodes: int = EPISODES,
+    few: int = 12,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = run.size(episodes, 12)
+    episodes = run.size(episodes, few)
     learned = [
         option
         for label, folder in brains.items()

@@ -310,6 +310,11 @@ def test_every_section_fills_its_table_from_what_its_commands_write(tmp_path: Pa
             assert re.search(r"(?i)\bdeaf(_\d)?\b", text), name
             assert re.search(r"(?i)\bblind(_\d)?\b", text), name
             assert len({row.what for row in section.rows}) == len(section.rows), name
+            # What was learned is shown of every training seed, or of all of them together; rules have none.
+            for row in section.rows:
+                rule = re.match(r"(avoidance|gap_follower|reach|pick|servo)\b(?!_)", row.what)
+                if "success" in row.what and not rule:
+                    assert re.search(r"(seed[_ ]|_)[012]\b|over [23] trainings", row.what), (name, row.what)
             commands = [one.command for one in run.commands]
             made = {int(seed) for command in commands for seed in re.findall(r"--seed=([012])\b", command)}
             wanted = {0} if is_short else ({1} if chosen == (1,) else {0, 1, 2})
