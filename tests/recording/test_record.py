@@ -312,7 +312,10 @@ def test_a_dataset_that_is_older_than_an_option_of_its_task_is_resumed_while_tha
     path.write_text(json.dumps(identity))
     for changed, named in (
         ({"task__report__dropout": 0.5}, "recording.task.report: not recorded"),
-        ({"task__randomisation__plain": 0.1}, "recording.task.randomisation.plain: not recorded"),
+        (
+            {"task__randomisation__enabled": "true", "task__randomisation__plain": 0.1},
+            "recording.task.randomisation.plain: not recorded",
+        ),
         ({"task__hold_s": 0.5}, "recording.task.hold_s: recorded 0.25, requested 0.5"),
     ):
         with pytest.raises(DatasetMismatchError, match=named):
