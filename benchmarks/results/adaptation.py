@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -143,8 +142,7 @@ def _recovery_rows(results: Any, seed: int, shown: str, shifted: str, goal: floa
     found, rows = results[shifted]["successes"], []
     share, low, high = recovered(results[_ORIGINAL]["successes"]["base"], found["base"], found["tuned"])
     for world, name in ((_ORIGINAL, "base"), (shifted, "base"), (shifted, "tuned"), (_ORIGINAL, "tuned")):
-        row = success_row(results[world], name)
-        rows.append(replace(row, what=row.what.replace(name, f"{name}_{seed}, {world}", 1)))
+        rows.append(success_row(results[world], name, shown=f"{name}_{seed}, {world}"))
     return [
         *rows,
         Row(

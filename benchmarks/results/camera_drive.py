@@ -1,7 +1,7 @@
 """The section about driving by the front camera: what its rounds of aggregation make of a driver, from three seeds."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 from benchmarks.results.learning import (
@@ -87,9 +87,8 @@ def camera_drive(run: Runner, section: Section) -> None:
 
 def _level_rows(results: Any, name: str, shown: str) -> list[Row]:
     """Return the rows of a brain's success and of its score, by the name that it is shown with."""
-    row = success_row(results, name)
     score = Row(f"{shown}: mean score", mean(results["brains"][name]["means"]["score"]))
-    return [replace(row, what=row.what.replace(name, shown, 1)), score]
+    return [success_row(results, name, shown=shown), score]
 
 
 def _learned(run: Runner, seed: int) -> Aggregated:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import yaml
@@ -123,8 +123,7 @@ def reach(run: Runner, section: Section) -> None:
     for name in (*(f"bc_{episodes}" for episodes in numbers), _HELPED):
         goal = _REACH_GOAL if name in (f"bc_{numbers[-1]}", _HELPED) else None
         for seed, results in made.items():
-            row = success_row(results, name, goal)
-            section.rows.append(replace(row, what=f"seed {seed}, {row.what}"))
+            section.rows.append(success_row(results, name, goal, shown=f"seed {seed}, {name}"))
         section.rows += seeds_rows(made, name, name)
         seconds = ", ".join(f"{results['seconds'][name]:.0f} s" for results in made.values())
         section.rows.append(Row(f"{name}: time from nothing", seconds))
@@ -332,19 +331,22 @@ def _scores(results: Any, name: str) -> list[float]:
     return [round(float(one), 6) for one in values(results, name, "score")]
 
 
-def success_row(results: Any, name: str, goal: float | None = None, *, privileged: bool = False) -> Row:
+def success_row(
+    results: Any, name: str, goal: float | None = None, *, shown: str = "", privileged: bool = False
+) -> Row:
     """Return the row of a brain's success.
 
     Args:
         results: what `summary` returned.
         name: of the brain.
         goal: what the rate should be; None if there is no goal.
+        shown: what the row calls it; its name if nothing.
         privileged: whether it acts on privileged state, where results of an earlier version do not say it.
     """
     brain = results["brains"][name]
     met = None if goal is None else brain["success"]["value"] >= goal
     told = ", from privileged state" if brain.get("privileged", privileged) else ""
-    what = f"{name}{told}: success in {brain['episodes']}"
+    what = f"{shown or name}{told}: success in {brain['episodes']}"
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
 
 
@@ -369,11 +371,11 @@ def beside_rows(made: Mapping[int, Any], *names: str, privileged: bool = False) 
         names: of the brains in each.
         privileged: as `success_row` has it.
     """
-    rows = []
+    rows: list[Row] = []
     for name in names:
-        for seed, results in made.items():
-            row = success_row(results, name, privileged=privileged)
-            rows.append(replace(row, what=row.what.replace(name, f"{name}_{seed}", 1)))
+        rows += [
+            success_row(results, name, shown=f"{name}_{seed}", privileged=privileged) for seed, results in made.items()
+        ]
         rows += seeds_rows(made, name, name)
     return rows
 

@@ -1,6 +1,6 @@
 """The section about reinforcement learning behind the collision monitor, from drivers that learned by aggregation."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -105,8 +105,7 @@ def rows(alone: Any, behind: Any, teacher: Any, seed: int, *, is_start: bool) ->
         (behind, "clone", "with the collision monitor, "),
         (behind, "ppo", "with the collision monitor, "),
     ):
-        row = success_row(results, name, privileged=True)
-        found.append(replace(row, what=f"{where}{row.what.replace(name, f'{name}_{seed}', 1)}"))
+        found.append(success_row(results, name, shown=f"{where}{name}_{seed}", privileged=True))
     brain, name = behind["brains"]["ppo"], f"ppo_{seed}"
     failures = int(brain["episodes"] - brain["successes"])
     is_met = failures <= _FAILURES_GOAL
