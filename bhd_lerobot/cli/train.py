@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bhd_lerobot.cli.start import keep_memory
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.rl.config import config_file
@@ -29,7 +30,9 @@ def algorithm_of(arguments: Sequence[str]) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-train`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:  # as a program of its own, not within another
+        keep_memory()
+        arguments = sys.argv[1:]
     algorithm = algorithm_of(arguments)
     # Only what is needed is imported: stable-baselines3 is an extra.
     part = "" if algorithm is None else "dagger." if algorithm == "dagger" else "rl."

@@ -83,7 +83,7 @@ class Learner:
         """Return the policy's input for a batch of the dataset."""
         for key in self._camera_keys:
             if key in batch and batch[key].dtype == torch.uint8:
-                batch[key] = batch[key].to(dtype=torch.float32) / 255.0
+                batch[key] = batch[key].to(dtype=torch.float32).div_(255.0)
         return self._preprocessor(batch)
 
     def step(self, batch: Batch) -> StepResult:

@@ -1,5 +1,6 @@
 """Ctrl-C in the first seconds of a command, while Python imports what it needs."""
 
+import ctypes
 import importlib
 import os
 import signal
@@ -163,3 +164,29 @@ def test_help_that_nobody_reads_to_its_end_ends_without_output(command: str) -> 
         os.close(writing)
     assert done.returncode in (0, 128 + signal.SIGPIPE)
     assert b"Traceback" not in done.stderr
+
+
+_FAULTS = """
+import resource
+import numpy as np
+from bhd_lerobot.cli.start import keep_memory
+
+def faults():  # where freed memory lies has settled after a few rounds
+    counts = []
+    for _ in range(12):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        np.empty(64 << 20, np.uint8).fill(1)
+        counts.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    return sum(counts[6:])
+
+fetched = faults()
+keep_memory()
+print(fetched, faults())
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no mallopt")
+def test_memory_that_a_batch_took_is_there_for_the_next():
+    ran = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True, cwd=ROOT)
+    fetched, kept = map(int, ran.stdout.split())
+    assert kept < fetched / 10

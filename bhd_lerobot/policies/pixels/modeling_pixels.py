@@ -250,8 +250,8 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
             return self._look(image)
         # In a training the same first images come again and again.
         thumbnails = image[..., ::_THUMBNAIL, ::_THUMBNAIL].cpu().numpy()
-        # Every pixel counts: integers, whose sum does not depend on the order.
-        sums = image.float().contiguous().view(torch.int32).flatten(1).sum(1, dtype=torch.int64).tolist()
+        # Every pixel counts: integers, whose sum does not depend on the order, also where it overflows.
+        sums = image.float().contiguous().view(torch.int32).flatten(1).sum(1, dtype=torch.int32).tolist()
         keys = [(one.tobytes(), number) for one, number in zip(thumbnails, sums, strict=True)]
         new = {key: row for row, key in enumerate(keys) if key not in self._looked}
         if new:
