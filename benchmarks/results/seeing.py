@@ -10,6 +10,7 @@ from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation import statistics
+from bhd_lerobot.training.setup import has_bfloat16
 
 EPISODES = 500
 _ANY = "--task.language=any"
@@ -138,7 +139,8 @@ def pixels(run: Runner, section: Section) -> None:
         data, brains = "pixels/small", []
         record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
         for name in _OTHERS:
-            folder, own, few = f"pixels/{name}/seed_{seed}", (f"--seed={seed}",), ("--steps=4", "--batch_size=8")
+            folder, few = f"pixels/{name}/seed_{seed}", ("--steps=4", "--batch_size=8")
+            own = (f"--seed={seed}", *(() if has_bfloat16() else ("--policy.use_amp=false",)))
             train(run, f"pixels_{name}_{seed}", f"{name}_ur5_pixels", folder, data, options=own, short=few)
             inner = {"type": "learned", "path": str(run.path(folder))}
             brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]

@@ -398,3 +398,16 @@ def test_a_configuration_that_cannot_be_honoured(
 def test_no_policy_at_all(data: Path, tmp_path: Path) -> None:
     arguments = [one for one in options(data, tmp_path / "run", {}) if "policy" not in one]
     refused(arguments, ConfigError, "No policy is given.*bhd_mlp")
+
+
+def test_mixed_precision_that_the_processor_can_only_emulate(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = options(data, tmp_path / "run", MLP, steps=2, policy__use_amp="true")
+    # A processor that has no such instruction says so, or knows nothing of it.
+    for known in ({}, {"avx512_bf16": False, "avx2": True}, {"neon": True}):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda known=known: known)
+        refused(arguments, ConfigError, r"no instructions for bfloat16.*--policy\.use_amp=false")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": False, "amx_bf16": True})
+    run_train(arguments)
+    assert [row["step"] for row in curve(tmp_path / "run")][-1] == 2
