@@ -10,7 +10,6 @@ from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation import statistics
-from bhd_lerobot.training.setup import has_bfloat16
 
 EPISODES = 500
 _ANY = "--task.language=any"
@@ -33,7 +32,7 @@ _AS_IT_IS, _OTHER_SENTENCES = 0, 3  # of these
 _WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
 _FEW = ("--steps=1200", "--eval_steps=1200")
-_FEW_TRIES = 24  # episodes of a short run of what learns so little in it that fewer would show nothing
+_FEW_EPISODES = 24  # evaluated in a short run of what learns so little in it that fewer would show nothing
 _OTHERS = ("act", "diffusion")
 SENSES = {"deaf": "instruction", "blind": "images"}
 # What the perception was trained with was chosen on the held-out episodes of seed 0; these nobody had looked at before.
@@ -126,39 +125,21 @@ def pixels(run: Runner, section: Section) -> None:
         policy, seconds = end_to_end(seed)
         name = f"seed_{seed}"
         brain = (f"--brains.{name}.type=learned", f"--brains.{name}.path={run.path(policy)}")
-        worlds = _in_worlds(run, "pixels_eval", "ur5_pick_pixels", brain, name, few=_FEW_TRIES)
+        worlds = _in_worlds(run, "pixels_eval", "ur5_pick_pixels", brain, name, few=_FEW_EPISODES)
         return {"worlds": worlds, "seconds": seconds}
 
     def senseless(seed: int) -> dict[str, Any]:
         inner = {"type": "learned", "path": str(run.path(end_to_end(seed)[0]))}
-        return blanked(run, f"pixels_eval/blanked/seed_{seed}", "ur5_pick_pixels", inner, few=_FEW_TRIES)
-
-    def others(seed: int) -> dict[str, Any]:
-        small = ("--robot.camera_width=160", "--robot.camera_height=120")
-        episodes, options = run.size(800, 60), ("--seed=21", *small)
-        data, brains = "pixels/small", []
-        record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
-        for name in _OTHERS:
-            folder, few = f"pixels/{name}/seed_{seed}", ("--steps=4", "--batch_size=8")
-            own = (f"--seed={seed}", *(() if has_bfloat16() else ("--policy.use_amp=false",)))
-            train(run, f"pixels_{name}_{seed}", f"{name}_ur5_pixels", folder, data, options=own, short=few)
-            inner = {"type": "learned", "path": str(run.path(folder))}
-            brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]
-            brains += _without(f"blind_{name}", "images", inner)
-        # After the few steps of a short run they see next to nothing, with images or without.
-        names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
-        output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small)
-        results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
-        return summary(results, *names)
+        return blanked(run, f"pixels_eval/blanked/seed_{seed}", "ur5_pick_pixels", inner, few=_FEW_EPISODES)
 
     made = each(run, section, "pixels", SEEDS, learn)
     without = each(run, section, "pixels_blanked", SEEDS, senseless)
-    beside = each(run, section, "pixels_others", SEEDS, others)
+    beside = each(run, section, "pixels_others", SEEDS, lambda seed: _stock(run, seed))
     _rows(run, section, made, [_PIXELS_GOAL, *[None] * len(WORLDS[1:])])
     section.rows += beside_rows(without, *SENSES)
     nominal = {seed: one["worlds"][str(_AS_IT_IS)] for seed, one in made.items()}
-    section.rows += [_another_row(results, f"seed_{seed}", f"seed_{seed}") for seed, results in nominal.items()]
-    section.rows += [_another_row(results, "deaf", f"deaf_{seed}") for seed, results in without.items()]
+    section.rows += [_another_row(results, f"seed_{seed}") for seed, results in nominal.items()]
+    section.rows += [_another_row(results, "deaf", shown=f"deaf_{seed}") for seed, results in without.items()]
     names = next(iter(beside.values()))["brains"] if beside else ()
     section.rows += [
         replace(row, what=f"{WORLDS[0][0]}, deaf by construction: {row.what}") for row in beside_rows(beside, *names)
@@ -182,6 +163,29 @@ def pixels(run: Runner, section: Section) -> None:
             "they have no input for words, and can do no better than to pick any one of the objects. A `blind_…` gets "
             "black images."
         )
+
+
+def _stock(run: Runner, seed: int) -> dict[str, Any]:
+    """Learn by LeRobot's own policies from images; return what `summary` does, of each with images and without."""
+    # Not at the top: that would take seconds before anything is begun.
+    from bhd_lerobot.training.setup import has_bfloat16
+
+    small = ("--robot.camera_width=160", "--robot.camera_height=120")
+    episodes, options = run.size(800, 60), ("--seed=21", *small)
+    data, brains = "pixels/small", []
+    record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
+    for name in _OTHERS:
+        folder, few = f"pixels/{name}/seed_{seed}", ("--steps=4", "--batch_size=8")
+        own = (f"--seed={seed}", *(() if has_bfloat16() else ("--policy.use_amp=false",)))
+        train(run, f"pixels_{name}_{seed}", f"{name}_ur5_pixels", folder, data, options=own, short=few)
+        inner = {"type": "learned", "path": str(run.path(folder))}
+        brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]
+        brains += _without(f"blind_{name}", "images", inner)
+    # After the few steps of a short run they see next to nothing, with images or without.
+    names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
+    output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small)
+    results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
+    return summary(results, *names)
 
 
 def _asked(run: Runner, name: str, seed: int) -> Any:
@@ -241,11 +245,11 @@ def _wording_row(name: str, worlds: Mapping[str, Any]) -> Row:
     return Row(what, value, goal, found.low >= -_WORDING_GOAL)
 
 
-def _another_row(results: Any, name: str, shown: str) -> Row:
+def _another_row(results: Any, name: str, *, shown: str = "") -> Row:
     """Return the row of how often a brain takes another object than the one that is named."""
     brain = results["brains"][name]
     found = asdict(statistics.wilson(brain["outcomes"].get("wrong_object", 0), brain["episodes"]))
-    return Row(f"{WORLDS[_AS_IT_IS][0]}: {shown} takes another object, in {brain['episodes']}", rate(found, {}))
+    return Row(f"{WORLDS[_AS_IT_IS][0]}: {shown or name} takes another object, in {brain['episodes']}", rate(found, {}))
 
 
 def blanked(

@@ -1,4 +1,4 @@
-"""How a command begins: from its first moment on, Ctrl-C is a line and status 130.
+"""How a command begins: from its first moment on, Ctrl-C is a line and status 130; how it uses threads and memory.
 
 What a command needs takes seconds to import. An interrupt in the middle of that is a traceback, or is swallowed by a
 library that catches everything; so this module imports next to nothing, and ends the process itself meanwhile.
@@ -13,9 +13,6 @@ from contextlib import contextmanager
 from types import FrameType
 
 from bhd_lerobot.command_line import INTERRUPTED, exit_status
-
-# Options of mallopt(3), by their numbers in malloc.h.
-_TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 
 
 @contextmanager
@@ -69,6 +66,9 @@ def keep_memory() -> None:
     if mallopt is not None:
         mallopt(_MMAP_MAX, 0)
         mallopt(_TRIM_THRESHOLD, -1)
+
+
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # options of mallopt(3), by their numbers in malloc.h
 
 
 def record() -> int:

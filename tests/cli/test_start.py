@@ -1,4 +1,4 @@
-"""Ctrl-C in the first seconds of a command, while Python imports what it needs."""
+"""How a command begins: Ctrl-C while Python imports what it needs, and what becomes of memory that it frees."""
 
 import ctypes
 import importlib
@@ -186,7 +186,7 @@ print(fetched, faults())
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no mallopt")
-def test_memory_that_a_batch_took_is_there_for_the_next():
+def test_memory_that_a_batch_took_is_there_for_the_next() -> None:
     ran = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True, cwd=ROOT)
     fetched, kept = map(int, ran.stdout.split())
     assert kept < fetched / 10
