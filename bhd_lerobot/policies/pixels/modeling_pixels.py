@@ -255,9 +255,11 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         keys = [(one.tobytes(), number) for one, number in zip(thumbnails, sums, strict=True)]
         new = {key: row for row, key in enumerate(keys) if key not in self._looked}
         if new:
+            # Each by itself: the last bits of a convolution depend on how many images there are, and a training that
+            # was resumed looks at them in other batches.
             with torch.no_grad():
-                cells, where = self._look(image[list(new.values())])
-            self._looked.update(zip(new, zip(cells, where, strict=True), strict=True))
+                looks = [self._look(image[row : row + 1]) for row in new.values()]
+            self._looked.update({key: (cells[0], where[0]) for key, (cells, where) in zip(new, looks, strict=True)})
         found = [self._looked[key] for key in keys]
         for key in list(self._looked)[: max(0, len(self._looked) - _KEPT)]:
             del self._looked[key]  # images that are varied anew each time would fill the memory

@@ -110,13 +110,13 @@ def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytes
     policy.train()
     first = policy.forward(samples)[0]
     again = policy.forward({key: values.flip(0) for key, values in samples.items()})[0]
-    assert looks == [8]
+    assert looks == [1] * 8
     assert torch.allclose(first, again, atol=1e-5)
     again.backward()
     optimizer.step()
     policy.eval()
     policy.forward(samples)
-    assert looks == [8, 8], "what is held out is looked at afresh"
+    assert looks == [*[1] * 8, 8], "what is held out is looked at afresh"
     changed = {
         name for name, values in policy.state_dict().items() if not torch.allclose(values, before[name], equal_nan=True)
     }
@@ -137,10 +137,21 @@ def test_an_image_that_differs_anywhere_is_another_and_not_all_are_kept(monkeypa
     for pixel in ((0, 1), (3, 5), (image.shape[-2] - 1, image.shape[-1] - 1)):
         image[2, 1, *pixel] += 0.01
         policy._cells(image)
-    assert looks == [8, 1, 1, 1]
+    assert looks == [1] * 11
     for number in range(1, 5):
         policy._cells(image + number / 100)
     assert len(policy._looked) == 20
+
+
+def test_what_is_seen_of_an_image_does_not_depend_on_the_others_of_a_batch() -> None:
+    image = batch()[IMAGE][:, 0]
+    policy = PixelsPolicy(made(perception="read before"), initialise=False).train()
+    together = policy._cells(image)
+    for parts in ((3, 5), (1, 6, 1), (1,) * 8):
+        policy._looked.clear()  # as in a training that goes on from a checkpoint
+        apart = [torch.cat(found) for found in zip(*map(policy._cells, image.split(list(parts))), strict=True)]
+        for one, other in zip(together, apart, strict=True):
+            assert torch.equal(one, other)
 
 
 def test_actions_behind_the_end_do_not_count() -> None:
