@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
-PANELS = 100  # panels on one page
-SHOWN = 200  # episodes of a run that are drawn: a panel takes 0.1 s
+SHOWN = 40  # episodes of a run that are drawn: a panel takes 0.1 s, and more are no longer looked at one by one
 
 _FREE, _WALL, _GOOD, _BAD = "#f4f1ea", "#8a8478", "#1b7f4d", "#c0392b"
 
@@ -63,39 +63,28 @@ class TrajectoryAlbum:
         chosen = [*failures, *successes[: SHOWN - len(failures)]]
         return [trajectory for _, trajectory in sorted(chosen, key=lambda one: one[0])]
 
-    def draw(self, path: Path, heading: str) -> list[Path]:
+    def draw(self, path: Path, heading: str) -> None:
         """Draw what is shown; the heading says so if that is not all."""
         shown = self.shown
         if len(shown) < self.added:
             heading += f"; {len(shown)} of them, failures before others"
-        return draw_trajectories(shown, path, heading)
+        draw_trajectories(shown, path, heading)
 
 
-def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: str) -> list[Path]:
-    """Draw every trajectory in a panel of its own; return the files, one for each page of `PANELS` panels."""
-    pages = []
-    count = max(1, math.ceil(len(trajectories) / PANELS))
-    for page in range(count):
-        chosen = trajectories[page * PANELS : (page + 1) * PANELS]
-        columns, rows = _grid(len(chosen))
-        size = 2.1 if len(chosen) > 4 else 4.0
-        # Figure without pyplot: no global state, no display.
-        figure = Figure(figsize=(size * columns + 0.2, size * 1.06 * rows + 0.7), layout="constrained")
-        figure.suptitle(heading if count == 1 else f"{heading} ({page + 1} of {count})", fontsize=11)
-        for axes, trajectory in zip(
-            np.atleast_1d(figure.subplots(rows, columns, squeeze=False).ravel()),
-            [*chosen, *[None] * (rows * columns - len(chosen))],
-            strict=True,
-        ):
-            if trajectory is None:
-                axes.set_axis_off()
-            else:
-                _draw_panel(axes, trajectory)
-        figure.supxlabel("circle: start, square: end, cross: failure", fontsize=7.5)
-        file = path if count == 1 else path.with_stem(f"{path.stem}_{page + 1:02d}")
-        figure.savefig(file, dpi=110)
-        pages.append(file)
-    return pages
+def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: str) -> None:
+    """Draw every trajectory in a panel of its own."""
+    columns, rows = _grid(len(trajectories))
+    size = 2.1 if len(trajectories) > 4 else 4.0
+    # Figure without pyplot: no global state, no display.
+    figure = Figure(figsize=(size * columns + 0.2, size * 1.06 * rows + 0.7), layout="constrained")
+    figure.suptitle(heading, fontsize=11)
+    for axes, trajectory in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, trajectories):
+        if trajectory is None:
+            axes.set_axis_off()
+        else:
+            _draw_panel(axes, trajectory)
+    figure.supxlabel("circle: start, square: end, cross: failure", fontsize=7.5)
+    figure.savefig(path, dpi=110)
 
 
 def _grid(count: int) -> tuple[int, int]:
