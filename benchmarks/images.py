@@ -4,7 +4,8 @@ Training: the same policy, the same data as video, the same number of steps, one
 `bhd_perception`, whose network is most of the work, on picks of a UR5 with two cameras; and `bhd_cnn`, a small network
 that looks at several images in a row, on drives of a TurtleBot3. Samples a second of processor time, that of all
 processes of a run counted together; once for a whole run, from the start of the program over reading and decoding to
-the last checkpoint, and once for the steps alone: the difference between a long and a short run.
+the last checkpoint, and once for the steps alone: the difference between a long and a short run. (`--whole`: only the
+former.)
 
 Rendering: images of two cameras of 96 x 96 pixels, beside MuJoCo's own renderer in its fastest settings, in turns.
 Exits with 1 if a goal is missed.
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,7 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
 CAMERAS, SIZE = ("scene", "wrist"), 96
 BATCH = 32
+PARTS = {"whole": "a run of {} steps", "steps": "its steps alone"}
 TRAIN_GOAL, RENDER_GOAL = 5.0, 0.8  # times the peer's speed
 # What is recorded to learn each policy from, and with which further options.
 RECORDINGS = {
@@ -87,18 +90,21 @@ def processor_time(program: str, policy: str, root: Path, output: Path, steps: i
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def training(folder: Path, policy: str, episodes: int, steps: int, turns: int) -> dict[str, Any]:
-    """Return samples a second of processor time of both programs, whole runs and steps alone, and their ratios."""
+def training(
+    folder: Path, policy: str, episodes: int, steps: int, *, turns: int, parts: Sequence[str]
+) -> dict[str, Any]:
+    """Return samples a second of processor time of both programs, in each part of `PARTS`, and their ratios."""
     root = record(folder, policy, episodes)
     runs: dict[tuple[str, int], list[float]] = {}
+    counts = {"whole": (steps,), "steps": (steps // 5, steps)}
     for _ in range(turns):
         for program in PROGRAMS:
-            for count in (steps // 5, steps):
+            for count in sorted({count for part in parts for count in counts[part]}):
                 seconds = processor_time(program, policy, root, folder / "run", count)
                 runs.setdefault((program, count), []).append(seconds)
     found: dict[str, Any] = {"episodes": episodes, "steps": steps, "batch_size": BATCH}
-    for what, samples in (("whole", steps * BATCH), ("steps", (steps - steps // 5) * BATCH)):
-        rates = {}
+    for what in parts:
+        rates, samples = {}, (steps if what == "whole" else steps - steps // 5) * BATCH
         for program in PROGRAMS:
             short = np.array(runs[program, steps // 5]) if what == "steps" else 0.0
             rates[program] = (samples / (np.array(runs[program, steps]) - short)).tolist()
@@ -156,6 +162,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--steps", type=int, default=500, help="of the longer training; the shorter has a fifth")
     parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--whole", action="store_true", help="whole trainings only, not the speed of their steps alone")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     results: dict[str, Any] = {}
@@ -167,12 +174,12 @@ def main() -> int:
     results["training"] = {}
     try:
         for policy in options.policies:
-            found = training(folder, policy, options.episodes, options.steps, options.turns)
+            parts = list(PARTS)[: 1 if options.whole else None]
+            found = training(folder, policy, options.episodes, options.steps, turns=options.turns, parts=parts)
             results["training"][policy] = found
-            for what, label, goal in (
-                ("whole", f"{policy}, a run of {options.steps} steps: samples per CPU s", f">= {TRAIN_GOAL:g}"),
-                ("steps", f"{policy}, its steps alone: samples per CPU s", ""),
-            ):
+            for what in parts:
+                label = f"{policy}, {PARTS[what].format(options.steps)}: samples per CPU s"
+                goal = f">= {TRAIN_GOAL:g}" if what == "whole" else ""
                 both = (shown(found[f"{what}: {program}"], ".1f") for program in PROGRAMS)
                 table.add_row(label, *both, "lerobot-train", shown(found[f"{what}: ratio"]), goal)
             if found["whole: ratio"]["median"] < TRAIN_GOAL:

@@ -299,7 +299,10 @@ def drive(
     refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in simulation.grants if not grant["granted"])
     if len(states) < 2 or episode.outcome.event.cause not in ("timeout", "success"):
         cause, robot = episode.outcome.event.cause, simulation.config.type
-        raise NotMeasuredError(f"the episode of {robot} ended with {cause}, {len(states)} ticks")
+        raise NotMeasuredError(
+            f"the episode of {robot} ended with {cause}, {len(states)} ticks. Where other programs keep the processors "
+            "busy, a loop stops by itself; run this alone"
+        )
     # The loop's warm-up, before the episode, was a segment of its own.
     due, started, ended, executed, _ = np.array([state for state in states if state[-1] == states[-1][-1]], np.int64).T
     if np.any(np.diff(executed) != 1):

@@ -113,7 +113,7 @@ def reach(run: Runner, section: Section) -> None:
             options=_COARSE,
         )
         results = evaluate(
-            run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run), few=48
+            run, f"reach_eval/seed_{seed}", "ur5_reach", folders, rules=("reach",), options=reaching(run), few=32
         )
         return {**summary(results, "reach", *folders), "seconds": seconds}
 

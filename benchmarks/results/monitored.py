@@ -16,8 +16,8 @@ _KEPT = "; PPO kept the start"
 _TASK, _RULE, _TEACHER = "turtlebot3_avoid", "avoidance", "gap_follower"
 # Too few to learn anything by: they show that the commands work.
 _SHORT = (
-    *("--steps=16000", "--critic_warmup=8192", "--env.n_envs=32"),
-    *("--validation.freq=8000", "--validation.n_episodes=8", "--validation.confirm=8"),
+    *("--steps=8000", "--critic_warmup=4096", "--env.n_envs=32"),
+    *("--validation.freq=4000", "--validation.n_episodes=8", "--validation.confirm=8"),
 )
 
 

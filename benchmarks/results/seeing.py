@@ -96,7 +96,8 @@ def record_tables(run: Runner) -> float:
 def train_perception(run: Runner, seed: int) -> float:
     """Train a perception on them; return how long that took [s]."""
     name, options = f"see_train_{seed}", (f"--seed={seed}",)
-    return train(run, name, "perception_ur5", perception_folder(seed), "see/tables", options=options, short=_FEW)
+    short = (*_FEW, "--policy.use_amp=true") if run.is_short and _has_bfloat16() else _FEW
+    return train(run, name, "perception_ur5", perception_folder(seed), "see/tables", options=options, short=short)
 
 
 def pixels(run: Runner, section: Section) -> None:
@@ -167,16 +168,13 @@ def pixels(run: Runner, section: Section) -> None:
 
 def _stock(run: Runner, seed: int) -> dict[str, Any]:
     """Learn by LeRobot's own policies from images; return what `summary` does, of each with images and without."""
-    # Not at the top: that would take seconds before anything is begun.
-    from bhd_lerobot.training.setup import has_bfloat16
-
     small = ("--robot.camera_width=160", "--robot.camera_height=120")
-    episodes, options = run.size(800, 60), ("--seed=21", *small)
+    episodes, options = run.size(800, 24), ("--seed=21", *small)
     data, brains = "pixels/small", []
     record(run, "pixels_small", "ur5_pick_pixels", data, episodes=episodes, options=options)
     for name in _OTHERS:
         folder, few = f"pixels/{name}/seed_{seed}", ("--steps=4", "--batch_size=8")
-        own = (f"--seed={seed}", *(() if has_bfloat16() else ("--policy.use_amp=false",)))
+        own = (f"--seed={seed}", *(() if _has_bfloat16() else ("--policy.use_amp=false",)))
         train(run, f"pixels_{name}_{seed}", f"{name}_ur5_pixels", folder, data, options=own, short=few)
         inner = {"type": "learned", "path": str(run.path(folder))}
         brains += [f"--brains.{name}.{key}={value}" for key, value in inner.items()]
@@ -184,8 +182,15 @@ def _stock(run: Runner, seed: int) -> dict[str, Any]:
     # After the few steps of a short run they see next to nothing, with images or without.
     names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
     output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small)
-    results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=4)
+    results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=2)
     return summary(results, *names)
+
+
+def _has_bfloat16() -> bool:
+    # Not at the top: that would take seconds before anything is begun.
+    from bhd_lerobot.training.setup import has_bfloat16
+
+    return has_bfloat16()
 
 
 def _asked(run: Runner, name: str, seed: int) -> Any:

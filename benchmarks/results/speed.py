@@ -37,7 +37,9 @@ def speed(run: Runner, section: Section) -> None:
     for measure in (
         benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-start")),
         benchmark(
-            "images", images_rows, short=("--policies=bhd_perception", "--episodes=4", "--steps=20", "--turns=1")
+            "images",
+            images_rows,
+            short=("--policies=bhd_perception", "--episodes=4", "--steps=20", "--turns=1", "--whole"),
         ),
         benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=2")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
@@ -78,6 +80,8 @@ def images_rows(results: Mapping[str, Any]) -> list[Row]:
     rows = []
     for policy, learned in results["training"].items():
         for part, what in (("whole", f"a run of {learned['steps']} steps"), ("steps", "its steps alone")):
+            if f"{part}: ratio" not in learned:  # `--whole`
+                continue
             speeds = ", ".join(
                 f"{name} {learned[f'{part}: {name}']['median']:.1f}" for name in ("bhd-train", "lerobot-train")
             )

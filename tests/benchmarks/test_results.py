@@ -31,7 +31,7 @@ from benchmarks.results.page import write_page
 from benchmarks.results.provenance import digests, provenance
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
 from benchmarks.results.section import Row, Section, mean, over_seeds
-from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
+from benchmarks.results.speed import envs_rows, evaluate_rows, images_rows, loader_rows, navigate_rows
 from bhd_lerobot import plugin  # noqa: F401 - registers our policies
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.recording.config import RecordConfig
@@ -84,6 +84,16 @@ def test_what_did_not_come_up_is_listed_with_its_reason() -> None:
     assert rows[2].value.startswith("8.0 x")
     assert rows[3].value == "not measured: 64 environments did not come up within 300 s"
     assert not summary({**speeds, BARE: [200.0, 200.0]}, {}, 64)["met"]
+
+
+def test_whole_trainings_are_shown_where_their_steps_alone_were_not_measured() -> None:
+    """Of `benchmarks.images --whole`, as short runs have it."""
+    programs = ("bhd-train", "lerobot-train")
+    one = {f"{part}: {name}": RATIO for part in ("whole", "steps") for name in (*programs, "ratio")} | {"steps": 20}
+    assert [row.met for row in images_rows({"training": {"bhd_cnn": one}})] == [None, True, None, None]
+    whole = {key: value for key, value in one.items() if not key.startswith("steps: ")}
+    rows = images_rows({"training": {"bhd_cnn": whole}})
+    assert [row.what.partition(": ")[0] for row in rows] == ["learning bhd_cnn from images, a run of 20 steps"] * 2
 
 
 def test_a_time_limit_ends_what_takes_too_long_and_nothing_else() -> None:
