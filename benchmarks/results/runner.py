@@ -1,9 +1,12 @@
 """Runs the commands that results come from, each once, and remembers what they were and how long they took."""
 
 import fcntl
+import importlib
 import json
+import multiprocessing
 import os
 import re
+import resource
 import shlex
 import shutil
 import subprocess
@@ -11,6 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from multiprocessing import reduction
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -27,6 +31,12 @@ _MODULES = {
     "bhd-eval": "bhd_lerobot.evaluation.evaluate",
     "bhd-data": "bhd_lerobot.cli.data.main",
 }
+
+
+# A start takes seconds, most of them to import PyTorch and LeRobot. A short run has more starts than it has anything
+# else: its commands are forked from a process that has imported them.
+_FORKS = multiprocessing.get_context("forkserver")
+_IMPORTED = (*_MODULES.values(), *(f"bhd_lerobot.training.{name}train" for name in ("", "dagger.", "rl.")), __name__)
 
 
 class FailedError(Exception):
@@ -143,16 +153,11 @@ class Runner:
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
         started, configs, made_by = time.perf_counter(), digests([command], REPOSITORY), provenance(REPOSITORY)
-        with log.open("w", encoding="utf-8") as file:
-            process = subprocess.Popen(
-                _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=self._held
-            )
-            # Its own processor time, and that of the processes that it waited for: others may run beside it.
-            _, ended, used = os.wait4(process.pid, 0)
-        status = process.returncode = os.waitstatus_to_exitcode(ended)
+        status, cpu_seconds = (_fork if self.is_short and arguments[0] in _MODULES else _start)(
+            arguments, log, self._held
+        )
         made = [str(self.path(one)) for one in (*makes, *resumes)]
-        spent = time.perf_counter() - started, used.ru_utime + used.ru_stime
-        ran = Ran(command, spent[0], status, spent[1], made, configs, made_by)
+        ran = Ran(command, time.perf_counter() - started, status, cpu_seconds, made, configs, made_by)
         if status not in allowed:
             tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
             raise FailedError(f"{command}\nended with status {status}. The end of {log}:\n{tail}")
@@ -222,8 +227,57 @@ def _read(note: Path) -> Ran:
     return Ran(**json.loads(note.read_text(encoding="utf-8")))
 
 
-def _executable(arguments: Sequence[str]) -> list[str]:
+# --- processes --------------------------------------------------------------------------------------------------------
+# Each returns the exit status, and the processor time [s] of the command and of the processes that it waited for.
+# Others may run beside it. What is held is left open in the command.
+
+
+def _start(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
+    """Run a command in an interpreter of its own."""
     first, *rest = arguments
-    if first == "python":
-        return [sys.executable, *rest]
-    return [sys.executable, "-m", _MODULES[first], *rest]
+    own = [sys.executable, *(() if first == "python" else ("-m", _MODULES[first])), *rest]
+    with log.open("w", encoding="utf-8") as file:
+        process = subprocess.Popen(own, cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=held)
+        _, ended, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(ended)
+    return process.returncode, used.ru_utime + used.ru_stime
+
+
+def _fork(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
+    """Run a command of ours in a process that need not import it."""
+    _FORKS.set_forkserver_preload(list(_IMPORTED))
+    used, sender = _FORKS.Pipe(duplex=False)
+    process = _FORKS.Process(target=_forked, args=(arguments, log, [_Held(one) for one in held], sender))
+    process.start()
+    sender.close()
+    process.join()
+    assert process.exitcode is not None
+    with used:
+        return process.exitcode, used.recv() if used.poll() else 0.0  # it was killed
+
+
+class _Held:
+    """A descriptor that a forked process gets."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _detached, (reduction.DupFd(self.descriptor),)
+
+
+def _detached(descriptor: Any) -> _Held:
+    return _Held(descriptor.detach())
+
+
+def _forked(arguments: Sequence[str], log: Path, held: Sequence[_Held], sender: Any) -> None:
+    os.chdir(REPOSITORY)
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(file, 1)
+    os.dup2(file, 2)
+    sys.argv = list(arguments)
+    try:
+        sys.exit(importlib.import_module(_MODULES[arguments[0]]).main())
+    finally:
+        both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        sender.send(sum(one.ru_utime + one.ru_stime for one in both))

@@ -105,7 +105,7 @@ def pixels(run: Runner, section: Section) -> None:
     recorded = record_tables(run)
     # Of most only the first frame: what is meant is learned from many tables, and picking from fewer.
     parts = {
-        "picks": (run.size(800, 150), ("--seed=21",)),
+        "picks": (run.size(800, 100), ("--seed=21",)),
         "firsts": (run.size(6_000, 800), ("--seed=500", "--task.duration_s=0.1")),
     }
     for name, (episodes, options) in parts.items():

@@ -413,6 +413,25 @@ def test_a_command_is_run_once_and_again_when_it_changed(tmp_path: Path) -> None
         run.run("note", ["python", "-c", "print('out of order'); raise SystemExit(3)"])
 
 
+def test_a_command_of_a_short_run_does_what_it_does_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There it is forked from a process that has imported it."""
+    monkeypatch.setattr(runner, "_IMPORTED", ("tests.preloaded",))  # there is one such process, for all tests
+    written: list[set[str]] = []
+    for is_short in (False, True):
+        folder = tmp_path / str(is_short)
+        descriptor = lock(folder)
+        run = Runner(folder, is_short=is_short, lock=descriptor)
+        with pytest.raises(FailedError, match="ended with status 2"):
+            run.run("wrong", ["bhd-data", "info", str(tmp_path / "nowhere")])
+        helped = run.run("help", ["bhd-data", "--help"])
+        assert helped.cpu_seconds > 0
+        assert helped.command == "bhd-data --help"
+        written.append({(folder / "notes" / f"{name}.log").read_text(encoding="utf-8") for name in ("wrong", "help")})
+        os.close(descriptor)
+    assert written[0] == written[1]
+    assert all("bhd-data" in text or "nowhere" in text for text in written[0])
+
+
 def test_what_a_stopped_command_left_is_in_nobodys_way(tmp_path: Path) -> None:
     run = Runner(tmp_path, is_short=True)
     # As our commands do: they refuse a folder that is there.
