@@ -24,7 +24,7 @@ _FEW_REACH = (
     *("--policy.hidden_dims=[256,256,256]", "--policy.optimizer_lr=2e-3"),
 )
 _FEW = ("--steps=2500", "--eval_steps=2500")
-SHORTER = ("--task.duration_s=20",)  # episodes of a short run
+SHORTER = ("--task.duration_s=30",)  # episodes of a short run
 _AVOID_TRAIN_S = 120
 _HELPED = "dagger"
 _REACH_GOAL = 0.97

@@ -181,7 +181,8 @@ def _stock(run: Runner, seed: int) -> dict[str, Any]:
         brains += _without(f"blind_{name}", "images", inner)
     # After the few steps of a short run they see next to nothing, with images or without.
     names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
-    output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small)
+    output, shorter = f"pixels_eval/others/seed_{seed}", ("--task.duration_s=10",) if run.is_short else ()
+    options = (_ANY, *small, *shorter)
     results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=2)
     return summary(results, *names)
 
