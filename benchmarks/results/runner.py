@@ -246,14 +246,19 @@ def _start(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[in
 def _fork(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
     """Run a command of ours in a process that need not import it."""
     _FORKS.set_forkserver_preload(list(_IMPORTED))
+    log.write_bytes(b"")  # here, where it is read
     used, sender = _FORKS.Pipe(duplex=False)
-    process = _FORKS.Process(target=_forked, args=(arguments, log, [_Held(one) for one in held], sender))
+    module, own = _MODULES[arguments[0]], [_Held(one) for one in held]
+    process = _FORKS.Process(target=_forked, args=(module, arguments, log, own, sender))
     process.start()
     sender.close()
     process.join()
     assert process.exitcode is not None
     with used:
-        return process.exitcode, used.recv() if used.poll() else 0.0  # it was killed
+        try:
+            return process.exitcode, float(used.recv()) if used.poll() else 0.0
+        except EOFError:  # it was killed
+            return process.exitcode, 0.0
 
 
 class _Held:
@@ -270,14 +275,14 @@ def _detached(descriptor: Any) -> _Held:
     return _Held(descriptor.detach())
 
 
-def _forked(arguments: Sequence[str], log: Path, held: Sequence[_Held], sender: Any) -> None:
+def _forked(module: str, arguments: Sequence[str], log: Path, held: Sequence[_Held], sender: Any) -> None:
     os.chdir(REPOSITORY)
-    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    file = os.open(log, os.O_WRONLY | os.O_APPEND)
     os.dup2(file, 1)
     os.dup2(file, 2)
     sys.argv = list(arguments)
     try:
-        sys.exit(importlib.import_module(_MODULES[arguments[0]]).main())
+        sys.exit(importlib.import_module(module).main())
     finally:
         both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
         sender.send(sum(one.ru_utime + one.ru_stime for one in both))

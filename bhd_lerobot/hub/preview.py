@@ -74,7 +74,8 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         )
     what = f"The first {len(trajectories)} episodes from above" if len(trajectories) > 1 else "The episode from above"
     with tempfile.TemporaryDirectory() as folder:
-        draw_trajectories(trajectories, path := Path(folder) / "trajectories.png", what)
+        path = Path(folder) / "trajectories.png"
+        draw_trajectories(trajectories, path, what)
         return (
             path.read_bytes(),
             f"{what}: the trajectory of {'the tool' if isinstance(body_of(summary.robot_type), Arm) else 'the base'}",

@@ -414,7 +414,7 @@ def test_a_command_is_run_once_and_again_when_it_changed(tmp_path: Path) -> None
 
 
 def test_a_command_of_a_short_run_does_what_it_does_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There it is forked from a process that has imported it."""
+    """There it is forked from a process that has imported it; that it is killed is a failure like any other."""
     monkeypatch.setattr(runner, "_IMPORTED", ("tests.preloaded",))  # there is one such process, for all tests
     written: list[set[str]] = []
     for is_short in (False, True):
@@ -428,6 +428,12 @@ def test_a_command_of_a_short_run_does_what_it_does_by_itself(tmp_path: Path, mo
         assert helped.command == "bhd-data --help"
         written.append({(folder / "notes" / f"{name}.log").read_text(encoding="utf-8") for name in ("wrong", "help")})
         os.close(descriptor)
+    dying = "import os, signal\ndef main():\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    (tmp_path / "dying.py").write_text(dying, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(runner._MODULES, "bhd-killed", "dying")
+    with pytest.raises(FailedError, match="ended with status -9"):
+        Runner(tmp_path, is_short=True).run("killed", ["bhd-killed"])
     assert written[0] == written[1]
     assert all("bhd-data" in text or "nowhere" in text for text in written[0])
 
