@@ -24,8 +24,9 @@ def observation_space(simulation: Simulation, task: Task, parts: tuple[str, ...]
     if "environment_state" in parts and task.environment_names:
         members["environment_state"] = spaces.Box(-np.inf, np.inf, (len(task.environment_names),), np.float32)
     if "pixels" in parts and simulation.camera_names:
-        shape = (simulation.config.camera_height, simulation.config.camera_width, 3)
-        members["pixels"] = spaces.Dict({name: spaces.Box(0, 255, shape, np.uint8) for name in simulation.camera_names})
+        members["pixels"] = spaces.Dict(
+            {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in simulation.camera_shapes.items()}
+        )
     return spaces.Dict(members)
 
 

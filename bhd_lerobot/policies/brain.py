@@ -86,6 +86,7 @@ class RobotFeatures:
         fps: frames a second [Hz].
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
         body: the robot's hardware; None if it is not known.
+        cameras: image shapes (height, width, channels) [px] by camera name; None if they are not known.
     """
 
     observation_names: Sequence[str]
@@ -93,6 +94,7 @@ class RobotFeatures:
     fps: int
     environment_names: Sequence[str] = ()
     body: Body | None = None
+    cameras: Mapping[str, tuple[int, int, int]] | None = None
 
 
 class Brain(Protocol):
@@ -120,7 +122,7 @@ class Brain(Protocol):
         """Learn what robot it will drive.
 
         Raises:
-            ConfigError: a feature that the brain needs is missing.
+            ConfigError: a feature or a camera that the brain needs is missing, or not as it needs it.
         """
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:

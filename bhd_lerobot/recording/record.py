@@ -254,15 +254,12 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
     Raises:
         BhdError: it exists and is not to be resumed, or holds something else.
     """
-    images = dict.fromkeys(
-        simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
-    )
     nq, nv = (part.shape[1] for part in simulation.physics)
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(
         simulation.observation_names,
         simulation.action_names,
-        images,
+        simulation.camera_shapes,
         physics,
         task.environment_names,
         effort_names=simulation.effort_names,

@@ -82,6 +82,7 @@ class EpisodeLoop:
                 simulation.rates.fps,
                 environment,
                 simulation.body,
+                simulation.camera_shapes,
             )
         )
 

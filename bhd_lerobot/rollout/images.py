@@ -48,8 +48,8 @@ class EpisodeImages:
             if wanted[sim] or observer is not None or self.sinks[sim] is not None:
                 self._order(sim, observer)
         if wanted.any():
-            height, width = simulation.config.camera_height, simulation.config.camera_width
-            images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
+            shapes = simulation.camera_shapes
+            images = {camera: np.zeros((simulation.n, *shapes[camera]), np.uint8) for camera in cameras}
             for sim in running:
                 if wanted[sim]:
                     for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):

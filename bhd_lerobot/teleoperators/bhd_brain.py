@@ -146,8 +146,8 @@ class BhdBrain(Teleoperator):
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment
             fps = self.config.fps or robot.config.fps
-            body = robot.simulation.body
-            self._brain.bind(RobotFeatures(robot.observation_names, robot.action_names, fps, names, body))
+            body, cameras = robot.simulation.body, robot.camera_shapes
+            self._brain.bind(RobotFeatures(robot.observation_names, robot.action_names, fps, names, body, cameras))
             self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
             self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
         seen = robot.last_observation

@@ -158,6 +158,8 @@ class LanguageBrain(PickBrain):
     def _find_objects(self, robot: RobotFeatures) -> None:
         if self.perceiver is None:
             super()._find_objects(robot)
+        elif robot.cameras is not None:
+            self.perceiver.check(robot.cameras)
 
     def _objects(self, sim: int, seen: Observation) -> Sequence[SeenObject]:
         if self.perceiver is None:

@@ -115,7 +115,7 @@ class LearnedBrain:
         return PolicyContract.load(config.path).robot_type or ANY_ROBOT
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Check that these are the features and the rate that the policy was trained on.
+        """Check that these are the features, the rate and the cameras that the policy was trained on.
 
         Raises:
             ConfigError: they are not; the message names both sides.
@@ -148,6 +148,8 @@ class LearnedBrain:
                     f"{', '.join(names[:6]) or 'none'}{', …' if len(names) > 6 else ''}. Use the robot options and the "
                     "task of its dataset."
                 )
+        if robot.cameras is not None:
+            self._check_cameras(robot.cameras)
         self._action_names = tuple(robot.action_names)
         self._next = np.zeros(0, np.int64)
 
@@ -224,6 +226,8 @@ class LearnedBrain:
 
     def _rows(self, observation: Observation, is_looking: bool) -> "Rows":
         """Return the policy's inputs of all simulations, shape (n, …); images if it looks."""
+        if is_looking:
+            self._check_cameras({name: images.shape[1:] for name, images in observation.images.items()})
         rows: Rows = {}
         for key in self.loaded.inputs:
             if key == _STATE:
@@ -233,23 +237,27 @@ class LearnedBrain:
                     raise AssertionError("The brain was bound to a task that tells something.")
                 rows[key] = observation.environment_state.astype(np.float32)
             elif is_looking:
-                rows[key] = self._image(observation, self.loaded.cameras[key], key)
+                rows[key] = observation.images[self.loaded.cameras[key]]
         return rows
 
-    def _image(self, observation: Observation, camera: str, key: str) -> NDArray[np.uint8]:
-        images = observation.images.get(camera)
-        shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
-        if images is None:
-            size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""
-            raise ConfigError(
-                f"The policy {self.config.path!r} looks at the camera {camera!r} ({key}), which this robot does not "
-                f"have. There is: {', '.join(observation.images) or 'none'}. Set --robot.camera=true{size}."
-            )
-        if shape and images.shape[1:] != shape:
-            height, width, channels = shape
-            contract = replace(self.contract, cameras={camera: (height, width, channels)})
-            contract.check(cameras={camera: images.shape[1:]}, who=f"The policy {self.config.path!r}")
-        return images
+    def _check_cameras(self, cameras: Mapping[str, tuple[int, ...]]) -> None:
+        """Check that the cameras that the policy looks at are there, and their images are of the shape that it knows.
+
+        Raises:
+            ConfigError: they are not; the message names both sides and the remedy.
+        """
+        for key, camera in self.loaded.cameras.items():
+            shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
+            if camera not in cameras:
+                size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""
+                raise ConfigError(
+                    f"The policy {self.config.path!r} looks at the camera {camera!r} ({key}), which this robot does "
+                    f"not have. There is: {', '.join(cameras) or 'none'}. Set --robot.camera=true{size}."
+                )
+            if shape and cameras[camera] != shape:
+                height, width, channels = shape
+                contract = replace(self.contract, cameras={camera: (height, width, channels)})
+                contract.check(cameras={camera: cameras[camera]}, who=f"The policy {self.config.path!r}")
 
     def _own_shape(self, key: str) -> tuple[int, ...]:
         """Return the shape of images that the policy itself says it takes, channels last; empty if it may take any."""

@@ -1,6 +1,6 @@
 """A trained `bhd_perception` as brains use it: an image in, objects with their errors out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -95,6 +95,29 @@ class Perceiver:
         self.camera: str = self._policy.config.camera
         self.image_size: tuple[int, int] = self._policy.config.image_size
 
+    def check(self, cameras: Mapping[str, Sequence[int]]) -> None:
+        """Check that the camera that it looks through is there, and its images are of the size that it knows.
+
+        Args:
+            cameras: image shapes (height, width, channels) [px] by camera name.
+
+        Raises:
+            ConfigError: they are not; the message names both sides and the remedy.
+        """
+        width, height = self.image_size
+        if self.camera not in cameras:
+            raise ConfigError(
+                f"{self.who} looks through the camera {self.camera!r}, which this robot does not have. There is: "
+                f"{', '.join(cameras) or 'none'}. Set --robot.camera=true --robot.camera_width={width} "
+                f"--robot.camera_height={height}."
+            )
+        shape = tuple(cameras[self.camera])
+        if shape != (height, width, 3):
+            raise ConfigError(
+                f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
+                f"{shape[1]} x {shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
+            )
+
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
         """Return the objects that one robot's camera shows, the surest first.
 
@@ -110,19 +133,8 @@ class Perceiver:
 
         from bhd_lerobot.policies.learned.inference import use_threads
 
-        width, height = self.image_size
-        if self.camera not in images:
-            raise ConfigError(
-                f"{self.who} looks through the camera {self.camera!r}, which this robot does not have. There is: "
-                f"{', '.join(images) or 'none'}. Set --robot.camera=true --robot.camera_width={width} "
-                f"--robot.camera_height={height}."
-            )
+        self.check({name: several.shape[1:] for name, several in images.items()})
         image = images[self.camera][sim]
-        if image.shape != (height, width, 3):
-            raise ConfigError(
-                f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
-                f"{image.shape[1]} x {image.shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
-            )
         # Along what is next to each other in memory: across the channels it takes half as long as the network.
         channels = np.ascontiguousarray(image.reshape(-1, 3).T)
         if int(channels.max()) < _DARK or float(channels.std(axis=1, dtype=np.float32).max()) < _FLAT:

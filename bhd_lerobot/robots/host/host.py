@@ -157,6 +157,11 @@ class Host(ABC):
         self._start_tick = np.zeros(n, np.int64)
         self._no_physics = np.zeros((n, 0)), np.zeros((n, 0))
 
+    @property
+    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Image shapes (height, width, channels) [px] of the cameras that are observed, by name."""
+        return dict.fromkeys(self.camera_names, (self.config.camera_height, self.config.camera_width, 3))
+
     # --- what a kind of robot defines --------------------------------------------------------------------------------
 
     @abstractmethod

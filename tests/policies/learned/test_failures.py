@@ -161,11 +161,18 @@ def test_a_camera_that_the_robot_does_not_have(is_known: bool, tmp_path: Path) -
     brain = rig.make_brain(folder)
     brain.reset(np.arange(1), [0], 1)
     seen = next(rig.observations(1, 1))
-    with pytest.raises(ConfigError, match=r"camera 'front'.*There is: none.*--robot.camera=true.*camera_width=48"):
-        brain.act(Observation(seen.names, seen.state, {}, seen.environment_state))
     small = {"front": seen.images["front"][:, ::2, ::2]}
-    with pytest.raises(ConfigError, match=r"48 x 32 px.*24 x 16 px"):
-        brain.act(Observation(seen.names, seen.state, small, seen.environment_state))
+    for images, message in (
+        ({}, r"camera 'front'.*There is: none.*--robot.camera=true.*camera_width=48"),
+        (small, r"48 x 32 px.*24 x 16 px"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            brain.act(Observation(seen.names, seen.state, images, seen.environment_state))
+        shapes = {name: several.shape[1:] for name, several in images.items()}
+        with pytest.raises(ConfigError, match=message):
+            brain.bind(RobotFeatures(rig.STATE, rig.ACTIONS, 10, rig.ENVIRONMENT, cameras=shapes))
+    shapes = {name: several.shape[1:] for name, several in seen.images.items()}
+    brain.bind(RobotFeatures(rig.STATE, rig.ACTIONS, 10, rig.ENVIRONMENT, cameras=shapes))
 
 
 @pytest.mark.parametrize("blind", [False, True])

@@ -105,6 +105,23 @@ def test_without_a_task_that_tells_anything_the_brain_is_recorded(run: Path, tmp
     assert info["total_episodes"] == 2
 
 
+@each_case(
+    ("robot", "message"),
+    [
+        ({"robot__camera": None}, "There is: none"),
+        ({"robot__camera_height": 48}, "images of 96 x 72 px; .* 96 x 48"),
+    ],
+)
+def test_a_recording_that_it_cannot_see_in_makes_no_dataset(
+    run: Path, tmp_path: Path, robot: dict[str, Any], message: str
+) -> None:
+    root = tmp_path / "episodes"
+    brain = {"brain__type": "language", "brain__perception__path": str(run)}
+    with pytest.raises(ConfigError, match=message):
+        run_record(root, **ARM, **(CAMERA | robot), **brain, dataset__num_episodes=1)
+    assert not root.exists()
+
+
 def images(value: Any = None, height: int = HEIGHT, width: int = WIDTH, camera: str = "scene") -> dict[str, np.ndarray]:
     one = np.random.default_rng(0).integers(0, 255, (1, height, width, 3), np.uint8)
     if value is not None:
