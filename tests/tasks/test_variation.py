@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
+from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
@@ -263,3 +266,19 @@ def test_a_range_without_randomisation_is_refused_unless_it_is_switched_off() ->
         off = RandomisationConfig(enabled=False, **range_, **more)
         assert off == RandomisationConfig(), "what is recorded is what was in force"
         assert off.enabled is False
+
+
+def test_a_range_on_top_of_a_shipped_configuration_is_used_or_refused() -> None:
+    asked = set()
+    for path in sorted((Path(__file__).resolve().parents[2] / "configs" / "record").glob("*.yaml")):
+        options = [f"--config_path={path}", "--task.randomisation.light=0.123"]
+        task = parse(RecordConfig, options[:1]).task
+        if "randomisation" not in vars(task):
+            continue
+        if task.randomisation.enabled:
+            assert parse(RecordConfig, options).task.randomisation.light == 0.123
+        else:
+            with pytest.raises(ConfigError, match=r"randomisation\.light is 0\.123"):
+                parse(RecordConfig, options)
+        asked.add(path.stem)
+    assert {"ur5_pick", "ur5_reach", "ur5_look"} <= asked
