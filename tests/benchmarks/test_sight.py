@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks import sight
+from benchmarks.realtime import NotMeasuredError
 from benchmarks.results.speed import sight_rows
-from benchmarks.sight import BESIDE, GOALS, HEIGHT, NOOP, PERCEPTION, SAME, WIDTH, rows, untrained_perception
+from benchmarks.sight import ATTEMPTS, BESIDE, GOALS, HEIGHT, NOOP, PERCEPTION, SAME, WIDTH, rows, untrained_perception
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
 
@@ -15,7 +17,7 @@ from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptio
 def block(brain: str, number: int, wake: float, *, core: str = SAME, rate: float = 25.0) -> dict[str, Any]:
     times = {"wake_p50": wake / 2, "wake_p99": wake, "wake_max": 3 * wake, "tick_p99": 100.0}
     brains = {"frames_per_s": rate, "cpu_ms": 9.0, "inference_p50": 8.0, "inference_p99": 9.0, "objects": None}
-    counts = {"ticks": 5000, "late": 5, "missed": 1, "late_share": 1e-3}
+    counts = {"ticks": 5000, "late": 5, "missed": 1, "late_share": 1e-3, "stops": 0}
     return {"round": number, "core": core, "brain": brain, **times, **brains, **counts}
 
 
@@ -45,6 +47,30 @@ def test_more_late_ticks_than_beside_noop_in_the_same_round_miss_the_goal() -> N
         table = rows(blocks)
         assert table[1]["met"] == met
         assert [row.met for row in sight_rows({"rows": table, "goals": GOALS})] == [True, met, True]
+
+
+def test_a_block_whose_robot_was_stopped_is_run_again_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def run(name: str, *_: Any) -> dict[str, Any]:
+        asked.append(name)
+        if name == PERCEPTION and asked.count(name) <= stopped:
+            raise NotMeasuredError("the episode ended with fault")
+        found = block(name, 0, 10.0)
+        return {key: found[key] for key in found.keys() - {"core", "stops"}}
+
+    monkeypatch.setattr(sight, "block", run)
+    for stopped in range(ATTEMPTS):
+        asked.clear()
+        table = rows(sight.measure(1, 1.0, {}))
+        assert asked.count(PERCEPTION) == stopped + len(table) // 3
+        assert {row["brain"]: row["stops"] for row in table if row["core"] == SAME}[PERCEPTION] == stopped
+        told = sight_rows({"rows": table, "goals": GOALS})[1].value
+        assert (f"stopped and run again {stopped}, beside noop 0" in told) == bool(stopped)
+    stopped = ATTEMPTS
+    asked.clear()
+    with pytest.raises(NotMeasuredError, match="ended with fault"):
+        sight.measure(1, 1.0, {})
 
 
 def test_the_untrained_perception_finds_as_many_objects_as_there_can_be(tmp_path: Path) -> None:
