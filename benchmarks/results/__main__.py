@@ -47,6 +47,7 @@ GROUPS: tuple[tuple[tuple[str, str, Measure], ...], ...] = (
     ),
     (("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),),
 )
+_SMALL = ("avoid", "navigate")  # fill what the others leave of the cores at the end
 LAST = ("speed", "Speed", speed)  # alone, whatever else runs side by side
 MEASURES = (*(one for group in GROUPS for one in group), LAST)
 _FOLDER, _PAGE = "outputs/results", "docs/reference/results.md"
@@ -124,7 +125,8 @@ def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, desc
     failures = []
     try:
         # The largest first, so that none of them is left to run alone at the end.
-        for stage, width in ((sorted(GROUPS, key=len, reverse=True), jobs), ([(LAST,)], 1)):
+        groups = sorted(GROUPS, key=lambda group: (group[0][0] in _SMALL, -len(group)))
+        for stage, width in ((groups, jobs), ([(LAST,)], 1)):
             with ThreadPoolExecutor(width) as pool:
                 running = [pool.submit(make, group) for group in stage]
                 try:
