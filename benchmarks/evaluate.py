@@ -49,6 +49,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=tuple(TASKS), default="avoid")
     parser.add_argument("--path", help="checkpoint of the policy; a small one is trained if none is given")
+    parser.add_argument("--demonstrations", type=int, default=40, help="episodes that the small policy learns from")
     parser.add_argument("--episodes", type=int, default=200, help="episodes of a run, of both")
     parser.add_argument("--n_envs", type=int, default=50, help="simulations side by side, of both")
     parser.add_argument("--turns", type=int, default=3)
@@ -58,7 +59,7 @@ def main() -> int:
     logging.disable(logging.INFO)
     turns: list[Turn] = []
     with tempfile.TemporaryDirectory() as folder:
-        path = args.path or train_policy(args.task, Path(folder))
+        path = args.path or train_policy(args.task, Path(folder), args.demonstrations)
         for turn in range(-1, args.turns):
             # The first is not counted.
             episodes = min(2, args.n_envs) if turn < 0 else args.episodes
@@ -164,7 +165,7 @@ def run_stock(task: str, path: str, episodes: int, n_envs: int, seed: int) -> tu
     return time.perf_counter() - started, info["per_episode"]
 
 
-def train_policy(task: str, folder: Path) -> str:
+def train_policy(task: str, folder: Path, demonstrations: int) -> str:
     """Record episodes of a rule and train a small policy on them; return the run's folder."""
     robot, _, brain = TASKS[task]
     data, run = folder / "data", folder / "train"
@@ -174,7 +175,7 @@ def train_policy(task: str, folder: Path) -> str:
         f"--brain.type={brain}",
         "--dataset.repo_id=benchmark/evaluate",
         f"--dataset.root={data}",
-        "--dataset.num_episodes=40",
+        f"--dataset.num_episodes={demonstrations}",
         "--n_envs=20",
         "--preview_video=false",
         f"--output_dir={folder / 'record'}",

@@ -43,7 +43,7 @@ def speed(run: Runner, section: Section) -> None:
         ),
         benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=2")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
-        benchmark("evaluate", evaluate_rows, short=("--episodes=4", "--n_envs=4", "--turns=1")),
+        benchmark("evaluate", evaluate_rows, short=("--demonstrations=8", "--episodes=4", "--n_envs=4", "--turns=1")),
     ):
         measure(run, section)
     section.remarks.append(
