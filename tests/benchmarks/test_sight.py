@@ -65,8 +65,11 @@ def test_a_block_whose_robot_was_stopped_is_run_again_and_counted(monkeypatch: p
         table = rows(sight.measure(1, 1.0, {}))
         assert asked.count(PERCEPTION) == stopped + len(table) // 3
         assert {row["brain"]: row["stops"] for row in table if row["core"] == SAME}[PERCEPTION] == stopped
-        told = sight_rows({"rows": table, "goals": GOALS})[1].value
-        assert (f"stopped and run again {stopped}, beside noop 0" in told) == bool(stopped)
+        told = sight_rows({"rows": table, "goals": GOALS})[1]
+        assert (f"stopped and run again {stopped}, beside noop 0" in told.value) == bool(stopped)
+        assert told.met == (not stopped)
+        missed = [(row["core"], row["brain"]) for row in table if row.get("met") is False]
+        assert missed == ([(SAME, PERCEPTION)] if stopped else [])
     stopped = ATTEMPTS
     asked.clear()
     with pytest.raises(NotMeasuredError, match="ended with fault"):

@@ -103,6 +103,16 @@ class LanguageBrain(PickBrain):
         """Whether it is told where the objects are, because it does not see for itself."""
         return self.perceiver is None
 
+    def bind(self, robot: RobotFeatures) -> None:
+        """Find the gripper, and the objects or the camera that shows them.
+
+        Raises:
+            ConfigError: one of them is missing, or the camera's images are not of the size that the perception knows.
+        """
+        super().bind(robot)
+        if self.perceiver is not None and robot.cameras is not None:
+            self.perceiver.check(robot.cameras)
+
     def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations it is about to look at something, shape (n,)."""
         return np.array([self._is_looking(sim, results.get(sim, ())) for sim in range(len(self._pending))], np.bool_)
@@ -158,8 +168,6 @@ class LanguageBrain(PickBrain):
     def _find_objects(self, robot: RobotFeatures) -> None:
         if self.perceiver is None:
             super()._find_objects(robot)
-        elif robot.cameras is not None:
-            self.perceiver.check(robot.cameras)
 
     def _objects(self, sim: int, seen: Observation) -> Sequence[SeenObject]:
         if self.perceiver is None:
