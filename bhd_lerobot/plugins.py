@@ -108,6 +108,9 @@ def body_of(robot_type: str | None) -> MobileBase | Arm | None:
 def _installed() -> list[tuple[str, Callable[[], Any]]]:
     found: dict[str, Callable[[], Any]] = {}
     for distribution in metadata.distributions():
+        # Python tells it from the folder's name; to read all metadata takes a tenth of a second.
+        if not getattr(distribution, "_normalized_name", PREFIXES[0]).startswith(PREFIXES):
+            continue
         name = str(distribution.metadata["Name"] or "")
         if name.startswith(PREFIXES) and name != _OURS:
             found[name] = partial(importlib.import_module, name)

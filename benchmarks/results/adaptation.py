@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.results.learning import (
     beside_rows,
     evaluate,
+    picking,
     reach_folder,
     reach_numbers,
     reaching,
@@ -103,7 +104,7 @@ def move_camera(run: Runner, section: Section) -> None:
         found: dict[str, Any] = {"seconds": seconds}
         for world, shift in ((_ORIGINAL, ()), (_ELSEWHERE, _MOVED)):
             output = f"camera_eval/seed_{seed}/{'moved' if shift else 'original'}"
-            rules, options = tuple(folders), (*brains, *_STILL, *shift)
+            rules, options = tuple(folders), (*brains, *_STILL, *shift, *picking(run))
             results = evaluate(run, output, "ur5_pick", {}, rules=rules, baseline="base", options=options)
             found[world] = {**summary(results, *folders), **_successes(results, folders)}
         return found

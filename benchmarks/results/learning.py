@@ -24,7 +24,8 @@ _FEW_REACH = (
     *("--policy.hidden_dims=[256,256,256]", "--policy.optimizer_lr=2e-3"),
 )
 _FEW = ("--steps=2500", "--eval_steps=2500")
-SHORTER = ("--task.duration_s=30",)  # episodes of a short run
+SHORTER = ("--task.duration_s=30",)  # drives of a short run
+SHORTER_PICKS = ("--task.duration_s=8",)  # a pick takes 5 s; those that are stuck would be most of the frames
 _AVOID_TRAIN_S = 120
 _HELPED = "dagger"
 _REACH_GOAL = 0.97
@@ -167,6 +168,11 @@ def train_reach(run: Runner, seed: int, episodes: int) -> float:
 def roaming(run: Runner) -> tuple[str, ...]:
     """Return the options of episodes in which it is reported what ground a driver has visited."""
     return "--task.trail=true", *(SHORTER if run.is_short else ())
+
+
+def picking(run: Runner) -> tuple[str, ...]:
+    """Return the options of episodes of the pick task."""
+    return SHORTER_PICKS if run.is_short else ()
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------

@@ -3,11 +3,13 @@
 from typing import Any
 
 from benchmarks.results.learning import (
+    SHORTER_PICKS,
     TOOL,
     Aggregated,
     aggregation,
     beside_rows,
     evaluate,
+    picking,
     rounds_rows,
     seeds_rows,
     success_row,
@@ -23,14 +25,14 @@ _GOAL = 0.97
 _ANY_ORDER = "--task.order=random"
 _RULES = ("pick", "servo")
 # Of a short run. What the corrections add is not learned from fewer episodes, or in fewer steps, of which small batches
-# are more in the same time. A pick takes 5 s; those that are stuck would be most of the frames.
-_SHORT, _FEW, _SHORTER = (100, 100, 8), ("--steps=8000", "--batch_size=64"), ("--task.duration_s=8",)
+# are more in the same time.
+_SHORT, _FEW = (100, 100, 8), ("--steps=8000", "--batch_size=64")
 _FEW_EPISODES = 48
 
 
 def pick(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
-    picking = (*TOOL, _ANY_ORDER, *(_SHORTER if run.is_short else ()))
+    driving = (*TOOL, _ANY_ORDER, *picking(run))
 
     def learn(seed: int) -> dict[str, Any]:
         policy, seconds, rounds = _learned(run, seed)
@@ -40,7 +42,7 @@ def pick(run: Runner, section: Section) -> None:
             f"pick_eval/{name}",
             "ur5_pick",
             {name: policy},
-            options=picking,
+            options=driving,
             episodes=EPISODES,
             few=_FEW_EPISODES,
         )
@@ -54,7 +56,7 @@ def pick(run: Runner, section: Section) -> None:
             "ur5_pick",
             {"clone": f"{_folder(seed)}/round_0/policy"},
             rules=_RULES,
-            options=(*picking, "--brains.servo.type=pick_servo"),
+            options=(*driving, "--brains.servo.type=pick_servo"),
             episodes=EPISODES,
             few=_FEW_EPISODES,
         )
@@ -85,7 +87,7 @@ def _learned(run: Runner, seed: int) -> Aggregated:
     name, config = f"pick_train_{seed}", "dagger_ur5_pick"
     few = _FEW if run.is_short else ()
     return aggregation(
-        run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, policy=few, options=_SHORTER
+        run, name, config, _folder(seed), seed=seed, rounds=ROUNDS, short=_SHORT, policy=few, options=SHORTER_PICKS
     )
 
 

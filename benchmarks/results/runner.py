@@ -32,11 +32,17 @@ _MODULES = {
     "bhd-data": "bhd_lerobot.cli.data.main",
 }
 
-
 # A start takes seconds, most of them to import PyTorch and LeRobot. A short run has more starts than it has anything
-# else: its commands are forked from a process that has imported them.
+# else: its commands are forked from a process that has imported them. Not the benchmarks of processes and of MuJoCo's
+# own renderer, which depend on what was started and imported before them.
 _FORKS = multiprocessing.get_context("forkserver")
-_IMPORTED = (*_MODULES.values(), *(f"bhd_lerobot.training.{name}train" for name in ("", "dagger.", "rl.")), __name__)
+_FORKED = tuple(f"benchmarks.{name}" for name in ("evaluate", "loader", "navigate", "refusals"))
+_IMPORTED = (
+    *_MODULES.values(),
+    *(f"bhd_lerobot.training.{name}train" for name in ("", "dagger.", "rl.")),
+    *_FORKED,
+    __name__,
+)
 
 
 class FailedError(Exception):
@@ -153,9 +159,13 @@ class Runner:
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
         started, configs, made_by = time.perf_counter(), digests([command], REPOSITORY), provenance(REPOSITORY)
-        status, cpu_seconds = (_fork if self.is_short and arguments[0] in _MODULES else _start)(
-            arguments, log, self._held
-        )
+        module, own = _module(arguments)
+        if self.is_short and module in (*_MODULES.values(), *_FORKED):
+            called = module if arguments[0] == "python" else arguments[0]
+            status, cpu_seconds = _fork(module, [called, *own], log, self._held)
+        else:
+            start = [sys.executable, *(arguments[1:] if module is None else ("-m", module, *own))]
+            status, cpu_seconds = _start(start, log, self._held)
         made = [str(self.path(one)) for one in (*makes, *resumes)]
         ran = Ran(command, time.perf_counter() - started, status, cpu_seconds, made, configs, made_by)
         if status not in allowed:
@@ -232,23 +242,29 @@ def _read(note: Path) -> Ran:
 # Others may run beside it. What is held is left open in the command.
 
 
+def _module(arguments: Sequence[str]) -> tuple[str | None, Sequence[str]]:
+    """Return the module that a command line runs, None if it runs something else, and the module's own arguments."""
+    first, *rest = arguments
+    if first != "python":
+        return _MODULES[first], rest
+    return (rest[1], rest[2:]) if rest[:1] == ["-m"] else (None, rest)
+
+
 def _start(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
     """Run a command in an interpreter of its own."""
-    first, *rest = arguments
-    own = [sys.executable, *(() if first == "python" else ("-m", _MODULES[first])), *rest]
     with log.open("w", encoding="utf-8") as file:
-        process = subprocess.Popen(own, cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=held)
+        process = subprocess.Popen(arguments, cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, pass_fds=held)
         _, ended, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(ended)
     return process.returncode, used.ru_utime + used.ru_stime
 
 
-def _fork(arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
-    """Run a command of ours in a process that need not import it."""
+def _fork(module: str, arguments: Sequence[str], log: Path, held: Sequence[int]) -> tuple[int, float]:
+    """Run the `main` of a module in a process that need not import it."""
     _FORKS.set_forkserver_preload(list(_IMPORTED))
     log.write_bytes(b"")  # here, where it is read
     used, sender = _FORKS.Pipe(duplex=False)
-    module, own = _MODULES[arguments[0]], [_Held(one) for one in held]
+    own = [_Held(one) for one in held]
     process = _FORKS.Process(target=_forked, args=(module, arguments, log, own, sender))
     process.start()
     sender.close()

@@ -5,7 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from benchmarks.results.learning import beside_rows, record, scores, seeds_rows, success_row, summary, time_rows, train
+from benchmarks.results.learning import (
+    beside_rows,
+    picking,
+    record,
+    scores,
+    seeds_rows,
+    success_row,
+    summary,
+    time_rows,
+    train,
+)
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, rate
 from benchmarks.results.trainings import SEEDS, each
@@ -181,8 +191,7 @@ def _stock(run: Runner, seed: int) -> dict[str, Any]:
         brains += _without(f"blind_{name}", "images", inner)
     # After the few steps of a short run they see next to nothing, with images or without.
     names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
-    output, shorter = f"pixels_eval/others/seed_{seed}", ("--task.duration_s=10",) if run.is_short else ()
-    options = (_ANY, *small, *shorter)
+    output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small, *picking(run))
     results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=2)
     return summary(results, *names)
 
@@ -222,7 +231,7 @@ def _in_worlds(
     """Evaluate a brain in each world; return what `summary` does, by the number of the world."""
     found = {}
     for number, (_, options, _) in _worlds(run):
-        place, every = f"{output}/{name}/world_{number}", (*options, *more)
+        place, every = f"{output}/{name}/world_{number}", (*options, *more, *picking(run))
         results = _evaluate(run, place, config, brain, every, names=(name,), few=few)
         found[str(number)] = summary(results, name)
     return found
@@ -264,7 +273,8 @@ def blanked(
     """Evaluate a brain that gets no instruction, or no images."""
     brains = [one for name, sense in SENSES.items() for one in _without(name, sense, inner)]
     names = tuple(SENSES)
-    results = _evaluate(run, output, config, brains, (_ANY, *options), names=names, episodes=_BESIDE, few=few)
+    every = (_ANY, *options, *picking(run))
+    results = _evaluate(run, output, config, brains, every, names=names, episodes=_BESIDE, few=few)
     return summary(results, *SENSES)
 
 

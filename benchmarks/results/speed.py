@@ -35,7 +35,7 @@ def benchmark(
 def speed(run: Runner, section: Section) -> None:
     """Loader, environments and evaluation, each beside its peers in one run."""
     for measure in (
-        benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-start")),
+        benchmark("loader", loader_rows, short=("--episodes", "20", "4", "--repeats=1", "--seconds=0.5", "--no-start")),
         benchmark(
             "images",
             images_rows,

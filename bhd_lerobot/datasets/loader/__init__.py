@@ -7,6 +7,7 @@ __all__ = [
     "frame_cache",
     "gather",
     "loader",
+    "metadata",
     "order",
     "selection",
     "source",

@@ -33,10 +33,10 @@ def local_metadata(
         ConfigError: a revision is named of a dataset that is on this machine, where nobody knows which it is.
         DatasetError: it is not on this machine, and downloading it failed.
     """
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
+    from bhd_lerobot.datasets.loader.metadata import Metadata
     from bhd_lerobot.datasets.loader.table import checked
 
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
@@ -47,7 +47,7 @@ def local_metadata(
         )
     complete_interrupted(folder)
     try:
-        meta = checked(LeRobotDatasetMetadata(repo_id, root=root, revision=revision))
+        meta = checked(Metadata(repo_id, root=root, revision=revision))
         wanted = episodes if select is None else select(meta)
         if _missing(meta, wanted):
             meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta

@@ -35,9 +35,9 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
         found = "has no meta/info.json" if root.is_dir() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}. Record one with bhd-record.")
     load_info(root)  # says what is wrong with it, which LeRobot does not
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.datasets.loader.metadata import Metadata  # seconds to import
 
-    return checked(LeRobotDatasetMetadata(root.name, root=root))
+    return checked(Metadata(root.name, root=root))
 
 
 def checked(meta: "LeRobotDatasetMetadata") -> "LeRobotDatasetMetadata":
