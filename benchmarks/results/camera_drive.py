@@ -21,7 +21,7 @@ from benchmarks.results.trainings import SEEDS, each
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES, ROUNDS = 500, 2
-_SHORT, _STEPS = (20, 10, 4), 600
+_SHORT, _STEPS = (20, 10, 2), 600
 _SUCCESS_GOAL = 0.9
 _RULE, _TEACHER = "avoidance", "gap_follower"
 _BESIDE = ("clone", "blind")

@@ -258,9 +258,10 @@ def aggregation(
         command += [f"--{key}={value}" for key, value in zip(names, short, strict=True)]
         policy = (*policy, *(() if steps is None else (f"--steps={steps}",)))
     parts = yaml.safe_load((REPOSITORY / path).read_text(encoding="utf-8"))
-    if run.is_short and options:
-        for part in ("expert", "learner", "evaluation"):
-            command.append(f"--{part}.options={json.dumps([*parts[part].get('options', ()), *options])}")
+    if run.is_short:
+        unseen = ("--preview_video=false",)
+        for part, more in {"expert": unseen, "learner": unseen, "evaluation": ()}.items():
+            command.append(f"--{part}.options={json.dumps([*parts[part].get('options', ()), *more, *options])}")
     if data:
         command.append(f"--data=[{', '.join(data)}]")
     if policy:

@@ -17,7 +17,7 @@ _TASK, _RULE, _TEACHER = "turtlebot3_avoid", "avoidance", "gap_follower"
 # Too few to learn anything by: they show that the commands work.
 _SHORT = (
     *("--steps=8000", "--critic_warmup=4096", "--env.n_envs=32"),
-    *("--validation.freq=4000", "--validation.n_episodes=8", "--validation.confirm=8"),
+    *("--validation.freq=4000", "--validation.n_episodes=4", "--validation.confirm=4"),
 )
 
 
