@@ -41,7 +41,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
 _AS_IT_IS, _OTHER_SENTENCES = 0, 3  # of these
 _WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
-_FEW = ("--steps=1200", "--eval_steps=1200")
+_FEW, _FEW_PIXELS = (tuple(f"--{name}={steps}" for name in ("steps", "eval_steps")) for steps in (1000, 1200))
 _FEW_EPISODES = 24  # evaluated in a short run of what learns so little in it that fewer would show nothing
 _OTHERS = ("act", "diffusion")
 SENSES = {"deaf": "instruction", "blind": "images"}
@@ -128,8 +128,8 @@ def pixels(run: Runner, section: Section) -> None:
     def end_to_end(seed: int) -> tuple[str, float]:
         seeing, policy = train_perception(run, seed), f"pixels/seed_{seed}"
         options = (f"--seed={seed}", f"--policy.perception={run.path(perception_folder(seed))}")
-        name, short = f"pixels_train_{seed}", ("--steps=1200", "--eval_steps=1200")
-        seconds = train(run, name, "pixels_ur5_pick", policy, "pixels/all", options=options, short=short)
+        name = f"pixels_train_{seed}"
+        seconds = train(run, name, "pixels_ur5_pick", policy, "pixels/all", options=options, short=_FEW_PIXELS)
         return policy, recorded + seeing + seconds
 
     def learn(seed: int) -> dict[str, Any]:
@@ -191,7 +191,8 @@ def _stock(run: Runner, seed: int) -> dict[str, Any]:
         brains += _without(f"blind_{name}", "images", inner)
     # After the few steps of a short run they see next to nothing, with images or without.
     names = _OTHERS if run.is_short else (*_OTHERS, *(f"blind_{name}" for name in _OTHERS))
-    output, options = f"pixels_eval/others/seed_{seed}", (_ANY, *small, *picking(run))
+    output, shorter = f"pixels_eval/others/seed_{seed}", ("--task.duration_s=2",) if run.is_short else ()
+    options = (_ANY, *small, *shorter)
     results = _evaluate(run, output, "ur5_pick_pixels", brains, options, names=names, episodes=_BESIDE, few=2)
     return summary(results, *names)
 

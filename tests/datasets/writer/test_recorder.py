@@ -59,8 +59,9 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("both")
     theirs, ours = folder / "theirs", folder / "ours"
     # LeRobot cannot join files with B-frames when an episode is a single frame.
-    encoder = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast", extra_options={"bf": 0})
-    video = VideoSettings(extra_options={"bf": 0})
+    extra = {"bf": 0, "mbtree": 0}
+    encoder = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast", extra_options=extra)
+    video = VideoSettings(extra_options=extra)
     dataset = LeRobotDataset.create(
         "t/theirs", 10, json.loads(json.dumps(FEATURES)) | FEATURES, root=theirs, robot_type="toy", rgb_encoder=encoder
     )
