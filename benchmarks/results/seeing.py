@@ -41,7 +41,7 @@ WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
 _AS_IT_IS, _OTHER_SENTENCES = 0, 3  # of these
 _WORDING_GOAL = 0.05  # the share of episodes that other sentences may cost
 _PIXELS_GOAL = 0.6
-_FEW, _FEW_PIXELS = (tuple(f"--{name}={steps}" for name in ("steps", "eval_steps")) for steps in (1000, 1200))
+_FEW, _FEW_PIXELS = ("--steps=1000", "--eval_steps=1000"), ("--steps=1200", "--eval_steps=1200")
 _FEW_EPISODES = 24  # evaluated in a short run of what learns so little in it that fewer would show nothing
 _OTHERS = ("act", "diffusion")
 SENSES = {"deaf": "instruction", "blind": "images"}

@@ -41,7 +41,7 @@ def speed(run: Runner, section: Section) -> None:
             images_rows,
             short=("--policies=bhd_perception", "--episodes=4", "--steps=10", "--turns=1", "--whole"),
         ),
-        benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=1")),
+        benchmark("sight", sight_rows, short=("--rounds=1", "--seconds=2")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
         benchmark("evaluate", evaluate_rows, short=("--demonstrations=8", "--episodes=4", "--n_envs=4", "--turns=1")),
     ):
