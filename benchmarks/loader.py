@@ -65,7 +65,10 @@ def record_dataset(root: Path, name: str, episodes: int) -> str:
     recording = multiprocessing.get_context("fork").Process(target=_record, args=(arguments, log))
     recording.start()
     recording.join()
-    return log.read_text(encoding="utf-8", errors="replace").strip() if recording.exitcode else ""
+    if recording.exitcode == 0:
+        return ""
+    said = log.read_text(encoding="utf-8", errors="replace").strip() if log.exists() else ""
+    return said or f"bhd-record ended with status {recording.exitcode}."
 
 
 def _record(arguments: list[str], log: Path) -> None:

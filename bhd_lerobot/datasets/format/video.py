@@ -72,7 +72,7 @@ class VideoSettings:
             if self.vcodec in ("h264", "libx264"):
                 # With AVX-512, x264's macroblock tree reads past the end of a row that is no multiple of 8 blocks wide:
                 # of encoders side by side, one in 15 made another stream of the same images of 64 x 48 pixels. With key
-                # frames this close it has nothing to do.
+                # frames as close as ours it has nothing to do.
                 options["mbtree"] = 0
         options = {**self.extra_options, **{key: value for key, value in options.items() if value is not None}}
         return {key: str(value) for key, value in options.items()}

@@ -3,6 +3,7 @@
 import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets import Dataset
+from datasets.table import table_cast
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_info, load_stats, load_tasks
 from lerobot.datasets.utils import EPISODES_DIR, check_version_compatibility
@@ -25,11 +26,14 @@ class Metadata(LeRobotDatasetMetadata):
 
     def _episodes(self) -> Dataset:
         folder = self.root / EPISODES_DIR
-        tables = []
+        tables: list[pa.Table] = []
         for path in sorted(folder.glob("*/*.parquet")):
             with pq.ParquetFile(path) as file:
                 names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                tables.append(file.read(columns=names, use_threads=False))
+                table = file.read(columns=names, use_threads=False).replace_schema_metadata(None)
+            # The first says which columns there are, and of which types, as LeRobot has it: merged datasets may have
+            # them in another order in every file.
+            tables.append(table_cast(table, tables[0].schema) if tables else table)
         if not tables:  # what LeRobot says then, who looks for it on the Hub
             raise FileNotFoundError(f"{folder} holds no Parquet file.")
-        return Dataset(pa.concat_tables(tables).replace_schema_metadata(None))
+        return Dataset(pa.concat_tables(tables))

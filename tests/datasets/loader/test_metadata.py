@@ -1,9 +1,13 @@
 """Our way to open LeRobot's metadata gives what LeRobot's own gives."""
 
+import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from datasets.exceptions import DatasetGenerationError
+from datasets.table import CastError
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from bhd_lerobot.datasets.loader.metadata import Metadata
@@ -11,23 +15,50 @@ from tests.datasets.loader import support
 from tests.datasets.loader.support import FRONT, WRIST
 
 
+def same(root: Path) -> None:
+    """Check that both read the same there, or that both refuse it."""
+    try:
+        theirs = LeRobotDatasetMetadata("t/t", root=root)
+    except DatasetGenerationError:
+        with pytest.raises(CastError):
+            Metadata("t/t", root=root)
+        return
+    mine = Metadata("t/t", root=root)
+    assert mine.episodes.features == theirs.episodes.features
+    assert mine.episodes.to_list() == theirs.episodes.to_list()
+    assert mine.episodes[1] == theirs.episodes[1]
+    assert (mine.info, mine.total_episodes, mine.root) == (theirs.info, theirs.total_episodes, theirs.root)
+    assert mine.tasks.equals(theirs.tasks)
+    assert mine.stats.keys() == theirs.stats.keys()
+    chosen = [meta.filter_episodes(lambda row: row["length"] > 6) for meta in (mine, theirs)]
+    assert chosen[0] == chosen[1] != []
+
+
 def test_the_same_as_lerobots(tmp_path: Path) -> None:
-    ours, stock = support.record_light(tmp_path / "ours", 3, (FRONT, WRIST)), support.record_stock(tmp_path / "stock")
-    split = support.record_light(tmp_path / "split")
-    first = next((split / "meta/episodes").glob("*/*.parquet"))
-    table = pq.read_table(first)
-    for number, rows in enumerate((table.slice(0, 2), table.slice(2))):
-        pq.write_table(rows, first.with_name(f"file-{number:03d}.parquet"))
-    for root in (ours, stock, split):
-        mine, theirs = Metadata("t/t", root=root), LeRobotDatasetMetadata("t/t", root=root)
-        assert mine.episodes.features == theirs.episodes.features
-        assert mine.episodes.to_list() == theirs.episodes.to_list()
-        assert mine.episodes[1] == theirs.episodes[1]
-        assert (mine.info, mine.total_episodes, mine.root) == (theirs.info, theirs.total_episodes, theirs.root)
-        assert mine.tasks.equals(theirs.tasks)
-        assert mine.stats.keys() == theirs.stats.keys()
-        chosen = [meta.filter_episodes(lambda row: row["length"] > 6) for meta in (mine, theirs)]
-        assert chosen[0] == chosen[1] != []
+    same(support.record_light(tmp_path / "ours", 3, (FRONT, WRIST)))
+    same(support.record_stock(tmp_path / "stock"))
+
+
+def test_the_same_where_files_differ(tmp_path: Path) -> None:
+    """In the order of their columns, as those that LeRobot merges do; in columns; and in types."""
+    recorded = support.record_light(tmp_path / "recorded")
+    path = next((recorded / "meta/episodes").glob("*/*.parquet"))
+    table = pq.read_table(path)
+    first, rest = table.slice(0, 2), table.slice(2)
+    place, column = rest.column_names.index("length"), rest["length"]
+    others = {
+        "same": rest,
+        "reversed": rest.select(rest.column_names[::-1]),
+        "fewer": rest.drop_columns(["bhd/score"]),
+        "more": rest.append_column("another", column),
+        **{str(kind): rest.set_column(place, "length", column.cast(kind)) for kind in (pa.int32(), pa.float64())},
+    }
+    for name, other in others.items():
+        root = shutil.copytree(recorded, tmp_path / name)
+        target = root / path.relative_to(recorded)
+        pq.write_table(first, target)
+        pq.write_table(other, target.with_name("file-001.parquet"))
+        same(root)
 
 
 def test_what_is_not_there_is_looked_for_on_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
