@@ -8,6 +8,8 @@ from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMe
 from lerobot.datasets.io_utils import load_info, load_stats, load_tasks
 from lerobot.datasets.utils import EPISODES_DIR, check_version_compatibility
 
+from bhd_lerobot.datasets.format.state import UNREADABLE, corrupt
+
 
 class Metadata(LeRobotDatasetMetadata):
     """The same, but for the time that it takes to open.
@@ -15,6 +17,9 @@ class Metadata(LeRobotDatasetMetadata):
     LeRobot's reads all columns of the episodes and drops the statistics, which are most of them. The library that it
     reads them with takes time that grows with the square of their number (a second, where there are 300), and keeps a
     copy in its cache.
+
+    Raises:
+        DatasetCorruptError: a file of the episodes cannot be read, or has other columns than the first.
     """
 
     def _load_metadata(self) -> None:
@@ -28,12 +33,15 @@ class Metadata(LeRobotDatasetMetadata):
         folder = self.root / EPISODES_DIR
         tables: list[pa.Table] = []
         for path in sorted(folder.glob("*/*.parquet")):
-            with pq.ParquetFile(path) as file:
-                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                table = file.read(columns=names, use_threads=False).replace_schema_metadata(None)
-            # The first says which columns there are, and of which types, as LeRobot has it: merged datasets may have
-            # them in another order in every file.
-            tables.append(table_cast(table, tables[0].schema) if tables else table)
+            try:
+                with pq.ParquetFile(path) as file:
+                    names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                    table = file.read(columns=names, use_threads=False).replace_schema_metadata(None)
+                # The first says which columns there are, and of which types, as LeRobot has it: merged datasets may
+                # have them in another order in every file.
+                tables.append(table_cast(table, tables[0].schema) if tables else table)
+            except UNREADABLE as error:
+                raise corrupt(path, error) from error
         if not tables:  # what LeRobot says then, who looks for it on the Hub
             raise FileNotFoundError(f"{folder} holds no Parquet file.")
         return Dataset(pa.concat_tables(tables))

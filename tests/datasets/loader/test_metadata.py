@@ -7,10 +7,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from datasets.exceptions import DatasetGenerationError
-from datasets.table import CastError
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from bhd_lerobot.datasets.loader.metadata import Metadata
+from bhd_lerobot.errors import DatasetCorruptError
 from tests.datasets.loader import support
 from tests.datasets.loader.support import FRONT, WRIST
 
@@ -20,7 +20,7 @@ def same(root: Path) -> None:
     try:
         theirs = LeRobotDatasetMetadata("t/t", root=root)
     except DatasetGenerationError:
-        with pytest.raises(CastError):
+        with pytest.raises(DatasetCorruptError, match=r"file-001\.parquet is corrupt"):
             Metadata("t/t", root=root)
         return
     mine = Metadata("t/t", root=root)
@@ -51,13 +51,15 @@ def test_the_same_where_files_differ(tmp_path: Path) -> None:
         "reversed": rest.select(rest.column_names[::-1]),
         "fewer": rest.drop_columns(["bhd/score"]),
         "more": rest.append_column("another", column),
+        "damaged": None,
         **{str(kind): rest.set_column(place, "length", column.cast(kind)) for kind in (pa.int32(), pa.float64())},
     }
     for name, other in others.items():
         root = shutil.copytree(recorded, tmp_path / name)
         target = root / path.relative_to(recorded)
         pq.write_table(first, target)
-        pq.write_table(other, target.with_name("file-001.parquet"))
+        second = target.with_name("file-001.parquet")
+        second.write_bytes(b"PAR1 and no more") if other is None else pq.write_table(other, second)
         same(root)
 
 
