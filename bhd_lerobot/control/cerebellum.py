@@ -22,9 +22,9 @@ from bhd_lerobot.control.messages import (
     mode_reason,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
+from bhd_lerobot.control.reading_check import ReadingCheck
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
-_OLDEST_PERIODS = 3  # a reading that is older than so many is no measurement of the present
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
 
 # Requests and the modes that they apply in; resets lead to INACTIVE only, motion needs a separate activation.
@@ -54,7 +54,7 @@ class Cerebellum:
     Attributes:
         guard: the last check of what is written to the plant.
         stamp_origin_ns: time 0 of the ticks, on the clock of the plant's stamps [ns].
-        oldest_ns: a reading that is older than this is a fault [ns]: three periods, if nothing else is set.
+        readings: checks that what the plant reads can be a measurement of the present.
         requested: the setpoint that was last taken, before all limits, shape (n, width).
         setpoints_taken: how many have been taken.
 
@@ -85,11 +85,11 @@ class Cerebellum:
         self.reading = PlantReading(n, self.controller.joints, sensors)
         self.requested = np.zeros((n, width))
         self.setpoints_taken = 0
-        self.ticks = 0
+        self.ticks = self._now_ns = 0
 
-        self.stamp_origin_ns, self.oldest_ns = 0, _OLDEST_PERIODS * NANOSECONDS // control_hz
+        self.stamp_origin_ns = 0
+        self.readings = ReadingCheck(body, n, control_hz)
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
-        self._last_position = np.zeros_like(self.reading.position)
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
         self._flat_reading = self.reading.values.reshape(-1)
         self._zeros = np.zeros_like(self._flat_reading)
@@ -122,7 +122,7 @@ class Cerebellum:
         self._take_commands(now_ns)
         self.controller.run(self.reading)
         self._follow_controller()
-        unsafe = self.guard.check(self.controller.actuators)
+        unsafe = self.guard.check(self.controller.actuators, self.reading.position)
         if unsafe is not None:
             self._refuse_to_write(unsafe)
         if self._mode_is_new:
@@ -130,7 +130,6 @@ class Cerebellum:
             self.plant.set_mode(self.mode)
         if self._may_write:
             self.plant.write(self.guard.written)
-        self._last_position[:] = self.reading.position
         self.ticks += 1
 
     def _supervise(self, now_ns: int) -> None:
@@ -142,10 +141,10 @@ class Cerebellum:
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
                 self.estop_latched |= hit
-        if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.safety):
-            self._handle_fault()
+        self._now_ns = now_ns
+        self._judge_reading()
         if self.reading.stamp_ns is not None:
-            self._check_age(self.reading.stamp_ns, now_ns)
+            self._check_times(self.reading.stamp_ns, now_ns)
         if self._deadline is not None and now_ns > self._deadline:
             old = (self.mode == Mode.TRACKING) & ~self._by_goal & (now_ns - self._last_due > self._timeout_ns)
             if old.any():
@@ -161,35 +160,44 @@ class Cerebellum:
                 self._set_mode(rest & self._deactivating, Mode.SAFE_OFF)
             self._stopping = bool((self.mode == Mode.STOPPING).any())
 
-    def _handle_fault(self) -> None:
+    def _judge_reading(self) -> None:
+        """Stop robots that report a stop of their own, or whose readings are no measurements."""
         reading = self.reading
+        wrong = self.readings.wrong_positions(reading, self._now_ns)
+        if wrong is None and self._flat_reading.dot(self._zeros) == 0.0 and not np.count_nonzero(reading.safety):
+            return
         bad: NDArray[np.bool_] = np.asarray(~np.isfinite(reading.values).all(axis=(0, 2)))
-        # What is not a number must not spread: it is treated as a joint at rest where the encoder last was.
-        reading.velocity[bad] = 0.0
-        reading.position[bad] = self._last_position[bad]
+        if wrong is not None:
+            bad |= wrong
+        # What is no measurement must not spread: it is treated as a joint at rest where the encoder last was.
+        reading.velocity[bad] = reading.effort[bad] = 0.0
         pressed = (reading.safety == SafetyStatus.EMERGENCY_STOP) & (self.mode != Mode.ESTOP)
         if np.count_nonzero(pressed):
             self._set_mode(pressed, Mode.ESTOP)
             self.estop_latched |= pressed
-        faulty = (bad | (reading.safety != SafetyStatus.NORMAL)) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
-        self._watchdog[faulty & ~bad] |= Watchdog.PLANT
+        faulty = bad | (reading.safety != SafetyStatus.NORMAL)
+        faulty &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
+        self._watchdog[faulty] |= Watchdog.PLANT
         self._set_mode(faulty, Mode.FAULT)
         if bad.any():
             self.controller.distrust(bad)
 
-    def _check_age(self, stamp_ns: NDArray[np.int64], now_ns: int) -> None:
-        """Stop robots whose reading is too old to be a measurement of the present."""
-        old = stamp_ns < now_ns + self.stamp_origin_ns - self.oldest_ns
-        if not np.count_nonzero(old):
+    def _check_times(self, stamp_ns: NDArray[np.int64], now_ns: int) -> None:
+        """Stop robots whose reading is too old to be a measurement of the present, or from the future."""
+        newest = stamp_ns
+        if self.reading.sensors.shape[1]:
+            newest = np.maximum(stamp_ns, self.reading.sensors_ns)
+        wrong = self.readings.wrong_times(stamp_ns, newest, now_ns + self.stamp_origin_ns)
+        if wrong is None:
             return
-        old &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT) & (self.mode != Mode.UNCONFIGURED)
-        self._watchdog[old] |= Watchdog.PLANT
-        self._set_mode(old, Mode.FAULT)
+        wrong &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT) & (self.mode != Mode.UNCONFIGURED)
+        self._watchdog[wrong] |= Watchdog.PLANT
+        self._set_mode(wrong, Mode.FAULT)
 
     def _refuse_to_write(self, unsafe: NDArray[np.bool_]) -> None:
         """Stop robots whose actuator commands are not safe: as hard as possible, from the last that were."""
         self._watchdog[unsafe] |= Watchdog.GUARD
-        self.controller.go_back(unsafe, self.guard.written, self.reading)
+        self.controller.go_back(unsafe, self.guard.written, self.guard.rate)
         latched = (self.mode == Mode.ESTOP) | (self.mode == Mode.FAULT)
         self.controller.stop(unsafe & latched, Mode.FAULT)  # the present stop is not safe either
         self._set_mode(unsafe & ~latched, Mode.FAULT)
@@ -351,12 +359,10 @@ class Cerebellum:
         those that came later. `ACTIVATE` drops what still waits in the queue: no command from before it can start
         motion.
         """
-        if request == Request.CONFIGURE:
-            self.plant.read(self.reading)
-            if self._flat_reading.dot(self._zeros) != 0.0:
-                self._handle_fault()
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
+        if request == Request.CONFIGURE:
+            self._read_anew(wanted)
         sources, result = _TRANSITIONS[request]
         allowed = wanted & np.isin(self.mode, [int(source) for source in sources])
         reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
@@ -377,16 +383,30 @@ class Cerebellum:
             # A press after another latch has not been seen yet: the next tick will.
             self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP))
             self.estop_latched &= ~allowed
-            self._configure(allowed & ~self._configured)
-            if np.count_nonzero(allowed) and self.plant.recover():
-                # It stopped elsewhere than the reference came to rest: to go there would be a jump.
-                self.controller.resume(np.flatnonzero(allowed), self.reading)
-                self.guard.restart(np.flatnonzero(allowed), self.controller.actuators)
+            if np.count_nonzero(allowed):
+                self._recover(allowed)
         self._set_mode(allowed, result)
         if request == Request.DEACTIVATE:
             self._deactivating |= allowed
         self._count_refusals(reasons)
         return SendResult(reasons)
+
+    def _recover(self, mask: NDArray[np.bool_]) -> None:
+        """Leave stops of the robots' own, and take where they are now."""
+        moved = self.plant.recover()
+        self._read_anew(mask)
+        self._configure(mask & ~self._configured)
+        if moved:
+            # It stopped elsewhere than the reference came to rest: to go there would be a jump.
+            ids = np.flatnonzero(mask)
+            self.controller.resume(ids, self.reading)
+            self.guard.restart(ids, self.controller.actuators)
+
+    def _read_anew(self, mask: NDArray[np.bool_]) -> None:
+        """Take where robots are now, wherever they were before; `mask` has shape (n,)."""
+        self.plant.read(self.reading)
+        self.readings.forget(np.flatnonzero(mask))
+        self._judge_reading()
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about simulations that were put somewhere else: they are unconfigured again.
@@ -400,6 +420,7 @@ class Cerebellum:
         self.mode[ids] = Mode.UNCONFIGURED
         self._mode_is_new = True
         self.controller.restart(ids)
+        self.readings.forget(ids)
         self.guard.restart(ids, self.controller.actuators)
         self._configured[ids] = False
         self._sent_sequence[ids] = self._taken_sequence[ids] = -1

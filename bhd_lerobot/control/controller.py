@@ -62,13 +62,13 @@ class Controller(ABC):
         """Advance by one tick."""
 
     @abstractmethod
-    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
         """Make the reference again what is really written to the actuators, whatever it has become; a stop follows.
 
         Args:
             mask: the robots, shape (n,).
             actuators: the last commands that were written, shape (n, joints).
-            reading: the joints now.
+            rate: their change in the last tick, shape (n, joints).
         """
 
     def distrust(self, mask: NDArray[np.bool_]) -> None:

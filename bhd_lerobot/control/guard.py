@@ -27,6 +27,8 @@ class WireLimits:
         lower: smallest value.
         upper: largest value.
         change: largest change from one tick to the next.
+        bend: largest difference between two changes that follow each other; infinite where a change is an acceleration,
+            or a torque's.
         start: where an actuator's first command has to be near to, as a share of its joint's position: 1 for servos of
             positions, 0 for wheels, which start at rest; not a number where it may be anything in range.
     """
@@ -34,6 +36,7 @@ class WireLimits:
     lower: Array
     upper: Array
     change: Array
+    bend: Array
     start: Array
 
     @classmethod
@@ -42,6 +45,8 @@ class WireLimits:
 
         Wheels may change their speed as fast as the hardest stop does. Positions may change by the largest speed, and
         by what the lead for the servos' damping adds when the reference accelerates; torques by what spares the gears.
+        The changes of positions may differ by what the largest acceleration makes of the reference, and of its lead when
+        it turns into the opposite one.
 
         Args:
             body: the robot.
@@ -55,7 +60,7 @@ class WireLimits:
             stop = np.maximum(limits.acceleration, limits.stop_deceleration)
             change = (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / control_hz
             largest = np.full(2, drive.max_wheel_speed * (1 + 1e-9))
-            return cls(-largest, largest, np.full(2, change * _TOLERANCE), np.zeros(2))
+            return cls(-largest, largest, np.full(2, change * _TOLERANCE), np.full(2, np.inf), np.zeros(2))
         if not isinstance(body, Arm):
             raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; no limits are known for its actuators.")
         reference = body.limits
@@ -68,21 +73,24 @@ class WireLimits:
         beyond = hardest * lead**2 / 2 + 1e-6
         lower, upper = np.asarray(reference.lower) - beyond, np.asarray(reference.upper) + beyond
         change = (np.asarray(reference.velocity) + 2 * lead * hardest) / control_hz * _TOLERANCE
+        bend = hardest / control_hz * (1 / control_hz + 2 * lead) * _TOLERANCE
         start = np.ones(len(change))
         start[-1] = np.nan  # what is gripped is not let go of: the opening commanded is not the one that is
         if body.actuation == "torque":
             effort = np.asarray(reference.effort[:-1])
             lower[:-1], upper[:-1] = -effort, effort
             change[:-1] = effort / (FULL_TORQUE_S * control_hz) * _TOLERANCE
+            bend[:-1] = np.inf
             start[:] = np.nan
-        return cls(lower, upper, change, start)
+        return cls(lower, upper, change, bend, start)
 
 
 class Guard:
-    """Lets actuator commands through that are finite, in range, and near enough to the last ones.
+    """Lets actuator commands through that are finite, in range, near enough to the last ones, and bent gradually.
 
     It knows nothing of how they came about: it is for what nobody thought of, such as a trajectory in shared memory
-    that another process overwrote. A robot whose command it does not let through keeps the last safe one.
+    that another process overwrote. The command of a robot that it does not let through goes on from the last safe ones,
+    at a falling speed. A position servo's command may always come nearer to where the joint is: that takes torque away.
 
     Attributes:
         written: what may be written, shape (n, actuators).
@@ -95,16 +103,21 @@ class Guard:
     def __init__(self, limits: WireLimits, n: int) -> None:
         self.limits = limits
         width = len(limits.lower)
-        # Both checks at once: the distances from the last command and from the middle of the range.
-        self._from = np.zeros((2, n, width))
+        # All checks at once: the distances from the last command, from the middle of the range, and from where the
+        # command would be if it went on changing as it does.
+        self._from = np.zeros((3, n, width))
         self._from[1] = (limits.lower + limits.upper) / 2
         self.written: Array = self._from[0]
-        self._most = np.zeros((2, n, width))
-        self._most[0], self._most[1] = limits.change, (limits.upper - limits.lower) / 2
-        self._work, self._flags = np.zeros((2, n, width)), np.zeros((2, n, width), np.bool_)
+        self._rate: Array = np.zeros((n, width))
+        self._most = np.zeros((3, n, width))
+        self._most[0], self._most[1], self._most[2] = limits.change, (limits.upper - limits.lower) / 2, limits.bend
+        self._work, self._flags = np.zeros((3, n, width)), np.zeros((3, n, width), np.bool_)
         self._all = self._flags.size
+        self._is_sparse = False  # the last commands were more than a tick apart
         # Plain numbers are several times cheaper than arrays of a few.
-        self._bounds = list(zip(limits.lower.tolist(), limits.upper.tolist(), limits.change.tolist(), strict=True))
+        bounds = (limits.lower, limits.upper, limits.change, limits.bend)
+        self._bounds = list(zip(*(bound.tolist() for bound in bounds), strict=True))
+        self._last, self._rates = [0.0] * width, [0.0] * width  # of a single robot
 
     def restart(self, ids: NDArray[np.intp], actuators: Array) -> None:
         """Start from commands that the next ones need not be near to: the robots were put or moved somewhere else.
@@ -113,7 +126,17 @@ class Guard:
             ids: the robots.
             actuators: their commands, shape (n, actuators).
         """
-        self.written[ids] = actuators[ids]
+        if len(ids):
+            self.written[ids] = actuators[ids]
+            self.rate[ids] = 0.0
+            self._last, self._rates = self.written[0].tolist(), [0.0] * len(self._bounds)
+
+    @property
+    def rate(self) -> Array:
+        """The last change of `written`, for each tick, shape (n, actuators)."""
+        if len(self.written) == 1:
+            self._rate[0] = self._rates
+        return self._rate
 
     def start(self, actuators: Array, position: Array) -> None:
         """Start from where the robots are, because somebody else held them there.
@@ -124,39 +147,64 @@ class Guard:
         """
         start = self.limits.start
         known = np.isfinite(start)
-        self.written[:] = np.where(known, position * np.where(known, start, 0.0), actuators)
+        first = np.where(known, position * np.where(known, start, 0.0), actuators)
+        self.restart(np.arange(len(first)), first)
 
-    def check(self, actuators: Array, ticks: int = 1) -> NDArray[np.bool_] | None:
+    def check(self, actuators: Array, position: Array, ticks: int = 1) -> NDArray[np.bool_] | None:
         """Check commands, and take those that are safe over into `written`.
 
         Args:
             actuators: what is to be written, shape (n, actuators).
+            position: of the joints, shape (n, joints).
             ticks: how many ticks the last commands are old.
 
         Returns:
-            The robots whose last safe command stays, shape (n,); None if there are none.
+            The robots whose commands were not safe, shape (n,); None if there are none.
         """
-        if len(actuators) == 1 and ticks <= 1 and self._is_safe(actuators[0].tolist(), self.written[0].tolist()):
-            self.written[:] = actuators
-            return None
+        is_sparse, self._is_sparse = self._is_sparse or ticks > 1, ticks > 1
+        if len(actuators) == 1:
+            if not is_sparse and self._is_safe(actuators[0].tolist()):
+                self.written[:] = actuators
+                return None
+        np.add(self.written, self.rate, out=self._from[2])
         work = np.subtract(actuators, self._from, out=self._work)
+        change = work[0] / max(ticks, 1)
         np.abs(work, out=work)
-        if ticks > 1:
-            work[0] /= ticks
+        if is_sparse:
+            np.abs(change, out=work[0])
+            work[2] = 0.0  # what was in between is not known
         # What is not a number is not less than anything either.
         np.less_equal(work, self._most, out=self._flags)
-        if np.count_nonzero(self._flags) == self._all:
-            self.written[:] = actuators
-            return None
-        good: NDArray[np.bool_] = np.asarray(self._flags.all(axis=(0, 2)))
-        np.copyto(self.written, actuators, where=good[:, None])
-        return ~good
+        unsafe = None
+        if np.count_nonzero(self._flags) < self._all:
+            with np.errstate(all="ignore"):
+                self._flags[2] |= (change * (position - actuators) >= 0.0) & (change != 0.0)
+            unsafe = self._slow_down(change, actuators)
+        else:
+            self._rate[:], self.written[:] = change, actuators
+        if len(actuators) == 1:
+            self._last, self._rates = self.written[0].tolist(), self._rate[0].tolist()
+        return unsafe
 
-    def _is_safe(self, values: list[float], last: list[float]) -> bool:
-        """Return what the two comparisons of `check` say about one robot."""
-        if values == last:  # never so if one is not a number
-            return True
-        for value, before, (lower, upper, change) in zip(values, last, self._bounds, strict=True):
-            if not (lower <= value <= upper and -change <= value - before <= change):
+    def _slow_down(self, change: Array, actuators: Array) -> NDArray[np.bool_] | None:
+        """Take safe commands over; let those of other robots go on from the last safe ones, at a falling speed."""
+        good: NDArray[np.bool_] = np.asarray(self._flags.all(axis=(0, 2)))
+        limits, bend, rate = self.limits, self.limits.bend, self.rate
+        slower = rate - np.minimum(np.maximum(rate, -bend), bend)
+        on = np.minimum(np.maximum(self.written + slower, limits.lower), limits.upper)
+        after = np.where(good[:, None], actuators, on)
+        rate[:] = np.where(good[:, None], change, after - self.written)
+        self.written[:] = after
+        return None if good.all() else ~good
+
+    def _is_safe(self, values: list[float]) -> bool:
+        """Return what the three comparisons of `check` say about a single robot, and take its command over."""
+        rates: list[float] = []
+        for value, before, rate, bounds in zip(values, self._last, self._rates, self._bounds, strict=True):
+            lower, upper, most, bend = bounds
+            change = value - before
+            if not (lower <= value <= upper and -most <= change <= most and -bend <= change - rate <= bend):
                 return False
+            rates.append(change)
+        self._last, self._rates = values, rates
         return True

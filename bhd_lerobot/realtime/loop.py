@@ -143,7 +143,7 @@ class RealtimeLoop:
     def _watch(self, now_ns: int, grid: TickGrid) -> None:
         for word, timeout, watchdog, mode in self._watched:
             seen = int(self.words[word])
-            if seen and now_ns - seen > timeout:
+            if seen and abs(now_ns - seen) > timeout:  # what is from the future never grows old
                 self.cerebellum.interrupt(watchdog, mode)
         if grid.too_many_misses:
             self.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)

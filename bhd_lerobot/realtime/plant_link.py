@@ -255,7 +255,8 @@ class CommandGuard:
         self._take(now_ns, position)
         before, self._checked_ns = self._checked_ns, now_ns
         away = before is not None and now_ns - before > self._timeout_ns
-        good = self.number > self._begun and self._is_safe and now_ns - self.stamp_ns <= self._timeout_ns
+        age = now_ns - self.stamp_ns
+        good = self.number > self._begun and self._is_safe and -self._timeout_ns <= age <= self._timeout_ns
         if self.phase == PlantPhase.DRIVEN:
             if away or not good:
                 self.phase = PlantPhase.STOPPED
@@ -280,4 +281,4 @@ class CommandGuard:
             ticks = _START_TICKS
         self.number, self.stamp_ns = int(command["number"]), int(command["stamp_ns"])
         self._acknowledged, self._taken_ns = int(command["acknowledged"]), now_ns
-        self._is_safe = self._wire.check(command["actuators"], ticks) is None
+        self._is_safe = self._wire.check(command["actuators"], position, ticks) is None

@@ -170,6 +170,32 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.HOLD
 
 
+# --- rows that alternate: each near to the last, and a torque at its limit ---------------------------------------------
+
+
+@pytest.mark.parametrize("by", [3e-3, 1e-3, 5e-4])
+def test_rows_that_alternate_stop_the_arm(by: float) -> None:
+    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
+    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    rig = arm(planning=link)
+    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
+    for _ in range(220):
+        rig.tick()
+        server.serve_once()
+    rows = link._memory.rows
+    rows[..., ::2, 0, :6] += by
+    rows[..., 1::2, 0, :6] -= by
+    before = len(rig.plant.written)
+    rig.tick(3)
+    assert rig.mode == Mode.FAULT
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.GUARD]
+    rig.tick(500)
+    bend = np.abs(np.diff(np.array(rig.plant.written[before - 3 :])[:, 0], n=2, axis=0)).max(axis=0)
+    hardest = arm_rig.STOP / arm_rig.HZ * (1 / arm_rig.HZ + 2 * arm_rig.LEAD)
+    assert (bend <= 1.021 * hardest).all()
+    assert np.abs(rig.plant.velocity).max() < 1e-6
+
+
 # --- finding 7: ticks that were skipped ------------------------------------------------------------------------------
 
 
@@ -190,7 +216,8 @@ def test_what_was_missed_is_not_caught_up_at_the_wire() -> None:
 
 
 @pytest.mark.parametrize("make", [base_rig, arm])
-def test_a_reading_older_than_three_periods_is_a_fault(make: Callable[[], Any]) -> None:
+@pytest.mark.parametrize("sign", [1, -1], ids=["old", "from the future"])
+def test_a_reading_older_than_three_periods_or_a_period_ahead_is_a_fault(make: Callable[[], Any], sign: int) -> None:
     rig = make()
     hz = rig.cerebellum.control_hz
     period = 1_000_000_000 // hz
@@ -203,21 +230,24 @@ def test_a_reading_older_than_three_periods_is_a_fault(make: Callable[[], Any]) 
         out.stamp_ns = np.array([origin + rig.now - ages[0]])
 
     rig.plant.read = stamped
-    for age in (0, 1, 3):  # periods
-        ages[0] = age * period
+    most = 3 if sign > 0 else 1  # periods
+    for age in (0, 1, most):
+        ages[0] = sign * age * period
         rig.tick(5)
         assert rig.mode == Mode.HOLD
-    ages[0] = 3 * period + 1
-    rig.tick()
-    assert rig.mode == Mode.FAULT
-    assert int(rig.cerebellum.take_flags()[1][0]) == Watchdog.PLANT
-    ages[0] = 0
-    rig.tick(50)
-    assert rig.mode == Mode.FAULT  # it latches
-    for request in (Request.RESET, Request.ACTIVATE):
-        assert rig.request(request).accepted.all()
-    rig.tick(5)
-    assert rig.mode == Mode.HOLD
+    for wrong in (sign * (most * period + 1), sign * 10**10):
+        ages[0] = wrong
+        rig.tick()
+        assert rig.mode == Mode.FAULT
+        assert int(rig.cerebellum.take_flags()[1][0]) == Watchdog.PLANT
+        assert ("of another clock" in rig.cerebellum.readings.problem) == (sign < 0)
+        ages[0] = 0
+        rig.tick(50)
+        assert rig.mode == Mode.FAULT  # it latches
+        for request in (Request.RESET, Request.ACTIVATE):
+            assert rig.request(request).accepted.all()
+        rig.tick(5)
+        assert rig.mode == Mode.HOLD
 
 
 @pytest.mark.parametrize("what", ["frozen", "one wheel", "the other way"])

@@ -23,7 +23,7 @@ TIMEOUT = 20 * MS
 def anything() -> Guard:
     """Return a guard that lets all finite commands through."""
     far = np.full(2, 1e9)
-    return Guard(WireLimits(-far, far, far, np.full(2, np.nan)), 1)
+    return Guard(WireLimits(-far, far, far, far, np.full(2, np.nan)), 1)
 
 
 class Rig:

@@ -12,6 +12,8 @@ from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
+from bhd_lerobot.control.gradual import largest_change
+from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
@@ -23,7 +25,10 @@ _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
 _GIVES_WAY_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
 _MOST_GIVING = 3
+_GIVING_S = 3.0  # [s] after which an arm gives way no longer: five times what it took in `python -m benchmarks.contact`
 _BACK_RAD = 0.02  # [rad] the way that an arm first goes back after a protective stop, of the joint that turned most
+_MOST_BACK_RAD = 0.25  # [rad] and in all: 0.2 in `python -m benchmarks.contact`
+_SPRINGS_RAD = 0.05  # [rad] by which what an arm leans on may push it on when it has given way
 LIGHT_N = 20.0  # [N] an arm that presses less has given way
 _TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
@@ -74,14 +79,24 @@ class ArmController(Controller):
         # How often an arm that was stopped hard may still give way to what it touches.
         self._gives_way: NDArray[np.int64] = np.zeros(n, np.int64)
         self._any_gives_way = False
+        self._giving_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._most_giving_ticks = round(_GIVING_S * control_hz)
+        self._stopped = np.zeros(n, np.bool_)  # hard, since it was last reset
         self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
+        # Where a protective stop brings the joints, or where the reference was when another hard stop began; and how far
+        # from `_centre` the reference may be brought after it. All are fixed when the stop begins, or has come to rest:
+        # a reading that is wrong moves an arm no further.
+        self._aim, self._centre, self._room = (np.zeros((n, width - 1)) for _ in range(3))
         self._back_rad = np.zeros(n)  # so far it then goes back
         self._trail = _Trail(n, width - 1, control_hz)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
+        self._bend = 0.9 * WireLimits.of(arm, control_hz).bend[:-1]
         self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._lead = np.asarray(arm.lead_s)
+        # [rad] so far a joint may be from its reference when it is found that it does not follow
+        self._reach = (arm.blocked_rad + self._speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:-1]
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
         self._effort = np.asarray(limits.effort)
         self._lowest_effort = -self._effort
@@ -118,22 +133,31 @@ class ArmController(Controller):
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
+            self._stopped &= ~mask
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
             mask = mask & (self.protective_stop == 0)  # they are on their way back, and goals have ended
-            self._unwatched |= mask
-            self._gives_way[mask] = _MOST_GIVING
-            self._any_gives_way = True
+            self._begin_giving_way(mask & ~self._stopped)
+            np.copyto(self._aim, self.command[:, :-1], where=mask[:, None] & ~self._yields[:, None])
         self._leave_setpoints(mask)
         self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
 
-    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
-        """Make the reference again what the servos have, at the speed that the joints have; play nothing any more."""
+    def _begin_giving_way(self, mask: NDArray[np.bool_]) -> None:
+        self._stopped |= mask
+        self._unwatched |= mask
+        self._gives_way[mask] = _MOST_GIVING
+        self._giving_ticks[mask] = self._still_ticks[mask] = 0
+        self._any_gives_way = True
+
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
+        """Make the reference again what the servos have, at the speed of their commands; play nothing any more."""
         where = mask[:, None]
         self.setpoints.drop(mask)
         self.goals.let_go(mask)
-        np.copyto(self.velocity, np.minimum(np.maximum(reading.velocity, -self._speed), self._speed), where=where)
+        self._yields &= ~mask
+        speed = rate / (2 * self._half_tick)
+        np.copyto(self.velocity, np.minimum(np.maximum(speed, -self._speed), self._speed), where=where)
         np.copyto(self.acceleration, 0.0, where=where)
         reference = actuators - self.velocity * self._lead
         np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
@@ -141,6 +165,8 @@ class ArmController(Controller):
     def distrust(self, mask: NDArray[np.bool_]) -> None:
         """Give way to nothing: where the arms are is not known."""
         self._gives_way[mask] = 0
+        if self.force is not None:
+            self.force.restart(np.flatnonzero(mask))
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
@@ -153,6 +179,10 @@ class ArmController(Controller):
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
         self._trail.note(reading, self._gives_way)
+        if self._any_gives_way:
+            self._giving_ticks += self._gives_way > 0
+            if np.count_nonzero(self._giving_ticks > self._most_giving_ticks):
+                self._gives_way[self._giving_ticks > self._most_giving_ticks] = 0
         if self._any_yields:
             self._yield(reading)
         if self._any_gives_way:
@@ -190,11 +220,20 @@ class ArmController(Controller):
             return
         self._still_ticks[ready] = 0
         where = self._retreat_from(reading)
+        first = ready & (self._gives_way == _MOST_GIVING) & (self._back_rad == 0.0)
+        if first.any():
+            # It may have been away from its reference when the stop began, and have met something on the way to rest.
+            np.copyto(self._centre, self.command[:, :dof], where=first[:, None])
+            np.copyto(self._room, self._reach + np.abs(self.command[:, :dof] - self._aim), where=first[:, None])
         for sim in np.flatnonzero(ready & (self._back_rad > 0.0)).tolist():
             where[sim, :dof] = self._trail.back(sim, reading.position[sim, :dof], self._back_rad[sim], where[sim, :dof])
             # Whatever it slid along on the way here holds it until it is back at where that began.
             presses = self.force is not None and self.force.force[sim] > LIGHT_N
             self._back_rad[sim] = 2 * self._back_rad[sim] if presses else 0.0
+        inside = np.minimum(np.maximum(where[:, :dof], self._centre - self._room), self._centre + self._room)
+        np.copyto(where[:, :dof], inside, where=ready[:, None])
+        np.copyto(self._centre, inside, where=first[:, None])
+        np.copyto(self._room, _SPRINGS_RAD, where=first[:, None])
         off = ready & (np.abs(where - self.command) > _GIVES_WAY_RAD).any(axis=1)
         # What it leans on springs back, and pushes the arm on: it takes a few times. A load, which makes the arm sag a
         # little further each time, must not make it sink for ever.
@@ -222,31 +261,34 @@ class ArmController(Controller):
         self.protective_stop[mask] = int(cause)
         self._any_stopped = True
         self._off_ticks[mask] = 0
-        self._unwatched |= mask
         self._leave_setpoints(mask)
         self.goals.end_all(mask, message)
+        self._begin_giving_way(mask)
+        off = reading.position[:, :-1] - self.actuators[:, :-1]
+        aim = self.actuators[:, :-1] + np.minimum(np.maximum(off, -self._reach), self._reach)
+        for array, value in ((self._aim, aim), (self._centre, aim), (self._room, _MOST_BACK_RAD)):
+            np.copyto(array, value, where=mask[:, None])
         self._yields |= mask
         self._back_rad[mask] = _BACK_RAD
         self._any_yields = True
-        self._gives_way[mask] = _MOST_GIVING
-        self._any_gives_way = True
 
     def _yield(self, reading: PlantReading) -> None:
-        """Bring the servos' commands to where the joints are, as fast as joints may turn, until these are at rest.
+        """Bring the servos' commands to where the joints were, as fast as joints may turn, until these are at rest.
 
         The reference would take its way to brake, against what the joints cannot go through. A servo that is so far
         from its command that it gives its largest torque gives no other on the way back, and one that is where it is
         commanded to brakes with all that it has.
         """
         dof, mask = self.width - 1, self._yields
-        step = self._speed[:dof] * 2 * self._half_tick
-        off = reading.position[:, :dof] - self.actuators[:, :dof]
-        where = self.actuators[:, :dof] + np.minimum(np.maximum(off, -step), step)
-        np.copyto(self.command[:, :dof], where, where=mask[:, None])
+        off = self._aim - self.actuators[:, :dof]
+        step = largest_change(np.abs(off) / self._bend) * self._bend
+        step = np.copysign(np.minimum(step, self._speed[:dof] * 2 * self._half_tick), off)
+        np.copyto(self.command[:, :dof], self.actuators[:, :dof] + step, where=mask[:, None])
         np.copyto(self.velocity, 0.0, where=mask[:, None])
         np.copyto(self.acceleration, 0.0, where=mask[:, None])
         there = (np.abs(off) <= self._largest_error[:dof]) & (np.abs(reading.velocity[:, :dof]) < _SLOW)
-        self._yields &= ~there.all(axis=1)
+        # One that never comes to rest, by what it reads, is not waited for.
+        self._yields &= ~there.all(axis=1) & ((self._gives_way > 0) | (np.abs(off) > _GIVES_WAY_RAD).any(axis=1))
         self._any_yields = bool(self._yields.any())
         inside = np.minimum(np.maximum(self.command, self._lower), self._upper)
         np.copyto(self.command, inside, where=(mask & ~self._yields)[:, None])
@@ -277,7 +319,7 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy & (self._gives_way == 0)
+        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy & (self._gives_way == 0) & ~self._yields
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -298,7 +340,7 @@ class ArmController(Controller):
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
         self._unwatched[ids], self._gives_way[ids] = False, 0
-        self._yields[ids], self._back_rad[ids] = False, 0.0
+        self._yields[ids], self._stopped[ids], self._back_rad[ids] = False, False, 0.0
         self._trail.restart(ids)
         self.protective_stop[ids] = 0
         if self.force is not None:

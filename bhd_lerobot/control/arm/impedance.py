@@ -166,7 +166,7 @@ class ImpedanceController(Controller):
             self._capture |= mask & ~self._held
             self._held |= mask
 
-    def go_back(self, mask: NDArray[np.bool_], actuators: Array, reading: PlantReading) -> None:
+    def go_back(self, mask: NDArray[np.bool_], actuators: Array, rate: Array) -> None:
         """Put the equilibrium where the tool is, and go on from the torques that the motors have."""
         ids = np.flatnonzero(mask)
         self.actuators[ids] = actuators[ids]

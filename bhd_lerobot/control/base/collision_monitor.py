@@ -86,8 +86,10 @@ class CollisionMonitor:
         if not np.count_nonzero(new):
             return
         for sim in np.flatnonzero(new):
-            if np.isfinite(ranges[sim]).all():  # otherwise the last gets old, and the base stops
-                self._seen_ns[sim], self._age[sim] = stamp_ns[sim], 0 if age is None else age[sim]
+            old = 0 if age is None else int(age[sim])
+            # A scan that is no measurement, or from the future, is not taken: the last gets old, and the base stops.
+            if old >= -1 and np.isfinite(ranges[sim]).all():
+                self._seen_ns[sim], self._age[sim] = stamp_ns[sim], max(old, 0)
                 self._keep(sim, ranges[sim], pose[sim])
         self._points, self._hidden = np.concatenate(self._near), np.concatenate(self._too_near)
         self._sims = np.repeat(np.arange(len(self._near)), [len(near) for near in self._near])

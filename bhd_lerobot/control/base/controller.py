@@ -108,7 +108,7 @@ class BaseController(Controller):
         np.copyto(self._rate, 0.0, where=mask[:, None] & (self._rate * self.command > 0))
         self._settled = self._is_clipped = False
 
-    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
         """Make the twist again what the wheels have."""
         np.copyto(self.command, self.drive.twist_from_wheels(actuators), where=mask[:, None])
         np.copyto(self._rate, 0.0, where=mask[:, None])

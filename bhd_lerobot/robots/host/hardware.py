@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
+from bhd_lerobot.control.reading_check import ahead_of_time
 from bhd_lerobot.errors import ConfigError, RealtimeError
 
 _READY_S = 10.0  # that a robot may take until it follows commands: brakes are released, a stop is left
 _AGAIN_S = 1.0  # after which a robot that is still stopped is asked again: a datagram is lost, or it asks for a pause
 _POLL_S = 0.005
+_AHEAD_NS = 1_000_000  # [ns] a stamp may be ahead of now: a millisecond is no other clock
 _CALLS = ("open", "enable", "read", "write", "set_mode", "recover", "close")
 
 
@@ -148,6 +150,8 @@ class Hardware(Plant):
             return "it has read nothing yet, or does not say when (PlantReading.stamp_ns)"
         if age > self._oldest_ns:
             return f"its newest reading is {age / 1e9:.2f} s old"
+        if ahead := self._ahead_ns(reading):
+            return ahead_of_time(ahead)
         if not (np.isfinite(reading.values).all() and np.isfinite(reading.sensors).all()):
             return "it reads what is not a finite number"
         status = SafetyStatus(int(reading.safety[0]))
@@ -179,8 +183,16 @@ class Hardware(Plant):
         if out.stamp_ns is not self._stamp_ns:
             self._stamp_ns[:] = 0 if out.stamp_ns is None else out.stamp_ns
             out.stamp_ns = self._stamp_ns
-        if self.problem or not np.isfinite(out.sensors).all():
+        if self.problem or self._ahead_ns(out) or not np.isfinite(out.sensors).all():
             out.safety[:] = SafetyStatus.FAULT
+
+    def _ahead_ns(self, reading: PlantReading) -> int:
+        """Return by how much a stamp is from the future, if by more than another clock's resolution [ns]; else 0."""
+        newest = int(self._stamp_ns[0])
+        if reading.sensors.shape[1]:
+            newest = max(newest, int(reading.sensors_ns[0]))
+        ahead = newest - self._clock()
+        return ahead if ahead > _AHEAD_NS else 0
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take actuator commands, shape (1, joints)."""

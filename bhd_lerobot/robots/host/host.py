@@ -122,7 +122,6 @@ class Host(ABC):
         is_simulated: whether there is a world, which can be placed, stored and rendered.
         knows: the fields of a task's truth that the robots measure themselves; None if there is a world, of which all
             is known.
-        problem: why robots on the wall clock were last stopped by a fault, in words, as far as it is known.
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
         grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
@@ -132,7 +131,6 @@ class Host(ABC):
     is_live = False
     is_simulated = False
     knows: frozenset[str] | None = frozenset()
-    problem = ""
     sensor_period_s = 0.0
     grants: list[dict[str, Any]] | None = None
 
@@ -335,6 +333,11 @@ class Host(ABC):
             results={sim: ended for sim, ended in results.items() if ended},
             refusals=receipt.refusals,
         )
+
+    @property
+    def problem(self) -> str:
+        """Why robots were last stopped by a fault, in words; empty if that is not known."""
+        return self.cerebellum.readings.problem
 
     def statistics(self) -> TimingStatistics:
         """Return how punctual the ticks of the present episode are: on time, by construction, on the lockstep clock."""

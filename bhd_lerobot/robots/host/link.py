@@ -208,7 +208,7 @@ class LiveLink:
                 how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
                 self._complain(name, how)
         if self._running and "plant" in self._pipes:
-            silence = time.monotonic_ns() - int(self.block.words[Word.PLANT_ALIVE])
+            silence = abs(time.monotonic_ns() - int(self.block.words[Word.PLANT_ALIVE]))
             if silence > _SILENCE_S * NANOSECONDS:
                 self._complain(
                     "plant", f"({self.pids['plant']}) has shown no sign of life for {silence / NANOSECONDS:.1f} s"

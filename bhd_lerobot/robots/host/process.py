@@ -136,7 +136,8 @@ class LiveProcess:
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
         self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns)
-        cerebellum.oldest_ns = spec.oldest_ns
+        # A tick is for the time that it was due at. How far stamps are ahead of now is checked where they are read.
+        cerebellum.readings.oldest_ns = cerebellum.readings.ahead_ns = spec.oldest_ns
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
@@ -196,6 +197,7 @@ class LiveProcess:
             self._hardware.is_muted = True
         grid = TickGrid(0, self._loop.period_ns)
         for tick in range(self._warm_up_ticks):
+            self._host.cerebellum.stamp_origin_ns = time.monotonic_ns() - tick * self._loop.period_ns
             self._host.cerebellum.tick(tick * self._loop.period_ns)
             self._serve_bridge(0)
             self._advance(1)
@@ -218,9 +220,13 @@ class LiveProcess:
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
         self._standing_ticks = 0
         grid = self._loop.run(start_ns)
+        return grid.executed, grid.skipped, self._problem()
+
+    def _problem(self) -> str:
         hardware, cerebellum = self._hardware, self._host.cerebellum
-        has_fault = hardware is not None and cerebellum.mode[0] == Mode.FAULT
-        return grid.executed, grid.skipped, hardware.not_ready(cerebellum.reading) if hardware and has_fault else ""
+        if cerebellum.mode[0] != Mode.FAULT:
+            return ""
+        return cerebellum.readings.problem or (hardware.not_ready(cerebellum.reading) if hardware else "")
 
     def _serve(self, now_ns: int) -> None:
         self._serve_bridge(now_ns)

@@ -341,7 +341,7 @@ class LiveHost(Host):
                 link.wait()
 
     @property
-    def problem(self) -> str:  # type: ignore[override]
+    def problem(self) -> str:
         """What was wrong with the plant in its last fault, or which watchdog noticed something, in words."""
         noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._watchdog)
         return self.link.problem or (f"watchdog: {noticed}" if noticed else "no watchdog says why")

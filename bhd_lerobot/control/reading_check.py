@@ -1,0 +1,130 @@
+"""Whether a reading can be a measurement of the present: finite, of this time, and no faster than joints can turn."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.plant import PlantReading, SafetyStatus
+
+Mask = NDArray[np.bool_]
+
+# Times the largest speed of a joint. In collisions of a simulated UR5 (`python -m benchmarks.contact`) no joint exceeded
+# 1.01 times its limit.
+_FASTER = 2.0
+_SLACK_PERIODS = 3  # by so much may stamps be off
+_TURN = 2 * math.pi
+
+
+class ReadingCheck:
+    """Finds readings of n robots that are no measurements of the present.
+
+    A position may be as far from an earlier one as the joint can turn in the time between the two, by their stamps
+    where the plant gives any. Robots in a stop of their own may be moved by hand and are not checked for that; neither
+    are grippers, whose fingers a collision throws.
+
+    Attributes:
+        oldest_ns: largest age of a reading [ns].
+        ahead_ns: by how much a stamp may be ahead of the tick's time [ns].
+        problem: why the last reading that was refused was no measurement, in words.
+
+    Args:
+        body: the robot.
+        n: number of robots.
+        control_hz: ticks a second [Hz].
+    """
+
+    def __init__(self, body: Body, n: int, control_hz: int) -> None:
+        period = NANOSECONDS // control_hz
+        self.oldest_ns, self.ahead_ns = _SLACK_PERIODS * period, period
+        self.problem = ""
+        if isinstance(body, Arm):
+            self._names: tuple[str, ...] = (*body.chain.joints, "gripper")
+            speed = np.array([*body.limits.velocity[:-1], np.inf])
+        elif isinstance(body, MobileBase):
+            self._names, speed = body.drive.joints, np.full(2, body.drive.max_wheel_speed)
+        self._speed = _FASTER * speed / NANOSECONDS  # [rad/ns]
+        self._step, self._slack = self._speed * period, _SLACK_PERIODS * self._speed * period
+        self._near = np.full((n, len(speed)), np.nan)  # follows the positions no faster than joints can turn
+        self._last = np.zeros_like(self._near)  # the last positions that were measurements
+        self._work, self._flags = np.zeros_like(self._near), np.zeros(self._near.shape, np.bool_)
+        self._time = np.zeros(n, np.int64)  # of the reading before [ns]
+
+    def forget(self, ids: NDArray[np.intp]) -> None:
+        """Accept the next positions of some robots, whatever they are."""
+        self._near[ids] = np.nan
+        self.problem = ""
+
+    def wrong_positions(self, reading: PlantReading, now_ns: int) -> Mask | None:
+        """Return the robots whose positions are not finite or changed too fast, shape (n,); None if there are none.
+
+        Their positions in `reading` become the last that were measurements.
+        """
+        near, work = self._near, self._work
+        np.subtract(reading.position, near, out=work)
+        np.abs(work, out=work)
+        np.less_equal(work, self._step, out=self._flags)  # false for what is not a number
+        wrong = None
+        if np.count_nonzero(self._flags) == self._flags.size:
+            near[:] = reading.position
+        else:
+            wrong = self._follow(reading, now_ns)
+        self._time[:] = now_ns if reading.stamp_ns is None else reading.stamp_ns
+        self._last[:] = reading.position
+        return wrong
+
+    def _follow(self, reading: PlantReading, now_ns: int) -> Mask | None:
+        position, near = reading.position, self._near
+        finite = np.isfinite(position).all(axis=1)
+        anew = finite & (~np.isfinite(near).all(axis=1) | (reading.safety != SafetyStatus.NORMAL))
+        np.copyto(near, position, where=anew[:, None])
+        elapsed = np.maximum((now_ns if reading.stamp_ns is None else reading.stamp_ns) - self._time, 0)
+        way = position - near
+        most = self._speed * np.maximum(elapsed, 1)[:, None]
+        follow = np.minimum(np.maximum(way, -most), most)
+        far = (np.abs(way - follow) > self._slack) & finite[:, None]
+        wrong: Mask = ~finite | far.any(axis=1)
+        np.add(near, follow, out=near, where=~wrong[:, None])
+        if not np.count_nonzero(wrong):
+            return None
+        if np.count_nonzero(far) and not self.problem:
+            sim, joint = (int(index) for index in np.argwhere(far)[0])
+            self.problem = self._explain(joint, float(way[sim, joint]), int(elapsed[sim]))
+        position[wrong] = self._last[wrong]
+        return wrong
+
+    def _explain(self, joint: int, way: float, elapsed_ns: int) -> str:
+        turns = round(way / _TURN)
+        text = f"{self._names[joint]} reads a change of {way:.3f} rad within {elapsed_ns / 1e6:.1f} ms"
+        if turns and abs(way - turns * _TURN) < 0.5:
+            return (
+                f"{text}: its angles are wrapped. Let the plant count turns, so that angles go on continuously beyond "
+                "their range of one turn"
+            )
+        return f"{text}, faster than it can turn: no measurement. Check its encoder and the plant's conversion"
+
+    def wrong_times(self, stamp_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], now_ns: int) -> Mask | None:
+        """Return the robots whose reading is too old, or from the future, shape (n,); None if there are none.
+
+        Args:
+            stamp_ns: of the joints' readings [ns], shape (n,).
+            newest_ns: the larger of these and the stamps of the further sensors [ns], shape (n,).
+            now_ns: the time, on the clock of the stamps [ns].
+        """
+        early = newest_ns > now_ns + self.ahead_ns
+        wrong: Mask = (stamp_ns < now_ns - self.oldest_ns) | early
+        if not np.count_nonzero(wrong):
+            return None
+        if np.count_nonzero(early) and not self.problem:
+            self.problem = ahead_of_time(int(newest_ns.max()) - now_ns)
+        return wrong
+
+
+def ahead_of_time(ahead_ns: int) -> str:
+    """Return in words that a stamp is from the future."""
+    return (
+        f"a stamp is {ahead_ns / NANOSECONDS:.3f} s ahead of now: of another clock. Stamps are of the monotonic clock of "
+        "this machine (time.monotonic_ns)"
+    )

@@ -1,0 +1,119 @@
+"""What is taken for a measurement of the present: all that joints can do, and nothing that they cannot."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.plant import PlantReading, SafetyStatus
+from bhd_lerobot.control.reading_check import ReadingCheck
+
+HZ = 500
+PERIOD = NANOSECONDS // HZ
+FASTEST = np.pi / HZ  # [rad] that a UR5's joint turns in a tick
+
+
+def made(n: int = 1, stamped: bool = False) -> tuple[ReadingCheck, PlantReading]:
+    reading = PlantReading(n, 7)
+    if stamped:
+        reading.stamp_ns = np.zeros(n, np.int64)
+    return ReadingCheck(ur5(), n, HZ), reading
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 4]), st.booleans(), st.integers(1, 3))
+def test_whatever_joints_can_do_is_a_measurement(seed: int, every: int, stamped: bool, n: int) -> None:
+    """Joints that speed and reverse; a plant that is read more often than it measures; ticks that were skipped."""
+    rng = np.random.default_rng(seed)
+    check, reading = made(n, stamped)
+    where, now = rng.uniform(-6, 6, (n, 7)), 0
+    for tick in range(200):
+        ticks = int(rng.choice([1, 1, 1, 1, 2, 20]))
+        now += ticks * PERIOD
+        where[:, :6] += rng.choice([-1, 0, 1], (n, 6)) * FASTEST * ticks
+        where[:, 6] = rng.uniform(0, 0.085)  # what a collision does to fingers
+        if tick % every == 0 or not stamped:  # what has no stamps is of now
+            reading.position[:] = where
+            if reading.stamp_ns is not None:
+                reading.stamp_ns[:] = now
+        before = reading.position.copy()
+        assert check.wrong_positions(reading, now) is None
+        np.testing.assert_array_equal(reading.position, before)
+    assert not check.problem
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 5),
+    st.floats(0.12, 7.0) | st.floats(-7.0, -0.12) | st.sampled_from([np.nan, np.inf, -np.inf, 1e300]),
+    st.booleans(),
+)
+def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float, stamped: bool) -> None:
+    check, reading = made(2, stamped)
+    where = np.tile(np.array(ur5().home), (2, 1))
+    for tick in range(10):
+        where[0, joint] += FASTEST
+        reading.position[:] = where
+        if reading.stamp_ns is not None:
+            reading.stamp_ns[:] = tick * PERIOD
+        assert check.wrong_positions(reading, tick * PERIOD) is None
+    for tick in range(10, 200):
+        reading.position[:] = where
+        reading.position[0, joint] += jump
+        if reading.stamp_ns is not None:
+            reading.stamp_ns[:] = tick * PERIOD
+        wrong = check.wrong_positions(reading, tick * PERIOD)
+        assert wrong is not None
+        assert wrong.tolist() == [True, False]
+        np.testing.assert_array_equal(reading.position, where)
+    if np.isfinite(jump) and abs(jump) < 100:
+        assert check.problem.startswith(f"{ur5().chain.joints[joint]} reads a change of {jump:.3f} rad within 2.0 ms")
+    check.forget(np.arange(2))
+    reading.position[:] = where + 1.0
+    assert check.wrong_positions(reading, 200 * PERIOD) is None
+    assert not check.problem
+
+
+@pytest.mark.parametrize("turns", [-1, 1, 2])
+def test_angles_that_are_wrapped_are_named_as_such(turns: int) -> None:
+    check, reading = made()
+    reading.position[0, 0] = -turns * np.pi
+    assert check.wrong_positions(reading, 0) is None
+    reading.position[0, 0] += turns * 2 * np.pi + 0.001
+    assert check.wrong_positions(reading, PERIOD) is not None
+    assert "shoulder_pan reads a change of" in check.problem
+    assert "its angles are wrapped" in check.problem
+
+
+def test_a_robot_in_a_stop_of_its_own_may_be_moved() -> None:
+    check, reading = made()
+    assert check.wrong_positions(reading, 0) is None
+    reading.safety[0] = SafetyStatus.STOPPED
+    reading.position[0] += 0.5
+    assert check.wrong_positions(reading, PERIOD) is None
+    reading.safety[0] = SafetyStatus.NORMAL
+    assert check.wrong_positions(reading, 2 * PERIOD) is None
+
+
+def test_wheels_have_no_end_and_no_jumps() -> None:
+    check, reading = ReadingCheck(turtlebot3_burger(), 1, 200), PlantReading(1, 2)
+    for tick in range(2000):
+        reading.position += 6.7 / 200
+        assert check.wrong_positions(reading, tick * NANOSECONDS // 200) is None
+    reading.position[0, 1] = 0.0  # a counter that overflowed, or a board that was started anew
+    assert check.wrong_positions(reading, 10 * NANOSECONDS) is not None
+
+
+def test_both_sides_of_an_age_are_checked() -> None:
+    now = 10**15
+    for age, is_wrong in ((0, False), (3, False), (3.01, True), (-1, False), (-1.01, True), (-5000, True)):
+        check = ReadingCheck(ur5(), 1, HZ)
+        stamp = np.array([now - round(age * PERIOD)])
+        assert (check.wrong_times(stamp, stamp, now) is not None) == is_wrong
+    assert check.problem == (
+        "a stamp is 10.000 s ahead of now: of another clock. Stamps are of the monotonic clock of this machine "
+        "(time.monotonic_ns)"
+    )

@@ -1,0 +1,165 @@
+"""Sensors that lie: whatever they read, nothing moves after the stop by more than giving way needs. On physics."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.control.messages import Mode, Request, Watchdog
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+
+Array = NDArray[np.float64]
+Lie = Callable[[PlantReading, float], None]
+"""Falsifies the readings of all arms; seconds since the lie began, from 0 on."""
+
+HZ = 500
+BRAKES = 0.03  # [rad] from 0.4 rad/s
+
+
+class Lied:
+    """UR5s of which each turns one joint with 0.4 rad/s, and whose readings are falsified after half a second."""
+
+    def __init__(self, joints: Any, lie: Lie) -> None:
+        self.joints = np.asarray(joints)
+        self.all = np.arange(len(self.joints))
+        self.arm = arm = UR5Simulation(UR5Config(), len(self.joints))
+        arm.reset(self.all, [TableScene("empty", (), arm.body.home)] * len(self.joints), self.all.tolist())
+        self.cerebellum: Any = arm.cerebellum
+        self.true: list[Array] = []
+        self.modes: list[Array] = []
+        read = self.cerebellum.plant.read
+
+        def falsified(out: PlantReading) -> None:
+            read(out)
+            self.true.append(out.position[:, :6].copy())
+            self.modes.append(self.cerebellum.mode.copy())
+            if len(self.true) > HZ // 2:
+                lie(out, (len(self.true) - HZ // 2 - 1) / HZ)
+
+        self.cerebellum.plant.read = falsified
+        self.action = self.cerebellum.command.copy()
+        self.watchdog = np.zeros(len(self.joints), np.int64)
+
+    def turn(self, seconds: float) -> None:
+        for _ in range(round(seconds * 25)):
+            self.action[self.all, self.joints] += 0.4 / 25
+            self.watchdog |= self.arm.step(self.action).watchdog
+
+    def moved(self, mode: Mode = Mode.FAULT) -> Array:
+        """How far the joint of each arm that moved most was from where the stop found it, by physics [rad]."""
+        assert (self.cerebellum.mode == mode).all(), self.cerebellum.mode
+        true, stopped = np.array(self.true), np.array(self.modes) >= Mode.ESTOP
+        first = stopped.argmax(axis=0)
+        away = np.abs(true - true[first, self.all]).max(axis=2)
+        return np.where(stopped, away, 0.0).max(axis=0)
+
+    def reset(self) -> None:
+        for request in (Request.RESET, Request.ACTIVATE):
+            assert self.cerebellum.request(request).accepted.all()
+
+
+def test_a_step_of_an_encoder_is_a_fault_that_is_not_followed() -> None:
+    by = np.repeat([0.12, 0.30, 1.0, -0.30], 6)
+    joints = np.tile(np.arange(6), 4)
+
+    def step(out: PlantReading, _: float) -> None:
+        out.position[np.arange(24), joints] += by
+
+    lied = Lied(joints, step)
+    lied.turn(2.5)
+    assert (lied.moved() < BRAKES).all()
+    assert (lied.watchdog & Watchdog.PLANT).all()
+    assert "faster than it can turn" in lied.arm.problem
+
+
+def test_angles_that_are_wrapped_are_a_fault_that_says_so() -> None:
+    """The home position of the shoulder pan is pi."""
+
+    def wrap(out: PlantReading, _: float) -> None:
+        out.position[:, :6] = (out.position[:, :6] + np.pi) % (2 * np.pi) - np.pi
+
+    lied = Lied([0, 1], wrap)
+    lied.turn(2.5)
+    assert (lied.moved() < BRAKES).all()
+    assert "shoulder_pan reads a change of -6.2" in lied.arm.problem
+    assert "its angles are wrapped" in lied.arm.problem
+
+
+def test_an_encoder_that_drifts_brings_the_joint_no_further_than_one_that_is_blocked() -> None:
+    """As fast as the joint can turn, for ever: by its reading it never comes to rest, and the stop ends all the same."""
+    rate = np.tile([0.3, 1.0, 3.0, -1.0, -6.0], 3)
+    joints = np.repeat([0, 1, 3], 5)
+
+    def drift(out: PlantReading, seconds: float) -> None:
+        out.position[np.arange(15), joints] += rate * seconds
+        out.velocity[np.arange(15), joints] += rate
+
+    lied = Lied(joints, drift)
+    lied.turn(6.0)
+    assert (lied.moved() < 0.1 + 0.07 * np.abs(rate) + BRAKES).all()
+    assert np.ptp(np.array(lied.true)[-HZ:], axis=0).max() < 1e-3
+    lied.reset()
+
+
+def test_an_encoder_that_freezes_with_fresh_stamps() -> None:
+    held: list[Array] = []
+
+    def freeze(out: PlantReading, _: float) -> None:
+        own = np.arange(6)
+        held[:] = held or [out.position[own, own].copy()]
+        out.position[own, own], out.velocity[own, own] = held[0], 0.0
+
+    lied = Lied(range(6), freeze)
+    lied.turn(3.0)
+    assert (lied.moved() < 0.1 + 0.1 * 0.4 + BRAKES).all()
+    assert (lied.watchdog & Watchdog.BLOCKED).all()
+
+
+def test_a_speed_that_is_wrong_moves_nothing() -> None:
+    speeds = np.array([2.0, -2.0, 1e6])
+
+    def lie(out: PlantReading, _: float) -> None:
+        out.velocity[:, 1] = speeds
+
+    lied = Lied([0, 0, 0], lie)
+    lied.turn(0.8)
+    lied.cerebellum.estop.press()
+    lied.turn(4.0)
+    assert (lied.moved(Mode.ESTOP) < BRAKES).all()
+    lied.reset()
+
+
+def test_after_an_emergency_stop_an_arm_gives_way_once_and_not_again_to_the_same_reading() -> None:
+    """Off by less than what is found to be blocked: by all that can be known, it presses on something."""
+    by = np.array([0.09, -0.09])
+
+    def creep(out: PlantReading, seconds: float) -> None:
+        out.position[:, 1] += by * min(seconds, 1.0)
+
+    lied = Lied([0, 1], creep)
+    lied.turn(2.0)
+    lied.cerebellum.estop.press()
+    lied.turn(3.0)
+    assert (lied.moved(Mode.ESTOP) < 0.09 + 0.05 + BRAKES).all()
+
+
+@pytest.mark.parametrize("what", ["effort", "velocity"])
+def test_what_is_no_number_leaves_no_blind_limit_of_force(what: str) -> None:
+    def lie(out: PlantReading, seconds: float) -> None:
+        if seconds == 0:
+            getattr(out, what)[0, 2] = np.nan
+
+    lied = Lied([0, 0], lie)
+    lied.turn(1.0)
+    assert lied.cerebellum.mode.tolist() == [Mode.FAULT, Mode.TRACKING]
+    assert lied.cerebellum.request(Request.RESET, np.array([0])).accepted[0]
+    assert lied.cerebellum.request(Request.ACTIVATE, np.array([0])).accepted[0]
+    lied.action = lied.cerebellum.command.copy()
+    lied.turn(1.0)
+    assert (lied.cerebellum.mode == Mode.TRACKING).all()
+    assert np.isfinite(lied.cerebellum.controller.force._torque).all()
