@@ -4,9 +4,11 @@ Streams of commands that no sensible brain sends, one for each simulated robot: 
 spirals that grow beyond every limit, values at the limits, huge ones, ones that are not finite, tool poses that turn on
 the spot through singular postures. Then the same streams again, while the memory of the command queue and the
 controller's own reference are overwritten at random. Every write to the plant is judged by limits that are stated here:
-finite, in the actuator's range, and a change in one tick that the body permits. The second table is the share of the
-guard, the last check before the plant, in a tick, that of the collision monitor, and that of the distance check of
-setpoints. Exits with 1 if anything unsafe was written.
+finite, in the actuator's range, and changes from tick to tick that the body permits. The second table is about readings
+that are no measurements: false, drifting, wrapped, frozen, from the future, of robots that move; with how far a joint or
+a wheel was, at the most, from where the stop found it, by physics. The third is the share of the guard, the last check
+before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits with 1 if
+anything unsafe was written, or a stop was followed by more motion than it needs.
 """
 
 import argparse
@@ -26,6 +28,7 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Mode, Request
+from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -36,7 +39,12 @@ Array = NDArray[np.float64]
 MONITORED = "wheels, monitored"
 SPACES = ("wheels", MONITORED, "joints", "tool", "impedance")
 KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
+LIES = ("false", "drifting", "wrapped", "frozen", "from the future")
 ROUNDING = 1.021  # a trajectory ends inside a tick
+# [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6. An arm
+# that seems to be blocked, 0.1 rad from its reference for 50 ms, is brought to where it seems to be, and then back by up to
+# 0.25 rad, for as long as its efforts do not agree with where it seems to be.
+NEEDED = {"joints": dict.fromkeys(LIES, 0.2) | {"drifting": 0.45, "frozen": 0.45}, "wheels": dict.fromkeys(LIES, 0.6)}
 
 
 class Judge:
@@ -58,27 +66,42 @@ class Judge:
             lead = np.asarray(body.lead_s)
             effort = np.asarray(limits.effort[:-1])
             change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
+            bend = np.asarray(limits.stop_deceleration) * (1 / hz + 2 * lead) / hz
             lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
             if body.actuation == "torque":
                 lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
+                bend[:-1] = np.inf
         else:
             drive = body.drive
             stop = limits.stop_deceleration
             most = drive.max_wheel_speed
             change = np.full(2, (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / hz)
-            lower, upper = np.full(2, -most), np.full(2, most)
+            lower, upper, bend = np.full(2, -most), np.full(2, most), np.full(2, np.inf)
         self._lower, self._upper, self._change = lower - 1e-9, upper + 1e-9, change * ROUNDING + 1e-9
+        self._bend = bend * ROUNDING + 1e-9
         self._last: Array | None = None
+        self._rate: Array | None = None
+        self._position = np.zeros((self.n, len(lower)))
         self.writes = self.unsafe = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._plant, name)
 
+    def read(self, out: PlantReading) -> None:
+        """Pass on, and remember where the joints are."""
+        self._plant.read(out)
+        self._position = out.position.copy()
+
     def write(self, ctrl: Array) -> None:
         """Judge and pass on."""
         safe = (ctrl >= self._lower) & (ctrl <= self._upper)  # false for what is not a number
         if self._last is not None:
-            safe &= np.abs(ctrl - self._last) <= self._change
+            rate = ctrl - self._last
+            safe &= np.abs(rate) <= self._change
+            if self._rate is not None:  # a command may always come nearer to where the joint is
+                nearer = rate * (self._position - ctrl) >= 0
+                safe &= (np.abs(rate - self._rate) <= self._bend) | nearer
+            self._rate = rate
         self.unsafe += int((~safe.all(axis=1)).sum())
         self.writes += len(ctrl)
         self._last = ctrl.copy()
@@ -232,6 +255,91 @@ def run(space: str, streams: int, frames: int, seed: int) -> tuple[Outcome, Outc
     return outcomes
 
 
+@dataclass
+class Followed:
+    """What became of robots whose readings were none."""
+
+    streams: int = 0
+    stopped: int = 0
+    unsafe: int = 0
+    moved: float = 0.0
+
+
+class Liar:
+    """A plant whose readings are falsified, of each robot from a tick of its own on.
+
+    Attributes:
+        moved: how far a joint was, at the most, from where a stop found it [rad], shape (n,).
+
+    Args:
+        simulation: whose plant it is.
+        lie: one of `LIES`.
+        rng: where chance comes from.
+    """
+
+    def __init__(self, simulation: Any, lie: str, rng: np.random.Generator) -> None:
+        self._plant, self.n, self._lie = simulation.cerebellum.plant, simulation.n, lie
+        self._cerebellum, self._hz = simulation.cerebellum, simulation.rates.control_hz
+        joints = 6 if isinstance(simulation.body, Arm) else 2
+        self._begin, self._tick = rng.integers(self._hz // 4, self._hz, self.n), 0
+        self._rows, self._joint = np.arange(self.n), rng.integers(joints, size=self.n)
+        self._by = rng.uniform(0.12, 3.0, self.n) * rng.choice([-1, 1], self.n)
+        self._held, self._joints = np.zeros((self.n, joints)), joints
+        self._found, self._stopped = np.zeros((self.n, joints)), np.zeros(self.n, np.bool_)
+        self.moved = np.zeros(self.n)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._plant, name)
+
+    def read(self, out: PlantReading) -> None:
+        """Read, and falsify."""
+        self._plant.read(out)
+        self._measure(out.position[:, : self._joints])
+        since = self._tick - self._begin
+        lies, rows, joint = since >= 0, self._rows, self._joint
+        position, velocity = out.position[:, : self._joints], out.velocity[:, : self._joints]
+        self._held = np.where((since <= 0)[:, None], position, self._held)
+        out.stamp_ns = np.full(self.n, self._tick * 10**9 // self._hz)
+        if self._lie == "false":
+            position[rows, joint] += self._by * lies
+        elif self._lie == "drifting":
+            position[rows, joint] += self._by * np.maximum(since, 0) / self._hz
+            velocity[rows, joint] += self._by * lies
+        elif self._lie == "wrapped":
+            wrapped = (position + self._by[:, None]) % (2 * np.pi) - self._by[:, None]
+            position[:] = np.where(lies[:, None], wrapped, position)
+        elif self._lie == "frozen":
+            position[:] = np.where(lies[:, None], self._held, position)
+            velocity[lies] = 0.0
+        else:
+            out.stamp_ns += np.where(lies, np.abs(self._by * 1e9), 0).astype(np.int64)
+        self._tick += 1
+
+    def _measure(self, position: Array) -> None:
+        stopped = self._cerebellum.mode >= Mode.ESTOP
+        new = stopped & ~self._stopped
+        self._found[new], self._stopped = position[new], stopped
+        away = np.abs(position - self._found).max(axis=1)
+        np.maximum(self.moved, away, out=self.moved, where=stopped)
+
+
+def deceive(space: str, lie: str, streams: int, frames: int, seed: int) -> Followed:
+    """Run robots that sway, and whose readings become false."""
+    simulation = make(space, streams)
+    rng = np.random.default_rng([seed, LIES.index(lie), SPACES.index(space)])
+    liar = simulation.cerebellum.plant = Liar(simulation, lie, rng)
+    judge = simulation.cerebellum.plant = Judge(simulation)
+    first = start_of(simulation)
+    size, rate = rng.uniform(0.1, 0.5, first.shape), rng.uniform(0.5, 2.0, first.shape)
+    for frame in range(frames):
+        action = first + size * np.sin(rate * frame / simulation.rates.fps)
+        if space == "joints":
+            action[:, -1] = first[:, -1]
+        simulation.step(action)
+    moved = float(liar.moved.max())
+    return Followed(streams, int((simulation.modes == Mode.FAULT).sum()), judge.unsafe, moved)
+
+
 def timed(function: Callable[[], object], count: int) -> float:
     """Return how long a call takes [s]; the shortest of 20 times `count` calls."""
     best = np.inf
@@ -282,7 +390,8 @@ def share(space: str, n: int) -> tuple[float, float]:
         monitor, command, pose = cerebellum.controller._monitor, np.tile([0.2, 1.0], (n, 1)), np.zeros((n, 3))
         check = timed(lambda: monitor.limit(command.copy(), command, pose), 200)
     else:
-        check = timed(lambda: [cerebellum.guard.check(one) for one in pair], 200) / 2
+        position = cerebellum.reading.position
+        check = timed(lambda: [cerebellum.guard.check(one, position) for one in pair], 200) / 2
     whole = timed(lambda: simulation.step(action), 3) / simulation.rates.ticks_per_frame
     return check, whole
 
@@ -316,6 +425,15 @@ def main(arguments: list[str] | None = None) -> int:
                 numbers = (one.streams, one.writes, one.unsafe, one.faults, one.refused, one.touched)
                 table.add_row(space, memory, *(f"{number:,}" for number in numbers))
     console.print(table)
+    lies = Table(title="Readings that are no measurements")
+    for column in ("robot", "reading", "streams", "stopped", "unsafe", "largest motion after the stop"):
+        lies.add_column(column, justify="left" if column in ("robot", "reading") else "right")
+    for space in NEEDED:
+        for lie in LIES:
+            one = deceive(space, lie, options.streams, options.frames, options.seed)
+            unsafe += one.unsafe + (one.moved > NEEDED[space][lie])
+            lies.add_row(space, lie, f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}", f"{one.moved:.3f} rad")
+    console.print(lies)
     shares = Table(title="The share of the checks in a tick, physics and sensors included")
     for column in ("robot", "n", "check", "tick", "share"):
         shares.add_column(column, justify="left" if column == "robot" else "right")

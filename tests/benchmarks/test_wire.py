@@ -16,10 +16,19 @@ def test_nothing_unsafe_is_written(space: str) -> None:
     assert vandalised.faults > 0  # the guard had something to do, and the robots went on after a reset
 
 
+@pytest.mark.parametrize("space", wire.NEEDED)
+def test_whatever_is_read_a_stop_is_followed_by_no_more_motion_than_it_needs(space: str) -> None:
+    for lie in wire.LIES:
+        one = wire.deceive(space, lie, 12, 50, 1)
+        assert one.unsafe == 0
+        assert one.moved < wire.NEEDED[space][lie]
+        assert one.stopped or (space, lie) == ("wheels", "drifting")
+
+
 def test_the_judge_is_not_blind(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the guard, the same streams write what is not safe."""
 
-    def let_through(self: Guard, actuators: np.ndarray, ticks: int = 1) -> None:
+    def let_through(self: Guard, actuators: np.ndarray, position: np.ndarray, ticks: int = 1) -> None:
         self.written[:] = actuators
 
     monkeypatch.setattr(Guard, "check", let_through)

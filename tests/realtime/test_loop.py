@@ -220,6 +220,15 @@ def test_a_sign_of_life_after_the_silence_and_a_new_setpoint_move_it_again():
     assert loop.modes[-1] == Mode.TRACKING
 
 
+@pytest.mark.parametrize("word", [Word.BRAIN_ALIVE, Word.RECORDER_ALIVE])
+def test_a_sign_of_life_from_the_future_is_none(word):
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.1, recorder_timeout_s=0.1))
+    loop.words[word] = loop.now + 3600 * NANOSECONDS
+    loop.drive(0, 30)
+    loop.run(30)
+    assert Mode.TRACKING not in loop.modes
+
+
 def test_absent_processes_are_not_watched():
     """A word that was never written belongs to a process that there is not."""
     loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01, plant_timeout_s=0.01))

@@ -102,6 +102,17 @@ def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
     assert rig.guard.stops == 1
 
 
+def test_a_command_from_the_future_drives_nothing_and_never_grows_fresh() -> None:
+    rig = Rig()
+    rig.send()
+    assert rig.check(1) == PlantPhase.DRIVEN
+    rig.now += 10_000 * MS
+    rig.send()  # stamped by a clock that is ahead
+    rig.now -= 10_000 * MS
+    assert rig.check(1) == PlantPhase.STOPPED
+    assert rig.check(TIMEOUT / MS) == PlantPhase.STOPPED
+
+
 def test_an_old_command_acknowledges_nothing() -> None:
     rig = Rig()
     rig.stop()

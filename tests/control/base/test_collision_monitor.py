@@ -125,8 +125,8 @@ def test_without_scans_of_the_last_three_periods_it_stands_and_goes_on_with_the_
         assert rig.command[0] == pytest.approx(0.2, abs=0.005)
 
 
-def test_scans_that_come_too_late_are_none_of_the_present() -> None:
-    for late, moves in ((0.4, True), (0.7, False)):
+def test_scans_that_come_too_late_or_from_the_future_are_none_of_the_present() -> None:
+    for late, moves in ((0.4, True), (0.7, False), (-0.02, False), (-10.0, False)):
         rig = watched()
         read = rig.plant.read
 
@@ -142,8 +142,20 @@ def test_scans_that_come_too_late_are_none_of_the_present() -> None:
                 rig.cerebellum.reading.sensors_ns[:] = 10**12 + rig.now - round(late * 1e9)
                 rig.send(0.2)
             rig.tick()
-        assert rig.mode == Mode.TRACKING
+        assert rig.mode == (Mode.TRACKING if late > 0 else Mode.FAULT)
         assert (rig.command[0] > 0.1) == moves
+
+
+def test_a_scan_from_the_future_does_not_take_the_place_of_one_that_grows_old() -> None:
+    rig = watched()
+    monitor: Any = rig.cerebellum.controller._monitor  # type: ignore[attr-defined]
+    pose, far = np.zeros((1, 3)), np.full((1, monitor.beams), 3.0)
+    for tick in range(4 * SCAN_TICKS):
+        stamp = np.array([tick])
+        monitor.see(far, stamp, pose, np.array([-2000 if tick else 0]))
+        twist = np.array([[0.2, 0.0]])
+        limited = monitor.limit(twist, twist.copy(), pose)
+        assert (limited is None) == (tick <= 3 * SCAN_TICKS), tick
 
 
 def test_beside_an_obstacle_only_what_leads_nearer_is_taken_away() -> None:

@@ -142,6 +142,11 @@ def no_stamp(out: PlantReading) -> None:
     out.stamp_ns = None
 
 
+def ten_seconds_ahead(out: PlantReading) -> None:
+    assert out.stamp_ns is not None
+    out.stamp_ns[0] += 10 * NANOSECONDS
+
+
 def wrong_shape(out: PlantReading) -> None:
     out.position[0] = np.zeros(3)
 
@@ -152,6 +157,7 @@ def wrong_shape(out: PlantReading) -> None:
         ("read", boom),
         ("read", not_a_number),
         ("read", no_stamp),
+        ("read", ten_seconds_ahead),
         ("read", wrong_shape),
         ("write", boom),
         ("set_mode", boom),
@@ -213,6 +219,7 @@ def test_the_robots_own_safety_functions_are_heard_and_a_reset_starts_from_where
         (lambda plant: plant.broken.update(read=no_stamp), "has read nothing yet"),
         (lambda plant: setattr(plant, "safety", SafetyStatus.STOPPED), "its safety status is STOPPED"),
         (lambda plant: plant.broken.update(read=not_a_number), "not a finite number"),
+        (lambda plant: plant.broken.update(read=ten_seconds_ahead), "a stamp is 10.000 s ahead of now"),
         (lambda plant: plant.broken.update(read=boom), "OSError: the cable is out"),
     ],
 )

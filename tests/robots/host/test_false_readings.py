@@ -1,0 +1,74 @@
+"""Sensors that lie, on the wall clock and with real processes: what is written after the stop."""
+
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5 import UR5
+from tests.robots.host import lying_arm
+from tests.robots.host.support import States, driving_child, mode, relaxed, unique, watchdog_count
+from tests.waiting import until
+
+BRAKES, BLOCKED = 0.03, 0.2  # [rad] from 0.4 rad/s; by which a joint is away that is found to be blocked
+WORDS = {
+    "step": "shoulder_lift reads a change of 0.300 rad",
+    "wrapped": "its angles are wrapped",
+    "from the future": "a stamp is 10.000 s ahead of now: of another clock",
+    "frozen": "watchdog: blocked",
+}
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[UR5, Any]]:
+    path = str(tmp_path_factory.mktemp("lying") / "shared")
+    shared = lying_arm.shared(path, new=True)
+    os.environ[lying_arm.LOG] = path
+    try:
+        plant = f"{lying_arm.__name__}:LyingArm"
+        realtime = relaxed(plant_timeout_s=5.0)
+        robot = UR5(UR5Config(id=unique("lying"), clock="realtime", plant=plant, control_hz=125, realtime=realtime))
+        robot.connect()
+        yield robot, shared
+        robot.disconnect()
+    finally:
+        del os.environ[lying_arm.LOG]
+
+
+@pytest.mark.parametrize("lie", lying_arm.LIES[1:])
+def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie: str) -> None:
+    robot, shared = arm
+    action = {name: robot.get_observation()[name] for name in robot.action_features}
+    start = int(shared["count"])
+
+    def turned(until_mode: Mode | None = None, most: float = 60.0) -> None:
+        end = time.monotonic() + most
+        while time.monotonic() < end and mode(robot) not in (Mode.FAULT, until_mode):
+            action["shoulder_pan.pos"] -= 0.4 / 25
+            robot.simulation.send(np.array([list(action.values())]))
+            robot.simulation.step(None)
+
+    turned(most=1.0)
+    assert mode(robot) == Mode.TRACKING
+    shared["lie"] = lying_arm.LIES.index(lie)
+    turned(Mode.FAULT)
+    assert mode(robot) == Mode.FAULT
+    time.sleep(1.0)
+    robot.simulation.link.pause()
+    end = int(shared["count"])
+    modes, written = shared["mode"][start:end], shared["written"][start:end]
+    first = int((modes == Mode.FAULT).argmax())
+    assert np.abs(written[first:, :6] - written[first, :6]).max() < (BLOCKED if lie == "frozen" else BRAKES)
+    assert np.abs(np.diff(written[:, :6], axis=0)).max() < np.pi / 125 * 1.5
+    assert WORDS[lie] in robot.simulation.problem
+    shared["lie"] = 0
+    robot.simulation.reset(np.zeros(1, np.intp), [None], [0])
+    robot.simulation.begin()
