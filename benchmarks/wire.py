@@ -5,10 +5,10 @@ spirals that grow beyond every limit, values at the limits, huge ones, ones that
 the spot through singular postures. Then the same streams again, while the memory of the command queue and the
 controller's own reference are overwritten at random. Every write to the plant is judged by limits that are stated here:
 finite, in the actuator's range, and changes from tick to tick that the body permits. The second table is about readings
-that are no measurements: false, drifting, wrapped, frozen, from the future, of robots that move; with how far a joint or
-a wheel was, at the most, from where the stop found it, by physics. The third is the share of the guard, the last check
-before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits with 1 if
-anything unsafe was written, or a stop was followed by more motion than it needs.
+that are no measurements: false, drifting, wrapped, frozen, from the future, of robots that move; with the largest
+distance of a joint or a wheel from where the stop found it, by physics. The third is the share of the guard, the last
+check before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits
+with 1 if anything unsafe was written, or a stop was followed by more motion than it needs.
 """
 
 import argparse
@@ -41,9 +41,9 @@ SPACES = ("wheels", MONITORED, "joints", "tool", "impedance")
 KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
 LIES = ("false", "drifting", "wrapped", "frozen", "from the future")
 ROUNDING = 1.021  # a trajectory ends inside a tick
-# [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6. An arm
-# that seems to be blocked, 0.1 rad from its reference for 50 ms, is brought to where it seems to be, and then back by up to
-# 0.25 rad, for as long as its efforts do not agree with where it seems to be.
+# [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6. An
+# arm that seems to be blocked, 0.1 rad from its reference for 50 ms, is brought to where it seems to be, and then back
+# by up to 0.25 rad, for as long as its efforts do not agree with where it seems to be.
 NEEDED = {"joints": dict.fromkeys(LIES, 0.2) | {"drifting": 0.45, "frozen": 0.45}, "wheels": dict.fromkeys(LIES, 0.6)}
 
 

@@ -45,8 +45,8 @@ class WireLimits:
 
         Wheels may change their speed as fast as the hardest stop does. Positions may change by the largest speed, and
         by what the lead for the servos' damping adds when the reference accelerates; torques by what spares the gears.
-        The changes of positions may differ by what the largest acceleration makes of the reference, and of its lead when
-        it turns into the opposite one.
+        The changes of positions may differ by what the largest acceleration makes of the reference, and of its lead
+        when it turns into the opposite one.
 
         Args:
             body: the robot.
@@ -162,10 +162,9 @@ class Guard:
             The robots whose commands were not safe, shape (n,); None if there are none.
         """
         is_sparse, self._is_sparse = self._is_sparse or ticks > 1, ticks > 1
-        if len(actuators) == 1:
-            if not is_sparse and self._is_safe(actuators[0].tolist()):
-                self.written[:] = actuators
-                return None
+        if len(actuators) == 1 and not is_sparse and self._is_safe(actuators[0].tolist()):
+            self.written[:] = actuators
+            return None
         np.add(self.written, self.rate, out=self._from[2])
         work = np.subtract(actuators, self._from, out=self._work)
         change = work[0] / max(ticks, 1)

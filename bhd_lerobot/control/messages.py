@@ -122,13 +122,14 @@ class Watchdog(IntFlag):
     RECORDER = 8
     """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
     PLANT = 16
-    """The plant showed no sign of life for its time-out, or its readings were too old, or contradicted each other: mode
-    FAULT."""
+    """The plant showed no sign of life for its time-out, reported a stop of its own, or its readings were no
+    measurements of the present (not finite, too old, from the future, faster than a joint can turn) or contradicted each
+    other: mode FAULT."""
     MISSES = 32
     """So many ticks in a row came too late that the loop is no control loop any more: mode FAULT."""
     GUARD = 64
-    """What was to be written to an actuator was not finite, out of its range, or too far from the last: mode FAULT, and
-    the last safe command stays until the stop begins."""
+    """What was to be written to an actuator was not finite, out of its range, too far from the last, or bent too
+    suddenly: mode FAULT, and the last safe commands are continued at a falling speed until the stop begins."""
     FORCE = 128
     """An arm pressed with more than its largest force: a protective stop, mode FAULT."""
 

@@ -11,8 +11,8 @@ from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 
 Mask = NDArray[np.bool_]
 
-# Times the largest speed of a joint. In collisions of a simulated UR5 (`python -m benchmarks.contact`) no joint exceeded
-# 1.01 times its limit.
+# Times the largest speed of a joint. In collisions of a simulated UR5 (`python -m benchmarks.contact`) no joint
+# exceeded 1.01 times its limit.
 _FASTER = 2.0
 _SLACK_PERIODS = 3  # by so much may stamps be off
 _TURN = 2 * math.pi
@@ -84,8 +84,9 @@ class ReadingCheck:
         way = position - near
         most = self._speed * np.maximum(elapsed, 1)[:, None]
         follow = np.minimum(np.maximum(way, -most), most)
-        far = (np.abs(way - follow) > self._slack) & finite[:, None]
-        wrong: Mask = ~finite | far.any(axis=1)
+        far: Mask = np.greater(np.abs(way - follow), self._slack)
+        far[~finite] = False
+        wrong: Mask = np.asarray(~finite | far.any(axis=1))
         np.add(near, follow, out=near, where=~wrong[:, None])
         if not np.count_nonzero(wrong):
             return None
@@ -125,6 +126,6 @@ class ReadingCheck:
 def ahead_of_time(ahead_ns: int) -> str:
     """Return in words that a stamp is from the future."""
     return (
-        f"a stamp is {ahead_ns / NANOSECONDS:.3f} s ahead of now: of another clock. Stamps are of the monotonic clock of "
-        "this machine (time.monotonic_ns)"
+        f"a stamp is {ahead_ns / NANOSECONDS:.3f} s ahead of now: of another clock. Stamps are of the monotonic clock "
+        "of this machine (time.monotonic_ns)"
     )

@@ -170,7 +170,7 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.HOLD
 
 
-# --- rows that alternate: each near to the last, and a torque at its limit ---------------------------------------------
+# --- rows that alternate: each near to the last, and a torque at its limit -------------------------------------------
 
 
 @pytest.mark.parametrize("by", [3e-3, 1e-3, 5e-4])

@@ -91,7 +91,7 @@ def test_angles_that_are_wrapped_are_a_fault_that_says_so() -> None:
 
 
 def test_an_encoder_that_drifts_brings_the_joint_no_further_than_one_that_is_blocked() -> None:
-    """As fast as the joint can turn, for ever: by its reading it never comes to rest, and the stop ends all the same."""
+    """As fast as the joint can turn, for ever: by its reading it never rests, and the stop ends all the same."""
     rate = np.tile([0.3, 1.0, 3.0, -1.0, -6.0], 3)
     joints = np.repeat([0, 1, 3], 5)
 

@@ -83,9 +83,9 @@ class ArmController(Controller):
         self._most_giving_ticks = round(_GIVING_S * control_hz)
         self._stopped = np.zeros(n, np.bool_)  # hard, since it was last reset
         self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
-        # Where a protective stop brings the joints, or where the reference was when another hard stop began; and how far
-        # from `_centre` the reference may be brought after it. All are fixed when the stop begins, or has come to rest:
-        # a reading that is wrong moves an arm no further.
+        # Where a protective stop brings the joints, or where the reference was when another hard stop began; and how
+        # far from `_centre` the reference may be brought after it. All are fixed when the stop begins, or has come to
+        # rest: a reading that is wrong moves an arm no farther.
         self._aim, self._centre, self._room = (np.zeros((n, width - 1)) for _ in range(3))
         self._back_rad = np.zeros(n)  # so far it then goes back
         self._trail = _Trail(n, width - 1, control_hz)
@@ -319,7 +319,12 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy & (self._gives_way == 0) & ~self._yields
+        return (
+            np.asarray((np.abs(self.velocity) < _REST).all(axis=1))
+            & ~self.busy
+            & (self._gives_way == 0)
+            & ~self._yields
+        )
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -418,7 +423,7 @@ class _Trail:
         self._period = max(1, round(_TRAIL_PERIOD_S * control_hz))
         self._rows = np.full((round(_TRAIL_S / _TRAIL_PERIOD_S), n, dof), np.nan)
         self._ticks = 0
-        self._count = np.zeros(n, np.int64)
+        self._count, self._gone_back = np.zeros(n, np.int64), np.zeros(n, np.int64)  # rows
 
     def note(self, reading: PlantReading, gives_way: NDArray[np.int64]) -> None:
         """Take one tick into account; arms that give way leave no trail."""
@@ -428,18 +433,26 @@ class _Trail:
         ids = np.flatnonzero(gives_way == 0)
         self._rows[self._count[ids] % len(self._rows), ids] = reading.position[ids, : self._rows.shape[2]]
         self._count[ids] += 1
+        self._gone_back[ids] = 0
 
     def back(
         self, sim: int, position: NDArray[np.float64], least: float, otherwise: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`."""
-        rows = self._rows[(self._count[sim] - 1 - np.arange(len(self._rows))) % len(self._rows), sim]
+        """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`.
+
+        One that has gone back already goes on from there.
+        """
+        ages = np.arange(self._gone_back[sim], len(self._rows))
+        rows = self._rows[(self._count[sim] - 1 - ages) % len(self._rows), sim]
         away = np.abs(rows - position).max(axis=1) >= least  # never so where there is no row yet
-        return rows[int(away.argmax())] if away.any() else otherwise
+        if not away.any():
+            return otherwise
+        self._gone_back[sim] += int(away.argmax())
+        return rows[int(away.argmax())]
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget arms that were put somewhere else."""
-        self._rows[:, ids] = np.nan
+        self._rows[:, ids], self._gone_back[ids] = np.nan, 0
 
 
 _STOP_CODES = {

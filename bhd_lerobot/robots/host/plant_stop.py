@@ -52,7 +52,8 @@ class ServoStop:
 
     While a joint is fast its servo is commanded to wherever the joint is: it brakes with what its damping gives, up to
     its largest torque, and does not pull the joint back to where the stop began. Once slow, it holds the joint there.
-    The gripper keeps its last command: what it grips is not let go of.
+    That is no farther from where the stop found it than a joint needs to brake from its largest speed: a reading that
+    is wrong is followed no farther. The gripper keeps its last command: what it grips is not let go of.
 
     Attributes:
         hold: where the joints are held [rad], the opening last [m], shape (1, joints).
@@ -64,16 +65,23 @@ class ServoStop:
     def __init__(self, arm: Arm) -> None:
         self.hold = np.asarray(arm.home)[None].copy()
         self._held = np.zeros(self.hold.shape, np.bool_)
+        speed = np.asarray(arm.limits.velocity)
+        self._room = speed**2 / np.asarray(arm.limits.stop_deceleration)  # twice the way that the hardest brake takes
+        self._first, self._begun = self.hold.copy(), False
 
     def begin(self, actuators: Array) -> None:
         """Start a stop."""
         self._held[:] = False
         self._held[:, -1] = True
         self.hold[:, -1] = actuators[:, -1]
+        self._begun = False
 
     def command(self, reading: PlantReading) -> Array:
         """Return where the joints are to be."""
-        np.copyto(self.hold, reading.position, where=~self._held)
+        if not self._begun:
+            self._first, self._begun = reading.position.copy(), True
+        near = np.minimum(np.maximum(reading.position, self._first - self._room), self._first + self._room)
+        np.copyto(self.hold, near, where=~self._held)
         self._held |= np.abs(reading.velocity) < _SLOW
         return self.hold
 

@@ -1,22 +1,18 @@
 """Sensors that lie, on the wall clock and with real processes: what is written after the stop."""
 
 import os
-import random
-import signal
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
 from tests.robots.host import lying_arm
-from tests.robots.host.support import States, driving_child, mode, relaxed, unique, watchdog_count
-from tests.waiting import until
+from tests.robots.host.support import mode, relaxed, unique
 
 BRAKES, BLOCKED = 0.03, 0.2  # [rad] from 0.4 rad/s; by which a joint is away that is found to be blocked
 WORDS = {

@@ -190,6 +190,15 @@ def test_missed_ticks_are_caught_up_within_a_bound(away: int, skipped: int, adva
 # --- how each kind of robot stops ------------------------------------------------------------------------------------
 
 
+def test_servos_that_hold_the_arm_follow_a_reading_that_runs_away_no_farther_than_a_brake() -> None:
+    stop, reading = ServoStop(ur5()), PlantReading(1, 7)
+    stop.begin(reading.position)
+    for _ in range(2000):
+        reading.position[:] += 2.0 / 500
+        reading.velocity[:] = 2.0  # by which it never comes to rest
+        assert (stop.command(reading)[0, :6] < 0.9).all()
+
+
 def test_a_servo_follows_a_fast_joint_and_holds_a_slow_one() -> None:
     stop, reading = ServoStop(ur5()), PlantReading(1, 7)
     last = np.full((1, 7), 0.03)
