@@ -22,6 +22,7 @@ Stream = Callable[[int, Array, np.random.Generator], Array]
 N, FPS, BEAMS = 16, 10, 36
 LIDAR = support.BODY.lidar
 assert LIDAR is not None
+WHEEL_RADIUS = support.BODY.drive.wheel_radius
 SCAN_TICKS = support.HZ // LIDAR.rate_hz
 
 
@@ -175,6 +176,27 @@ def test_beside_an_obstacle_only_what_leads_nearer_is_taken_away() -> None:
             assert 0 <= rig.command[0] < 0.05
             assert int(rig.cerebellum.take_flags()[0][0]) & Limit.CLEARANCE
             assert rig.plant.position.mean() * 0.033 < 0.06 - MARGIN + 0.001
+
+
+@pytest.mark.parametrize("wall_speed", [0.0, 0.02, 0.05, 0.1])
+def test_a_base_stands_when_a_slow_wall_comes_that_it_is_commanded_to_drive_into(wall_speed: float) -> None:
+    """Between two scans a wall of 0.1 m/s comes as near as the margin is wide: faster ones are met on the way."""
+    rig = watched()
+    angle = 2 * np.pi * np.arange(BEAMS) / BEAMS
+    front = max(front for _, front, _ in support.BODY.outline)
+    for tick in range(12 * support.HZ):
+        x = float(rig.plant.position.mean()) * WHEEL_RADIUS
+        ahead = 1.0 - wall_speed * tick / support.HZ - x
+        if ahead <= front:
+            break
+        if tick % SCAN_TICKS == 0:
+            ranges = np.where(np.cos(angle) > 1e-3, (ahead - LIDAR.ahead) / np.maximum(np.cos(angle), 1e-3), np.inf)
+            scan(rig, np.clip(ranges, LIDAR.range_min, LIDAR.range_max))
+        if tick % 20 == 0:
+            rig.send(0.22)
+        rig.tick()
+    assert (ahead <= front) == (wall_speed > 0.0)
+    assert np.abs(rig.plant.velocity).max() * WHEEL_RADIUS < 0.01
 
 
 def test_what_is_near_stays_near_when_odometry_begins_anew() -> None:

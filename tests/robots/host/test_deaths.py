@@ -3,6 +3,7 @@
 import ctypes
 import itertools
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -64,6 +65,25 @@ def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
     drive(robot)
     robot.disconnect()
     assert is_gone(name)
+
+
+def test_a_brain_that_is_stopped_at_any_moment_leaves_nothing_half_sent(tmp_path):
+    """It sends all the time: some of these moments are within a command that it writes."""
+    name = unique("stopped")
+    rng = random.Random(0)
+    with driving_child(name, tmp_path / "log", brain_timeout_s=0.1) as (brain, _):
+        states = States(name)
+        for _ in range(12):
+            until(lambda: states.read().all and states.all[-1]["mode"][0] == Mode.TRACKING, "the base drives")
+            time.sleep(rng.uniform(0.0, 0.06))
+            brain.send_signal(signal.SIGSTOP)
+            until(lambda: states.read().all[-1]["mode"][0] == Mode.HOLD, "the base holds")
+            brain.send_signal(signal.SIGCONT)
+        last = states.read().all[-1]
+        assert not any(watchdog_count(last, one) for one in (Watchdog.GUARD, Watchdog.PLANT, Watchdog.BLOCKED))
+        assert not any(state["mode"][0] in (Mode.FAULT, Mode.ESTOP) for state in states.all)
+        assert all(abs(state["command"][0, 0]) <= 0.2 + 1e-9 for state in states.all)
+        states.block.close()
 
 
 def complaint(call: Callable[[], object]) -> str:
