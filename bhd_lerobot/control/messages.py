@@ -123,8 +123,8 @@ class Watchdog(IntFlag):
     """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
     PLANT = 16
     """The plant showed no sign of life for its time-out, reported a stop of its own, or its readings were no
-    measurements of the present (not finite, too old, from the future, faster than a joint can turn) or contradicted each
-    other: mode FAULT."""
+    measurements of the present (not finite, too old, from the future, faster than a joint can turn) or contradicted
+    each other: mode FAULT."""
     MISSES = 32
     """So many ticks in a row came too late that the loop is no control loop any more: mode FAULT."""
     GUARD = 64
