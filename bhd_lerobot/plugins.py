@@ -92,6 +92,13 @@ def load_named(arguments: Sequence[str]) -> list[str]:
     return left
 
 
+def module_to_name(kind: type) -> str | None:
+    """Return the module that a command line has to name for a class to be known; None if it finds it by itself."""
+    own = kind.__module__.partition(".")[0]
+    installed = {name.partition(":")[0].partition(".")[0] for name, _ in _installed()}
+    return None if own in {__name__.partition(".")[0], "lerobot", *installed} else kind.__module__
+
+
 def body_of(robot_type: str | None) -> MobileBase | Arm | None:
     """Return the body of a robot, for whoever reads its data and makes no robot; None if there is no such robot.
 

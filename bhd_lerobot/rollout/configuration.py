@@ -227,7 +227,10 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
             given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
             raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(sorted(choices))}.")
         if chosen not in choices:
-            raise ConfigError(unknown_name(f"{key}.type", chosen, choices))
+            raise ConfigError(
+                f"{unknown_name(f'{key}.type', chosen, choices)} One that a module of yours registers: "
+                f"--{key}.discover_packages_path=MODULE."
+            )
         fields = {k: v for k, v in value.items() if k != "type"}
         _check_keys(choices[chosen], fields, f"{key}.")
         return {"type": chosen, **fields}

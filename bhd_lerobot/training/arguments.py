@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import lerobot.policies  # noqa: F401  registers LeRobot's own
+import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot.utils.device_utils import auto_select_torch_device
 
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
@@ -162,9 +162,9 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
     path = policy.pop("path", None)
     fine_tune = values.get("fine_tune")
     source = fine_tune or path
-    # Only where nothing else was asked for: LeRobot's choice comes with a warning where there is no GPU.
     if ("type" in policy or source is not None) and "device" not in policy:
-        policy["device"] = auto_select_torch_device().type
+        accelerator = torch.accelerator.current_accelerator(check_available=True)
+        policy["device"] = "cpu" if accelerator is None else accelerator.type
     if resume or source is None:
         if policy:
             policy.setdefault("push_to_hub", bool(policy.get("repo_id")))

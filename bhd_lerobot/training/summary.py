@@ -12,9 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.errors import counted, quoted
+from bhd_lerobot.plugins import module_to_name
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.registry import robot_configs, tasks_for
-from bhd_lerobot.robots.host.host import describe
+from bhd_lerobot.robots.host.host import LEFT_OUT_IF_OFF
 from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
@@ -38,7 +39,8 @@ def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: Tra
     table.add_row("data", f"{counted(data.episodes, 'episode')}{held_out}, {data.frames:,} samples in an epoch")
     table.add_row("loader", escape(data.how))
     epochs = config.steps * config.batch_size / data.frames
-    table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {epochs:.3g} epochs")
+    passes = f"{epochs:,.1f}" if epochs < 100 else f"{epochs:,.0f}"
+    table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {passes} epochs")
     if step:
         table.add_row("resumed", f"after step {step}")
     table.add_row("run folder", escape(str(config.output_dir)))
@@ -89,6 +91,8 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = robot_configs()
     task, found, module = (contract.task or {}).get("type"), contract.task or {}, ""
+    if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
+        found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
         rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
         return ["Let it drive the robot for a minute with:", f"  {rollout}"]
@@ -97,13 +101,22 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
         task, found = tasks_for(contract.robot_type)[0], {}
         text = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
     elif task in TaskConfig.get_known_choices():
-        usual = asdict(TaskConfig.get_choice_class(task)())
+        chosen = TaskConfig.get_choice_class(task)
+        usual = asdict(chosen())
+        if (name := module_to_name(chosen)) == "__main__":
+            text = f"Its task {task!r} is defined in this script. Evaluate it, with the task in a module of its own, with:"
+            module = " --task.discover_packages_path=MODULE"
+        elif name is not None:
+            text = f"Evaluate it, where Python finds the module {name!r} (in this folder with PYTHONPATH=.), with:"
+            module = f" --task.discover_packages_path={name}"
     else:
         text = f"Its task {task!r} is of a plug-in that is not installed. Evaluate it, with the plug-in's module, with:"
         usual = dict.fromkeys(key for key in found if key != "type")
         module = " --task.discover_packages_path=MODULE"
     brain = "type=language --brain.perception.path" if kind == "bhd_perception" else "path"
-    options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
+    robot, default = contract.robot or {}, vars(kinds[contract.robot_type]())
+    off = {name: False for name in LEFT_OUT_IF_OFF if robot and name not in robot and default.get(name) is True}
+    options = _options("robot", robot | off, default)
     command = (
         f"bhd-eval{module} --robot.type={contract.robot_type}{options} --task.type={task}"
         f"{_options('task', found, usual)} --brain.{brain}={quoted(path)}"

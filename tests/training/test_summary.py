@@ -1,12 +1,15 @@
 """What `bhd-train` says at its end."""
 
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import pytest
 
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import is_for, robot_of_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -30,6 +33,7 @@ from bhd_lerobot.training.summary import how_to_evaluate
         ),
         (TurtleBot3Config(odometry=True, beams=36), AvoidConfig(trail=True, arena="empty")),
         (TurtleBot3Config(), AvoidConfig()),
+        (TurtleBot3Config(jerk_limits=False, collision_monitor=True), AvoidConfig()),
     ],
 )
 def test_the_command_evaluates_with_the_robot_and_the_task_of_the_recordings(robot, task) -> None:
@@ -67,6 +71,38 @@ def test_a_task_of_a_plug_in_that_is_not_installed_is_named_with_its_options() -
         "  bhd-eval --task.discover_packages_path=MODULE --robot.type=ur5 --task.type=hover --task.hold_s=0.4 "
         "--brain.path=c/pretrained_model"
     )
+
+
+@dataclass
+class WayConfig(AvoidConfig):
+    """A task of this module, which no command finds by itself."""
+
+
+def test_a_task_of_a_script_or_of_a_module_of_ones_own_is_found_by_the_module_that_is_named(monkeypatch) -> None:
+    monkeypatch.setitem(TaskConfig._choice_registry, "way", WayConfig)
+    contract = PolicyContract(robot_type="turtlebot3", task={"type": "way"})
+    said, command = how_to_evaluate(contract, "c")
+    assert f"where Python finds the module '{__name__}'" in said
+    assert f" --task.discover_packages_path={__name__} " in command
+    monkeypatch.setattr(WayConfig, "__module__", "__main__")
+    said, command = how_to_evaluate(contract, "c")
+    assert "'way' is defined in this script" in said
+    assert " --task.discover_packages_path=MODULE " in command
+    with pytest.raises(ConfigError, match=r"Unknown task.type 'where'.*--task.discover_packages_path=MODULE"):
+        parse(EvalConfig, ["--robot.type=turtlebot3", "--task.type=where", "--brain.type=noop"])
+
+
+@pytest.mark.parametrize("recipe", sorted(Path("configs/record").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_command_after_every_recipe_evaluates_whole_episodes_of_its_task(recipe: Path) -> None:
+    config = parse(RecordConfig, [f"--config_path={recipe}"])
+    task = {"type": TaskConfig.get_choice_name(type(config.task)), **asdict(config.task)}
+    contract = PolicyContract(robot_type=config.robot.type, task=task, robot=describe(config.robot))
+    kind = "bhd_perception" if config.brain.get_choice_name(type(config.brain)) == "noop" else "bhd_mlp"
+    _, command = how_to_evaluate(contract, "c", kind)
+    brain = ["--brain.type=learned"] if kind == "bhd_mlp" else []
+    evaluation = parse(EvalConfig, [*shlex.split(command)[1:], *brain])
+    assert describe(evaluation.robot) == describe(config.robot)
+    assert evaluation.task.duration_s >= 1.0
 
 
 @pytest.mark.parametrize("robot", [TurtleBot3Config(), UR5Config()])

@@ -413,14 +413,16 @@ class Host(ABC):
         return
 
 
+LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor")
+"""Options that `describe` does not mention where they are off, as in the data of versions that did not have them."""
+
+
 def describe(config: Any) -> dict[str, Any]:
     """Return everything about a robot that shapes its data, as plain values."""
     left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", *config.not_recorded]
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
-    # What is off is not mentioned, as in the data of versions that did not have it.
-    newer = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor")
-    left_out += [name for name in newer if not getattr(config, name, None)]
+    left_out += [name for name in LEFT_OUT_IF_OFF if not getattr(config, name, None)]
     values = {key: value for key, value in vars(config).items() if key not in left_out}
     return {
         "type": config.type,
