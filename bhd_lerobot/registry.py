@@ -238,9 +238,11 @@ def check_brain(key: str, brain: BrainConfig, robot_type: str) -> None:
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from error
     if not is_for(driven, robot_type):
+        path = getattr(brain, "path", None)
+        name = f"{key}.path is {str(path)!r}" if path else f"{key}.type is {brain.get_choice_name(type(brain))!r}"
         raise ConfigError(
-            f"{key}.type is {brain.get_choice_name(type(brain))!r}, which drives {_with_article(driven)}; robot.type "
-            f"is {robot_type!r}. Brains for it: {', '.join(brains_for(robot_type))}."
+            f"{name}, which drives {_with_article(driven)}; robot.type is {robot_type!r}. Brains for it: "
+            f"{', '.join(brains_for(robot_type))}."
         )
 
 

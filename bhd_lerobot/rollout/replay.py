@@ -37,12 +37,12 @@ class ReplayDatasetConfig:
     """Which episode is replayed. The names are those of `lerobot-replay`.
 
     Attributes:
-        repo_id: name of the dataset.
-        root: folder of the dataset; LeRobot's default place if nothing.
+        repo_id: name of the dataset; not needed with `root`.
+        root: folder of the dataset; LeRobot's default place of `repo_id` if nothing.
         episode: its number in the dataset.
     """
 
-    repo_id: str = "bhd/replay"
+    repo_id: str | None = None
     root: str | None = None
     episode: int = 0
 
@@ -228,10 +228,16 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
     """Replay an episode, print how far it diverges, and draw it.
 
     Raises:
+        ConfigError: no dataset is given.
         DatasetError: the dataset cannot be replayed.
     """
     console = console or Console(stderr=True)
-    root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
+    if config.dataset.root:
+        root = Path(config.dataset.root).expanduser()
+    elif config.dataset.repo_id:
+        root = default_root(config.dataset.repo_id)
+    else:
+        raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
     episode = Replay(root, config.dataset.episode)
     folder = Path(config.output_dir or "outputs/replay").expanduser()
     try:

@@ -100,6 +100,11 @@ def test_bad_options(options, message):
         parse(ReplayConfig, options)
 
 
+def test_a_dataset_is_to_be_named(capsys):
+    assert module.main([]) == 2
+    assert "No dataset is given; set --dataset.root=FOLDER" in capsys.readouterr().err
+
+
 def test_an_episode_that_does_not_exist(recorded, capsys):
     assert module.main([f"--dataset.root={recorded}", "--dataset.episode=9"]) == 2
     assert "from 0 to 3" in capsys.readouterr().err

@@ -110,9 +110,11 @@ def _run_folder(config: RlConfig) -> Path:
     folder = Path(config.output_dir).expanduser()
     try:
         if folder.exists() and not config.resume:
+            resume = f", or continue its run with --resume=true --config_path={quoted(folder)}"
+            is_run = (folder / "checkpoints").is_dir()
             raise ConfigError(
-                f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
-                f"--resume=true --config_path={quoted(folder)}."
+                f"The output folder {folder} exists{'' if is_run else ' and holds no run to continue'}. Set another "
+                f"--output_dir{resume if is_run else ''}."
             )
         if config.resume and not folder.is_dir():
             raise ConfigError(f"There is no run to resume in {folder}.")
