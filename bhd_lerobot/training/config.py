@@ -134,9 +134,9 @@ class BhdTrainConfig(TrainPipelineConfig):
         if self.output_dir is not None and not self.resume and _is_there(Path(self.output_dir)):
             last = Path(self.output_dir) / "checkpoints/last/pretrained_model"
             resume = f", or continue its run with --resume=true --config_path={quoted(last)}"
+            what = "exists" if last.is_dir() else "exists and holds no run to continue"
             raise ConfigError(
-                f"The output folder {self.output_dir} exists{'' if last.is_dir() else ' and holds no run to continue'}. "
-                f"Set another --output_dir{resume if last.is_dir() else ''}."
+                f"The output folder {self.output_dir} {what}. Set another --output_dir{resume if last.is_dir() else ''}."
             )
         if self.policy.push_to_hub and not self.policy.repo_id:
             raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")

@@ -104,7 +104,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
         chosen = TaskConfig.get_choice_class(task)
         usual = asdict(chosen())
         if (name := module_to_name(chosen)) == "__main__":
-            text = f"Its task {task!r} is defined in this script. Evaluate it, with the task in a module of its own, with:"
+            text = f"Its task {task!r} is defined in this script. Move it to a module, and evaluate it with:"
             module = " --task.discover_packages_path=MODULE"
         elif name is not None:
             text = f"Evaluate it, where Python finds the module {name!r} (in this folder with PYTHONPATH=.), with:"
@@ -116,7 +116,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     brain = "type=language --brain.perception.path" if kind == "bhd_perception" else "path"
     robot, default = contract.robot or {}, vars(kinds[contract.robot_type]())
     off = {name: False for name in LEFT_OUT_IF_OFF if robot and name not in robot and default.get(name) is True}
-    options = _options("robot", robot | off, default)
+    options = _options("robot", {**robot, **off}, default)
     command = (
         f"bhd-eval{module} --robot.type={contract.robot_type}{options} --task.type={task}"
         f"{_options('task', found, usual)} --brain.{brain}={quoted(path)}"

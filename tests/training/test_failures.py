@@ -345,13 +345,13 @@ def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
 
 
 def test_a_dataset_is_to_be_named() -> None:
-    refused(["--policy.type=bhd_mlp"], ConfigError, r"No dataset is given; set --dataset.root=FOLDER, or --dataset.repo")
+    refused(["--policy.type=bhd_mlp"], ConfigError, r"No dataset is given; set --dataset.root=FOLDER, or ")
 
 
 def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").touch()
-    refused(options(data, tmp_path / "run"), ConfigError, r"run exists and holds no run to continue. Set another --output_dir\.")
+    refused(options(data, tmp_path / "run"), ConfigError, r"run exists and holds no run to continue.*--output_dir\.")
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["precious"]
     with pytest.raises(ConfigError, match=r"File name too long.*--output_dir"):
         run_train(options(data, tmp_path / ("x" * 300)))
