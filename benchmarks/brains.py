@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks._episodes import add_options, run, seeds_of
 from benchmarks._turns import seconds, verdict
+from bhd_lerobot.evaluation.results import SCORE_RANGE
 from bhd_lerobot.evaluation.statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
@@ -62,7 +63,7 @@ def main() -> int:
     print(f"{'':14}{'failures':>9}{'by cause':>24}{'share, 95 %':>22}{'score, 95 %':>28}{'act, n=1':>11}{'n=64':>10}")
     for brain, result in zip(brains, results, strict=True):
         print(row(brain.name, result))
-    ratio = ratio_of_means(new.scores, old.scores)
+    ratio = ratio_of_means(new.scores, old.scores, within=SCORE_RANGE)
     interval = f"95 % {ratio.low:.3f} to {ratio.high:.3f} (Fieller, paired)"
     print(f"\nscore ratio {ratio.value:.3f}, {interval}; goal: {GOAL_RATIO}")
     allowed = old.failures // 3 if old.failures > 0.05 * args.episodes else old.failures

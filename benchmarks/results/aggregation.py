@@ -20,6 +20,7 @@ from benchmarks.results.learning import (
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean
 from benchmarks.results.trainings import SEEDS, each
+from bhd_lerobot.evaluation.results import SCORE_RANGE
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 EPISODES, ROUNDS = 1000, 3
@@ -48,7 +49,7 @@ def aggregate(run: Runner, section: Section) -> None:
         row, success = success_row(results, name, privileged=True), results["brains"][name]["success"]
         is_met = success["low"] >= _SUCCESS_GOAL
         section.rows.append(Row(row.what, row.value, f"lower end at least {_SUCCESS_GOAL:.1%}", is_met))
-        ratio = ratio_of_means(scores(results, name), scores(results, _RULE))
+        ratio = ratio_of_means(scores(results, name), scores(results, _RULE), within=SCORE_RANGE)
         what = f"{name} / {_RULE}: mean score, paired"
         section.rows.append(Row(what, mean(asdict(ratio)), f"at least {_SCORE_GOAL}", ratio.value >= _SCORE_GOAL))
     section.rows += seeds_rows(made)

@@ -11,6 +11,7 @@ import yaml
 from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean, over_seeds, rate
 from benchmarks.results.trainings import SEEDS, each
+from bhd_lerobot.evaluation.results import SCORE_RANGE
 from bhd_lerobot.evaluation.statistics import mean_difference
 
 EPISODES = 500
@@ -69,7 +70,10 @@ def avoid(run: Runner, section: Section) -> None:
 def _driving_rows(results: Any, name: str) -> list[Row]:
     """Return the rows of a training seed of the section `avoid`."""
     lost = {one: int(brain["episodes"] - brain["successes"]) for one, brain in results["brains"].items()}
-    difference, more = mean_difference(scores(results, name), scores(results, _RULE)), lost[name] - lost[_RULE]
+    difference, more = (
+        mean_difference(scores(results, name), scores(results, _RULE), within=SCORE_RANGE),
+        lost[name] - lost[_RULE],
+    )
     seconds = results["seconds"]
     return [
         success_row(results, name),

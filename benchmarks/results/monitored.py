@@ -9,6 +9,7 @@ from benchmarks.results.learning import evaluate, roaming, scores, seeds_rows, s
 from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean
 from benchmarks.results.trainings import SEEDS, each
+from bhd_lerobot.evaluation.results import SCORE_RANGE
 from bhd_lerobot.evaluation.statistics import ratio_of_means
 
 _FAILURES_GOAL, _RULE_GOAL, _TEACHER_GOAL = 5, 1.5, 1.2
@@ -111,16 +112,16 @@ def rows(alone: Any, behind: Any, teacher: Any, seed: int, *, is_start: bool) ->
     is_met = failures <= _FAILURES_GOAL
     found.append(Row(f"{name}: failures", str(failures), f"at most {_FAILURES_GOAL} of {EPISODES}", is_met))
     score = scores(behind, "ppo")
-    clone = ratio_of_means(score, scores(alone, "clone"))
+    clone = ratio_of_means(score, scores(alone, "clone"), within=SCORE_RANGE)
     what = f"{name} / clone_{seed} without the monitor: mean score, paired"
     found.append(Row(what, mean(asdict(clone)), "at least 1", clone.value >= 1))
-    both = ratio_of_means(score, scores(behind, "clone"))
+    both = ratio_of_means(score, scores(behind, "clone"), within=SCORE_RANGE)
     what = f"{name} / clone_{seed}, both with the monitor: mean score, paired"
     found.append(Row(what, f"{mean(asdict(both))}{_KEPT if is_start else ''}"))
-    over = ratio_of_means(score, scores(alone, _RULE))
+    over = ratio_of_means(score, scores(alone, _RULE), within=SCORE_RANGE)
     what = f"{name} / avoidance, the simple rule: mean score, paired"
     found.append(Row(what, mean(asdict(over)), f"at least {_RULE_GOAL}", over.value >= _RULE_GOAL))
-    ratio = ratio_of_means(score, scores(teacher, _TEACHER))
+    ratio = ratio_of_means(score, scores(teacher, _TEACHER), within=SCORE_RANGE)
     is_met = ratio.value >= _TEACHER_GOAL and ratio.low > 1
     what, goal = f"{name} / {_TEACHER}: mean score, paired", f"at least {_TEACHER_GOAL}, its interval above 1"
     found.append(Row(what, mean(asdict(ratio)), goal, is_met))

@@ -17,6 +17,8 @@ from bhd_lerobot.evaluation.statistics import Discordance, Estimate
 
 MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
 """Numbers of an episode whose mean and interval an evaluation reports."""
+SCORE_RANGE = (0.0, 1.0)
+"""What no episode's score exceeds."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool) -> 
     means = {}
     for name in MEANS:
         values = np.array([getattr(episode, name) for episode in episodes], np.float64)
-        within = (0.0, 1.0) if name == "score" else (-math.inf, math.inf)
+        within = SCORE_RANGE if name == "score" else (-math.inf, math.inf)
         means[name] = statistics.mean(values[np.isfinite(values)], within=within)
     return BrainSummary(
         brain=label,
@@ -191,8 +193,8 @@ def _pair(
         episodes=len(pairs),
         success=statistics.rate_difference(*success, confidence),
         differ=replace(differ, p=min(1.0, compared * differ.p)),
-        score=statistics.mean_difference(*score, confidence),
-        ratio=statistics.ratio_of_means(*score, confidence),
+        score=statistics.mean_difference(*score, confidence, within=SCORE_RANGE),
+        ratio=statistics.ratio_of_means(*score, confidence, within=SCORE_RANGE),
     )
 
 

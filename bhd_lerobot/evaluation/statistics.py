@@ -108,32 +108,63 @@ def _corrected(quantile: float, skewness: float, count: int) -> float:
     return float(np.cbrt(1 + skewness * (quantile / math.sqrt(count) - skewness / (6 * count))) - 1) * 3 / skewness
 
 
-def mean_difference(values: ArrayLike, baseline: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
+def mean_difference(
+    values: ArrayLike,
+    baseline: ArrayLike,
+    confidence: float = CONFIDENCE,
+    *,
+    within: tuple[float, float] = (-math.inf, math.inf),
+) -> Estimate:
     """Return the mean of paired differences, values minus baseline, with the interval of `mean`.
 
     Args:
         values: one for each episode, shape (episodes,).
         baseline: of the same episodes, in the same order.
         confidence: probability that the interval covers the truth.
+        within: what neither can exceed.
     """
     one, two = _paired(np.asarray(values, np.float64), np.asarray(baseline, np.float64))
-    return mean(one - two, confidence)
+    width = within[1] - within[0]
+    return mean(one - two, confidence, within=(-width, width))
 
 
-def ratio_of_means(values: ArrayLike, baseline: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
+def ratio_of_means(
+    values: ArrayLike,
+    baseline: ArrayLike,
+    confidence: float = CONFIDENCE,
+    *,
+    within: tuple[float, float] = (0.0, math.inf),
+) -> Estimate:
     """Return the ratio of two means over the same episodes, neither negative, with Fieller's interval for pairs.
 
-    Where the baseline's mean may be 0 the upper end is infinite; where it is, nothing is defined.
+    Where the baseline's mean may be 0 the upper end is infinite; where it is, nothing is defined. Where the values have
+    an upper bound, the interval also holds the ratio if a share of the episodes that easily stays unseen, as in `mean`,
+    had the value of a bound.
 
     Args:
         values: one for each episode, shape (episodes,).
         baseline: of the same episodes, in the same order.
         confidence: probability that the interval covers the truth.
+        within: what neither can exceed.
     """
     one, two = _paired(np.asarray(values, np.float64), np.asarray(baseline, np.float64))
     count = len(one)
     if count == 0 or two.mean() == 0:
         return Estimate(math.nan, math.nan, math.nan)
+    found = _fieller(one, two, confidence)
+    lower, upper = within
+    if count == 1 or not math.isfinite(upper):
+        return found
+    unseen = 1 - (1 - confidence) ** (1 / count)
+    top, bottom = float(one.mean()), float(two.mean())
+    least, most = top - unseen * (top - lower), top + unseen * (upper - top)
+    low = min(least / bottom, top / (bottom + unseen * (upper - bottom)))
+    high = max(most / bottom, top / (bottom - unseen * (bottom - lower)))
+    return Estimate(found.value, float(np.fmin(found.low, low)), float(np.fmax(found.high, high)))
+
+
+def _fieller(one: NDArray[np.float64], two: NDArray[np.float64], confidence: float) -> Estimate:
+    count = len(one)
     ratio = float(one.mean() / two.mean())
     if count == 1 or np.ptp(one - ratio * two) <= _FLAT * np.abs(one).max():
         return Estimate(ratio, math.nan, math.nan)

@@ -136,7 +136,8 @@ class BhdTrainConfig(TrainPipelineConfig):
             resume = f", or continue its run with --resume=true --config_path={quoted(last)}"
             what = "exists" if last.is_dir() else "exists and holds no run to continue"
             raise ConfigError(
-                f"The output folder {self.output_dir} {what}. Set another --output_dir{resume if last.is_dir() else ''}."
+                f"The output folder {self.output_dir} {what}. Set another --output_dir"
+                f"{resume if last.is_dir() else ''}."
             )
         if self.policy.push_to_hub and not self.policy.repo_id:
             raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")

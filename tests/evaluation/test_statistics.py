@@ -113,6 +113,26 @@ def test_intervals_of_scores_cover_the_truth_as_often_as_they_say_however_few_th
         assert all(0.0 <= one.low < one.high <= 1.0 for one in estimates)  # never without a width
 
 
+@pytest.mark.parametrize("failures", [0.0, 0.02, 0.05])
+def test_intervals_of_differences_and_ratios_cover_a_clone_that_rarely_fails(failures):
+    """It does in all other episodes what its rule does, to the bit: the episodes seen may hold none of its failures."""
+    rng = np.random.default_rng(6)
+    scores = rng.beta(8.0, 4.0, 1_000_000)
+    loss = failures * scores.mean()
+    for count in (5, 20, 50, 100):
+        covered = np.zeros(4, np.int64)
+        for _ in range(400):
+            rule = rng.beta(8.0, 4.0, count)
+            clone = np.where(rng.random(count) < failures, 0.0, rule)
+            for place, (one, two, sign) in enumerate(((clone, rule, -1), (rule, clone, 1))):
+                difference = mean_difference(one, two, within=(0.0, 1.0))
+                ratio = ratio_of_means(one, two, within=(0.0, 1.0))
+                truth = (1 - failures) ** -sign
+                covered[2 * place] += difference.low <= sign * loss <= difference.high
+                covered[2 * place + 1] += ratio.low <= truth <= ratio.high
+        assert (covered >= 365).all(), (count, covered)  # of 400: three standard deviations
+
+
 def test_what_has_no_spread_and_no_bounds_has_no_interval():
     for estimate in (mean([3.0] * 9), mean_difference([0.5] * 9, [0.5] * 9), mean_difference([0.5] * 9, [0.25] * 9)):
         assert math.isnan(estimate.low)
