@@ -62,7 +62,17 @@ def write(path: Path | None, results: Any) -> None:
         path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
+GOAL_MISSED = 3
+"""Exit status of a benchmark that ran and missed a goal. After an exception it is 1; with wrong options, and where
+nothing could be measured, 2."""
+
+
+def status(*, met: bool) -> int:
+    """Return the exit status of a benchmark that ran: 0, or `GOAL_MISSED`."""
+    return 0 if met else GOAL_MISSED
+
+
 def verdict(*, met: bool) -> int:
     """Print whether the goals were met; return the exit status."""
     print("goals met" if met else "GOAL MISSED")
-    return int(not met)
+    return status(met=met)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from benchmarks._turns import in_turns, rates, ratios, shown, spread, write
+from benchmarks._turns import in_turns, rates, ratios, shown, spread, status, write
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
@@ -67,7 +67,7 @@ def check(root: Path) -> None:
 
 
 def main() -> int:
-    """Print what was measured; return 1 if the goal was missed."""
+    """Print what was measured; return 3 if the goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--frames", type=int, default=500, help="of an episode")
@@ -94,7 +94,7 @@ def main() -> int:
         f"{options.episodes} episodes, {total:,} frames: {shown(speed, ',.0f')} frames/s, goal {GOAL:,.0f}; "
         f"{shown(share)} of the speed of reading alone"
     )
-    return int(not results["met"])
+    return status(met=results["met"])
 
 
 if __name__ == "__main__":

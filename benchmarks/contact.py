@@ -6,6 +6,7 @@ done by setpoints with the distance check, without it, and without the limit of 
 """
 
 import argparse
+import sys
 from dataclasses import dataclass
 
 import mujoco
@@ -13,6 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Mode, Watchdog
@@ -45,7 +47,7 @@ class Outcome:
     ended: str
 
 
-def run(into: str, speed: float, way: str, frames: int = 260) -> Outcome:
+def run(into: str, speed: float, way: str, frames: int) -> Outcome:
     """Move an arm into something by setpoints of a steady speed [rad/s], and wait."""
     direction, fixtures = INTO[into]
     force = 150.0 if way != WAYS[2] else float("inf")
@@ -81,9 +83,10 @@ def run(into: str, speed: float, way: str, frames: int = 260) -> Outcome:
 
 
 def main() -> int:
-    """Print the table; return 1 if an arm touches something in spite of the check, or presses for over 0.5 s."""
+    """Print the table; return 3 if an arm touches something in spite of the check, or presses for over 0.5 s."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speeds", type=float, nargs="+", default=list(SPEEDS), help="of the joints [rad/s]")
+    parser.add_argument("--frames", type=int, default=260, help="of each run")
     arguments = parser.parse_args()
     table = Table(title="A UR5 that runs into something: peak force, and time above 20 N")
     for column in ("into", "speed", *WAYS):
@@ -93,15 +96,15 @@ def main() -> int:
         for speed in arguments.speeds:
             row = []
             for way in WAYS:
-                outcome = run(into, speed, way)
+                outcome = run(into, speed, way, arguments.frames)
                 row.append(f"{outcome.peak:.0f} N, {outcome.over_s:.2f} s, {outcome.ended}")
                 # The check knows the table and the arm, not the box.
                 missed |= way == WAYS[0] and into != "box" and outcome.peak > 0.0
                 missed |= way != WAYS[2] and outcome.over_s > WITHIN_S
             table.add_row(into, f"{speed} rad/s", *row)
     Console(width=140).print(table)
-    return int(missed)
+    return status(met=not missed)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main())

@@ -8,7 +8,7 @@ the last checkpoint, and once for the steps alone: the difference between a long
 former.)
 
 Rendering: images of two cameras of 96 x 96 pixels, beside MuJoCo's own renderer in its fastest settings, in turns.
-Exits with 1 if a goal is missed.
+Exits with 3 if a goal is missed.
 """
 
 import argparse
@@ -32,7 +32,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._turns import in_turns, ratios, shown, spread, write
+from benchmarks._turns import in_turns, ratios, shown, spread, status, write
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -155,7 +155,7 @@ def rendering(frames: int, turns: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Print the table; return 1 if a goal was missed."""
+    """Print the table; return 3 if a goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     policies = list(RECORDINGS)
     parser.add_argument("--policies", nargs="+", choices=policies, default=policies, help="which of them learn")
@@ -199,7 +199,7 @@ def main() -> int:
     write(options.json, json.loads(json.dumps(results)))
     if missed:
         print(f"Missed: {', '.join(missed)}")
-    return 1 if missed else 0
+    return status(met=not missed)
 
 
 if __name__ == "__main__":

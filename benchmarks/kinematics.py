@@ -2,7 +2,7 @@
 
 Every pose is the tool frame of a random posture that our checks admit. Iterative peers start near that posture and end
 at 1e-6 m and rad. The goal: ours solves at least 99.9 % of the poses, and is faster than each peer that iterates.
-Exits with 1 if it is missed.
+Exits with 3 if it is missed.
 """
 
 import argparse

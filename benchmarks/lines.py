@@ -1,7 +1,7 @@
 """How long straight lines of the UR5's tool take, beside TOPP-RA: `python -m benchmarks.lines`.
 
 Random lines, one after the other, at two speeds of the tool. The peer's times have the same limits of velocity and
-acceleration, of the joints and of the tool, but none of the jerk: no law with one can be as quick. Exits with 1 if a
+acceleration, of the joints and of the tool, but none of the jerk: no law with one can be as quick. Exits with 3 if a
 goal is missed.
 """
 

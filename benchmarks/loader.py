@@ -27,7 +27,7 @@ os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._turns import spread, write
+from benchmarks._turns import spread, status, write
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.recording.record import main as record_main
 
@@ -141,10 +141,12 @@ def measure(root: Path, seconds: float, repeats: int) -> tuple[list[list[float]]
 
 
 def main() -> int:
-    """Print the table; return 1 if a goal was missed."""
+    """Print the table; return 3 if a goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--episodes", type=int, nargs=2, default=EPISODES, help="of each dataset", metavar=tuple(CASES))
+    parser.add_argument(
+        "--episodes", type=int, nargs=2, default=EPISODES, help="of each dataset; 0 leaves it out", metavar=tuple(CASES)
+    )
     parser.add_argument("--seconds", type=float, default=3.0, help="length of one measurement [s]")
     parser.add_argument("--start", action=argparse.BooleanOptionalAction, default=True, help="time starts, too")
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
@@ -156,11 +158,11 @@ def main() -> int:
     results: dict[str, Any] = {}
     missed = []
     try:
-        counts = zip(CASES, options.episodes, strict=True)
-        problems = {name: record_dataset(folder / name, name, episodes) for name, episodes in counts}
-        for name, (_, _, goal) in CASES.items():
-            root = folder / name
-            if error := problems[name]:
+        counts = {name: episodes for name, episodes in zip(CASES, options.episodes, strict=True) if episodes}
+        problems = {name: record_dataset(folder / name, name, episodes) for name, episodes in counts.items()}
+        for name, error in problems.items():
+            root, goal = folder / name, CASES[name][2]
+            if error:
                 print(f"{name}: nothing was recorded. {error}")
                 missed.append(name)
                 continue
@@ -208,7 +210,7 @@ def main() -> int:
     write(options.json, results)
     if missed:
         print(f"Missed: {', '.join(missed)}")
-    return 1 if missed else 0
+    return status(met=not missed)
 
 
 if __name__ == "__main__":

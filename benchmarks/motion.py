@@ -2,7 +2,7 @@
 
 Straight lines of the tool at 0.25 m/s in random directions: the largest distance of the measured tool from its line,
 with an empty gripper. Joint goals at full speed: the time from the end of the trajectory until every joint stays within
-the goal tolerance, 0.002 rad, and slower than 0.01 rad/s. Exits with 1 if a goal is missed.
+the goal tolerance, 0.002 rad, and slower than 0.01 rad/s. Exits with 3 if a goal is missed.
 """
 
 import argparse

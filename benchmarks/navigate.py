@@ -1,6 +1,6 @@
 """The navigator on held-out scenes: success, collisions, path length, time: `python -m benchmarks.navigate`.
 
-The goal: at least 99 % success, no collision, and a mean SPL (success weighted by path length) above 0.85. Exits with 1
+The goal: at least 99 % success, no collision, and a mean SPL (success weighted by path length) above 0.85. Exits with 3
 if it is missed.
 """
 

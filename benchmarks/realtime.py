@@ -5,7 +5,7 @@ turns in blocks of some seconds, quiet and under CPU load on every core: a C++ l
 process, each on an absolute grid with the same physics and nothing else; the robot as it is, driven by a brain; and the
 UR5 with two cameras, a torch brain that looks at them, and video that is encoded meanwhile. One table shows the
 lateness of the ticks, how long they take, and behind every time its ratio to that of a peer in the neighbouring block.
-Ticks that were missed are counted, and what the system refused is printed. Exits with 1 if a goal is missed, with 2 if
+Ticks that were missed are counted, and what the system refused is printed. Exits with 3 if a goal is missed, with 2 if
 nothing could be measured.
 """
 
@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks._turns import ratios, write
+from benchmarks._turns import ratios, status, write
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -368,7 +368,7 @@ def make_recorder(simulation: Any, task: Any, config: Any, folder: Path) -> Data
     images = dict.fromkeys(simulation.camera_names, (config.camera_height, config.camera_width, 3))
     physics = [f"physics_{index}" for index in range(simulation.physics_state.shape[1])]
     names = simulation.observation_names, simulation.action_names
-    features = dataset_features(*names, images, physics, task.environment_names, simulation.effort_names)
+    features = dataset_features(*names, images, physics, task.environment_names, effort_names=simulation.effort_names)
     root = Path(tempfile.mkdtemp(dir=folder)) / "data"
     return DatasetRecorder.create("bench/realtime", config.fps, features, robot_type=config.type, root=root)
 
@@ -508,7 +508,7 @@ def show(table: Sequence[dict[str, Any]], conditions: Sequence[str]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; return 1 if a goal was missed, 2 if nothing was measured."""
+    """Measure and print; return 3 if a goal was missed, 2 if nothing was measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.realtime", description=__doc__)
     parser.add_argument("--blocks", type=int, help="blocks for each loop and condition (default 6)")
     parser.add_argument("--seconds", type=float, help="length of a block [s] (default 10)")
@@ -547,7 +547,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("A SHORT RUN: these numbers are not to be quoted; that takes 6 blocks of 10 s.")
     print(*(f"GOAL MISSED: {one}" for one in missed), sep="\n" if missed else "", end="\n" if missed else "goals met\n")
     write(options.json, {"seconds": seconds, "busy": busy, "notes": list(notes), "rows": table, "blocks": found})
-    return int(bool(missed))
+    return status(met=not missed)
 
 
 if __name__ == "__main__":

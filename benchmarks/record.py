@@ -4,7 +4,7 @@ Without a camera: simulated seconds in a second with everything on (physics, cer
 brain, task, recorder, finalising), of the TurtleBot3's avoid task and the UR5's pick task, for one and for many
 simulations, beside the bare `Batch.step` with the same number of physics steps and the same scans. With a camera:
 frames a second beside MuJoCo's own renderer, in its fastest settings, feeding the same encoder. The two of a pair run
-in turns in one process, after a short run that is not counted; the table shows medians. Exits with 1 if a goal is
+in turns in one process, after a short run that is not counted; the table shows medians. Exits with 3 if a goal is
 missed.
 """
 
@@ -28,7 +28,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._turns import in_turns, ratios, spread
+from benchmarks._turns import in_turns, ratios, spread, status
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.recording.config import RecordConfig
@@ -154,11 +154,12 @@ def paired(first: Callable[[], float], second: Callable[[], float], turns: int) 
 
 
 def main() -> int:
-    """Print the table; return 1 if a goal was missed."""
+    """Print the table; return 3 if a goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--simulated_s", type=float, default=60.0, help="length of an episode of the TurtleBot3")
     parser.add_argument("--robots", nargs="+", choices=tuple(CONFIGS), default=list(CONFIGS))
+    parser.add_argument("--n_envs", type=int, nargs="+", default=[1, 32, 64], help="only cases of so many simulations")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
     table = Table(title="bhd-record", title_justify="left")
@@ -175,7 +176,7 @@ def main() -> int:
     length = {"turtlebot3": [f"--dataset.episode_time_s={options.simulated_s}"], "ur5": []}
     try:
         for robot, n, episodes, goal in CASES:
-            if robot not in options.robots:
+            if robot not in options.robots or n not in options.n_envs:
                 continue
             real_time(folder, robot, n, n, *length[robot])
             ours = partial(real_time, folder, robot, n, episodes, *length[robot])
@@ -206,7 +207,7 @@ def main() -> int:
     Console(width=140).print(table)
     if missed:
         print(f"Missed: {', '.join(missed)}")
-    return 1 if missed else 0
+    return status(met=not missed)
 
 
 if __name__ == "__main__":

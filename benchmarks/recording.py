@@ -12,6 +12,7 @@ import io
 import logging
 import shutil
 import statistics
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -154,7 +155,7 @@ def check(root: Path, data: list, camera_frames: np.ndarray | None) -> None:
             assert difference < 12, f"frame {i} differs by {difference:.1f} grey levels"
 
 
-def main() -> None:
+def main() -> int:
     """Run all of them in turns and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=20)
@@ -204,7 +205,8 @@ def main() -> None:
     for name, rate in rates.items():
         shares = [f"{rate / rates[other]:17.2f}" if other in rates else f"{'-':>17}" for other in references.values()]
         print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f}" + "".join(shares))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,7 +12,7 @@ becomes of its answers does: the threshold of the untrained perception is set so
 there can be. Lateness of ticks, ticks later than 0.1 ms, missed ticks, frames a second and the brain's processor time
 per frame are printed, lateness with its ratio to that of `noop` in the same round. A block in which the robot was
 stopped, because other programs or the host of a virtual machine held up its loop, is run again and counted; beside a
-brain that may not happen more often than beside `noop`. Exits with 1 if a goal is missed, with 2 if nothing could be
+brain that may not happen more often than beside `noop`. Exits with 3 if a goal is missed, with 2 if nothing could be
 measured.
 """
 
@@ -40,7 +40,7 @@ from rich.console import Console
 from rich.table import Table
 from torch.nn import functional
 
-from benchmarks._turns import ratios, write
+from benchmarks._turns import ratios, status, write
 from benchmarks.realtime import BUSY, SEED, WARM_UP_S, NotMeasuredError, busy_share, drive, make_task, summarise
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.errors import BhdError
@@ -317,7 +317,7 @@ def show(table: Sequence[dict[str, Any]]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; return 1 if a goal was missed, 2 if nothing was measured."""
+    """Measure and print; return 3 if a goal was missed, 2 if nothing was measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sight", description=__doc__)
     parser.add_argument("--rounds", type=int, default=6, help="blocks for each brain and core")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block [s]")
@@ -356,7 +356,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     missed = [f"{row['brain']}, cerebellum on {row['core']}" for row in table if row.get("met") is False]
     print(*(f"GOAL MISSED: {one}" for one in missed), sep="\n" if missed else "", end="\n" if missed else "goals met\n")
     write(options.json, {"seconds": options.seconds, "busy": busy, "goals": GOALS, "rows": table, "blocks": blocks})
-    return int(bool(missed))
+    return status(met=not missed)
 
 
 if __name__ == "__main__":

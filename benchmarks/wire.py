@@ -8,7 +8,7 @@ finite, in the actuator's range, and changes from tick to tick that the body per
 that are no measurements: false, drifting, wrapped, frozen, from the future, of robots that move; with the largest
 distance of a joint or a wheel from where the stop found it, by physics. The third is the share of the guard, the last
 check before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits
-with 1 if anything unsafe was written, or a stop was followed by more motion than it needs.
+with 3 if anything unsafe was written, or a stop was followed by more motion than it needs.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -402,6 +403,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--streams", type=int, default=1000, help="of each action space, and again with vandals")
     parser.add_argument("--frames", type=int, default=60, help="of each stream")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--n", type=int, nargs="+", default=[1, 64], help="simulations, in the second table")
     options = parser.parse_args(arguments)
     console = Console()
     table = Table(title="What was written to the plants")
@@ -438,16 +440,16 @@ def main(arguments: list[str] | None = None) -> int:
     for column in ("robot", "n", "check", "tick", "share"):
         shares.add_column(column, justify="left" if column == "robot" else "right")
     for space in ("wheels", MONITORED, "joints", "impedance"):
-        for n in (1, 64):
+        for n in options.n:
             check, whole = share(space, n)
             shares.add_row(space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}")
-    for n in (1, 64):
+    for n in options.n:
         check, whole = distance_share(n)
         shares.add_row(
             "joints, distances", str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}"
         )
     console.print(shares)
-    return int(unsafe > 0)
+    return status(met=not unsafe)
 
 
 if __name__ == "__main__":

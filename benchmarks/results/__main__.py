@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event, Lock
 
+from benchmarks._turns import status
 from benchmarks.results.adaptation import fine_tune, move_camera
 from benchmarks.results.aggregation import aggregate
 from benchmarks.results.camera_drive import camera_drive
@@ -147,7 +148,7 @@ def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, desc
         print(f"Written: {where}. Its goals are those of a full run: {len(missed)} are missed.")
         return 0
     print(f"Written: {where}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
-    return 1 if missed else 0
+    return status(met=not missed)
 
 
 def _failure(running: Future[None]) -> FailedError | None:

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from benchmarks._turns import GOAL_MISSED
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section, mean, rate
 
-_MISSED = 1  # the exit status of a benchmark that found a goal missed
 _BARE = "Batch.step and lidar alone"
 _PEERS = ("SyncVectorEnv", "AsyncVectorEnv")
 
@@ -26,7 +26,7 @@ def benchmark(
     def measure(run: Runner, section: Section) -> None:
         output = run.path("speed", f"{module}.json")
         command = ["python", "-m", f"benchmarks.{module}", *options, *(short if run.is_short else ())]
-        run.run(f"speed_{module}", [*command, f"--json={output}"], allowed=(0, _MISSED))
+        run.run(f"speed_{module}", [*command, f"--json={output}"], allowed=(0, GOAL_MISSED))
         section.rows += rows(run.read("speed", f"{module}.json"))
 
     return measure

@@ -93,8 +93,8 @@ class LockstepBridge(ModeRequests):
             replaces: whether it takes the place of what was sent before and is not due yet.
         """
         due = self.now_ns if due_ns is None else due_ns
-        if due - self.now_ns > HORIZON_NS:
-            return self.cerebellum.refuse(Reason.BEYOND_HORIZON, mask)
+        if abs(due - self.now_ns) > HORIZON_NS:
+            return self.cerebellum.refuse(Reason.BEYOND_HORIZON if due > self.now_ns else Reason.STALE, mask)
         self._sequence += 1
         return self.cerebellum.offer(Setpoint(self._sequence, due, values, replaces), mask)
 

@@ -12,6 +12,7 @@ from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import (
     HORIZON_NS,
     NANOSECONDS,
+    SEQUENCE_STEP,
     CerebellumState,
     Mode,
     Reason,
@@ -206,19 +207,21 @@ class Cerebellum:
         """Take what is due from the queue; the newest that is due wins, and at most one for each robot counts."""
         due = self.fifo.next_due()
         if due is not None and due - now_ns > HORIZON_NS:
-            self.fifo.drop(np.arange(self.n))  # by a sender whose clock is another one
+            # By a sender whose clock is another one.
+            self.refusals[Reason.BEYOND_HORIZON] += self.fifo.drop(np.arange(self.n))
             return
         popped = None
         while due is not None and due <= now_ns:
             if popped is not None:
+                last = self._taken_sequence
+                self.refusals[Reason.OUT_OF_ORDER] += self.fifo.drop_outside(last + 1, last + SEQUENCE_STEP)
                 self.fifo.keep_newest(now_ns)  # however many are due, a tick takes its time for one
             popped = self.fifo.pop(self._popped, self._popped_mask)
             if popped is None:
                 return
+            take = self._in_order(popped[0], self._popped_mask)
             # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
-            self.fifo.drop_older(popped[0], self._popped_mask)
-            take: NDArray[np.bool_] = self._popped_mask
-            take &= self._taken_sequence < popped[0]  # none is taken twice, whatever became of the queue
+            self.fifo.drop_older(popped[0], take)
             self._taken_sequence[take] = popped[0]
             # Modes may have changed since the command was sent.
             if now_ns - due > self._timeout_ns or not self._all_track:
@@ -232,6 +235,17 @@ class Cerebellum:
             self.controller.set_setpoint(self._popped, take)
             self._update_deadline()
             due = self.fifo.next_due()
+
+    def _in_order(self, sequence: int, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Count the robots that refuse a sequence number; return those that take it.
+
+        None is taken twice, and none is so far ahead that all that follow would be refused.
+        """
+        ahead = sequence - self._taken_sequence  # where that overflows it is out of the range, too
+        right = (ahead > 0) & (ahead <= SEQUENCE_STEP)
+        if np.count_nonzero(mask > right):
+            self.refusals[Reason.OUT_OF_ORDER] += mask > right
+        return mask & right
 
     @property
     def _all_track(self) -> bool:
@@ -327,7 +341,8 @@ class Cerebellum:
             self._count_refusals(reasons)
             return SendResult(reasons)
         reasons = self._mode_reasons()
-        late = setpoint.sequence <= self._sent_sequence
+        last = self._sent_sequence
+        late = (setpoint.sequence <= last) | (setpoint.sequence > last + SEQUENCE_STEP)
         if not setpoint.replaces:
             late |= setpoint.due_ns < self._sent_due
         reasons[(reasons == Reason.ACCEPTED) & late] = Reason.OUT_OF_ORDER

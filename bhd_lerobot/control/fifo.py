@@ -65,8 +65,13 @@ class CommandFifo:
         return 16 + capacity * cls._dtype(n, width).itemsize
 
     def __len__(self) -> int:
-        """Return the number of entries in use: those that wait, and those between them."""
-        return int(self._head[0]) - int(self._tail[0])
+        """Return the number of entries in use: those that wait, and those between them; at most the capacity."""
+        return min(max(0, int(self._head[0]) - int(self._tail[0])), self.capacity)
+
+    @property
+    def pushed(self) -> int:
+        """Number of entries that were ever appended."""
+        return int(self._head[0])
 
     def push(self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> bool:
         """Append an entry.
@@ -126,6 +131,20 @@ class CommandFifo:
             self._mask[slot, ids] = False
         self._update()
         return dropped
+
+    def drop_outside(self, lowest: NDArray[np.int64], highest: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Drop commands whose sequence numbers are out of range; return how many of each simulation. For the reader.
+
+        Args:
+            lowest: the smallest that stay, shape (n,).
+            highest: the largest that stay, shape (n,).
+        """
+        slots = self._slots()
+        sequence = self._sequence[slots][:, None]
+        outside = self._mask[slots] & ((sequence < lowest) | (sequence > highest))
+        self._mask[slots] &= ~outside
+        self._update()
+        return np.asarray(outside.sum(axis=0))
 
     def drop_older(self, sequence: int, mask: NDArray[np.bool_]) -> None:
         """Drop what was sent to some simulations before a sequence number and still waits. For the reader.

@@ -14,6 +14,9 @@ NANOSECONDS = 1_000_000_000
 HORIZON_NS = 10 * NANOSECONDS
 """A command that is due later than this is refused [ns]: 100 frames at 10 fps, the action chunks of most policies."""
 
+SEQUENCE_STEP = 1 << 31
+"""A command whose sequence number is further than this after that of the command before it is refused."""
+
 
 class Mode(IntEnum):
     """What the cerebellum is doing.
@@ -66,7 +69,8 @@ _EXPLANATIONS = {
     Reason.ACCEPTED: "accepted",
     Reason.NON_FINITE: "the command holds NaN or an infinity",
     Reason.WRONG_WIDTH: "the command has another number of values than the robot has command dimensions",
-    Reason.OUT_OF_ORDER: "the command's sequence number or due time is not after that of the command before it",
+    Reason.OUT_OF_ORDER: "the command's sequence number or due time is not after that of the command before it, or its "
+    f"sequence number is more than {SEQUENCE_STEP:,} after it; a queue takes the commands of one sender",
     Reason.STALE: "the command was due longer ago than the command time-out",
     Reason.FIFO_FULL: "the command queue is full; send later or make it longer",
     Reason.NOT_ACTIVE: "the robot is not active; call activate() first, after a deactivation reset() and activate()",
@@ -148,7 +152,7 @@ class Setpoint:
     """An action with a due time.
 
     Attributes:
-        sequence: counts up with every setpoint of one sender.
+        sequence: counts up with every setpoint of one sender, by `SEQUENCE_STEP` at the most.
         due_ns: when it is to take effect, on the cerebellum's clock [ns].
         values: the command, shape (n, width), in the units of the action features.
         replaces: whether it takes the place of what was sent before and is not due yet: the first of a new action

@@ -25,6 +25,8 @@ from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.realtime.requests import RequestClient
 
+_NEVER_NS = -(1 << 62)  # before every due time
+
 
 class LiveBridge(ModeRequests):
     """Sends commands to a cerebellum that ticks in another process, and reads what it publishes.
@@ -50,7 +52,8 @@ class LiveBridge(ModeRequests):
     ) -> None:
         self.rates, self._wait, self._clock = rates, wait, clock
         self._block, self._client = block, client
-        self._sequence, self._last_due = 0, -(1 << 62)
+        # After whatever was sent by another bridge: the cerebellum takes no sequence number twice.
+        self._sequence, self._last_due = block.fifo.pushed, _NEVER_NS
         self._all = np.ones(1, np.bool_)
 
     @property
@@ -72,7 +75,7 @@ class LiveBridge(ModeRequests):
 
     def begin(self) -> None:
         """Forget what was sent in another segment."""
-        self._last_due = -(1 << 62)
+        self._last_due = _NEVER_NS
         self._client.take_results()
 
     # --- setpoints ---------------------------------------------------------------------------------------------------
@@ -96,18 +99,15 @@ class LiveBridge(ModeRequests):
         if mask is not None and not mask[0]:
             return SendResult(np.zeros(1, np.int8))
         due = self.now_ns if due_ns is None else due_ns
-        if replaces:
-            self._last_due = due
-        reason = self._refusal(values, due)
+        reason = self._refusal(values, due, replaces)
         if reason == Reason.ACCEPTED:
-            self._sequence += 1
-            if self._block.fifo.push(self._sequence, due, values, self._all):
-                self._last_due = due
+            if self._block.fifo.push(self._sequence + 1, due, values, self._all):
+                self._sequence, self._last_due = self._sequence + 1, due
             else:
                 reason = Reason.FIFO_FULL
         return SendResult(np.array([reason], np.int8))
 
-    def _refusal(self, values: NDArray[np.float64], due_ns: int) -> Reason:
+    def _refusal(self, values: NDArray[np.float64], due_ns: int, replaces: bool) -> Reason:
         if np.shape(values) != (1, self._block.fifo.width) or np.asarray(values).dtype.kind not in "fiu":
             return Reason.WRONG_WIDTH
         if self.estop_pressed:
@@ -115,10 +115,11 @@ class LiveBridge(ModeRequests):
         reason = mode_reason(Mode(int(self.latest["mode"][0])))
         if reason != Reason.ACCEPTED:
             return reason
-        if due_ns < self._last_due:
+        now = self.now_ns
+        if abs(due_ns - now) > HORIZON_NS:
+            return Reason.BEYOND_HORIZON if due_ns > now else Reason.STALE
+        if due_ns < self._last_due and not replaces:
             return Reason.OUT_OF_ORDER
-        if due_ns - self.now_ns > HORIZON_NS:
-            return Reason.BEYOND_HORIZON
         return Reason.ACCEPTED if np.isfinite(values).all() else Reason.NON_FINITE
 
     def send_chunk(self, values: NDArray[np.float64], start_ns: int | None = None) -> list[SendResult]:
@@ -196,6 +197,8 @@ class LiveBridge(ModeRequests):
             RealtimeError: the cerebellum does not answer.
         """
         reason = self._client.request(request)
+        if request == Request.ACTIVATE and reason == Reason.ACCEPTED:
+            self._last_due = _NEVER_NS  # what still waited was dropped
         # What was published before the request was carried out would still refuse what comes next.
         tick = int(self.latest["tick"])
         while int(self.latest["tick"]) <= tick:

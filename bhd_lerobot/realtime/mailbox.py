@@ -42,8 +42,8 @@ class Mailbox:
         return 16 + capacity * cls._slot(dtype).itemsize
 
     def __len__(self) -> int:
-        """Return the number of records that wait."""
-        return self._head.item() - self._tail.item()
+        """Return the number of records that wait; at most the capacity."""
+        return min(max(0, self._head.item() - self._tail.item()), self.capacity)
 
     @property
     def full(self) -> bool:
@@ -61,8 +61,11 @@ class Mailbox:
 
     def take(self) -> Any:
         """Take the oldest record: a copy, or None if none waits."""
-        tail = self._tail.item()
-        if self._head.item() == tail:
+        head, tail = self._head.item(), self._tail.item()
+        if head == tail:
+            return None
+        if not 0 < head - tail <= self.capacity:
+            self._tail[0] = head  # ends that cannot be, because another process wrote garbage
             return None
         record = self._records[tail % self.capacity].copy()
         self._tail[0] = tail + 1

@@ -134,6 +134,7 @@ class PlanLink:
         if sim:
             raise ConfigError(f"A plan for arm {sim} was requested; another process plans for one arm only, number 0.")
         self._number += 1
+        self._dropped[0] = self._number - 1
         request = self._request
         self._guard[0] += 1
         request["number"], request["start_tick"], request["block"] = self._number, start_tick, 1 - self._played
@@ -221,7 +222,7 @@ class PlanServer:
         if self._guard.item() != guard:
             return None
         self._seen_guard = guard
-        return request if request["number"] > self._served else None
+        return request if request["number"] != self._served else None
 
     def _unwanted(self, number: int) -> bool:
         return self._dropped.item() >= number

@@ -88,10 +88,11 @@ class RequestServer:
 
     Attributes:
         expired: how many requests were not carried out because they came too late.
+        invalid: how many requests were dropped because no client writes such.
     """
 
     def __init__(self, cerebellum: Cerebellum, requests: Mailbox, events: Mailbox) -> None:
-        self.expired = 0
+        self.expired = self.invalid = 0
         self._cerebellum, self._requests, self._events = cerebellum, requests, events
         self._unposted: deque[CommandResult] = deque()  # results that there was no room for
 
@@ -112,21 +113,27 @@ class RequestServer:
             self._post()
 
     def _answer(self, request: Any, now_ns: int) -> None:
-        cerebellum, kind = self._cerebellum, RequestKind(int(request["kind"]))
+        cerebellum = self._cerebellum
         if now_ns > int(request["expires_ns"]):
             # The caller does not wait for it any more, and does not expect it to happen now.
             self.expired += 1
             return
+        try:
+            kind, mode = RequestKind(int(request["kind"])), Request(int(request["mode"]))
+            goal, name = decode_goal(request["goal"]), decode_name(request["goal"])
+        except (ValueError, IndexError):  # another process wrote garbage
+            self.invalid += 1
+            return
         event = np.zeros(1, EVENT_DTYPE)[0]
         event["number"], event["tick"], event["kind"] = request["number"], cerebellum.ticks, EventKind.REPLY
         if kind == RequestKind.MODE:
-            event["code"] = cerebellum.request(Request(int(request["mode"]))).reasons[0]
+            event["code"] = cerebellum.request(mode).reasons[0]
         elif kind == RequestKind.GOAL:
-            refusal = cerebellum.submit(0, decode_goal(request["goal"]))
+            refusal = cerebellum.submit(0, goal)
             if refusal is not None:
                 event["refused"], event["code"], event["result"] = True, refusal.code, encode_result(refusal)
         else:
-            event["code"] = cerebellum.cancel(0, decode_name(request["goal"]))
+            event["code"] = cerebellum.cancel(0, name)
         self._events.post(event)
 
     def _post(self) -> None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks._turns import GOAL_MISSED
 from benchmarks.realtime import (
     OURS,
     PYTHON,
@@ -121,7 +122,7 @@ def test_a_loop_that_cannot_be_measured_is_left_out_with_the_reason_and_the_rest
     monkeypatch.setenv("CXX", "no-such-compiler")
     out = tmp_path / "numbers.json"
     options = ["--quick", "--seconds=0.2", "--robots", "turtlebot3", "--conditions", "load", f"--json={out}"]
-    assert main(options) in (0, 1)  # the machine may be as busy as it likes
+    assert main(options) in (0, GOAL_MISSED)  # the machine may be as busy as it likes
     found = json.loads(out.read_text(encoding="utf-8"))
     assert [row["loop"] for row in found["rows"]] == [PYTHON, OURS]
     assert [row["peer"] for row in found["rows"]] == ["", PYTHON]

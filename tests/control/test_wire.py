@@ -15,7 +15,7 @@ from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Watchdog
+from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Setpoint, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
 from tests.control import arm_rig, support
@@ -358,12 +358,13 @@ def test_a_command_is_never_taken_twice() -> None:
     assert rig.command[0] == 0
 
 
-@pytest.mark.parametrize("ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2)])
+@pytest.mark.parametrize("ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2), (2**63 - 1, -(2**63))])
 def test_garbage_in_the_queues_ends_empties_it(ends: tuple[int, int]) -> None:
     rig = base_rig()
     rig.send(0.2)
     rig.tick(10)
     rig.cerebellum.fifo._head[0], rig.cerebellum.fifo._tail[0] = ends
+    rig.cerebellum.interrupt(Watchdog.BRAIN, Mode.STOPPING)
     rig.tick(300)
     assert rig.mode == Mode.HOLD
     assert rig.command == [0, 0]
@@ -381,3 +382,59 @@ def test_a_command_for_later_than_the_horizon_is_refused_and_dropped_from_the_qu
     rig.cerebellum.fifo.push(1, 10 * HORIZON_NS, row, np.ones(1, np.bool_))  # another process, with another clock
     rig.tick()
     assert rig.cerebellum.fifo.next_due() is None
+    assert rig.refused(Reason.BEYOND_HORIZON) == 1
+
+
+ABSURD = (2**62, 2**63 - 1, -(2**63), -1, 0, 1, 100 + 2**31)
+"""Sequence numbers that another process writes beside a sender that has come to 4."""
+
+
+@pytest.mark.parametrize("late", [0, 3 * support.TICK_NS])
+@pytest.mark.parametrize("beside", [1, 3])
+def test_numbers_of_a_second_sender_are_dropped_and_counted_and_take_no_command_of_the_first(
+    late: int, beside: int
+) -> None:
+    rig = base_rig(2)
+    everyone = np.ones(2, np.bool_)
+    for _ in range(4):
+        assert rig.send(0.05).accepted.all()
+        rig.tick(10)
+    bad = np.full((2, 2), 0.2)
+    for number in ABSURD:
+        refused, taken = rig.refused(Reason.OUT_OF_ORDER), rig.cerebellum.setpoints_taken
+        for _ in range(beside):  # before and after the command, and all of them are due in the same tick
+            rig.cerebellum.fifo.push(number, rig.now - late, bad, everyone)
+        assert rig.send(0.05, due=rig.now - late).accepted.all()
+        assert rig.send(0.1, due=rig.now - late).accepted.all()
+        rig.cerebellum.fifo.push(number, rig.now - late, bad, everyone)
+        rig.tick(10)
+        assert rig.refused(Reason.OUT_OF_ORDER) - refused == beside + 1
+        assert rig.cerebellum.setpoints_taken - taken in (2, 4)  # of two robots, one or both commands
+        assert rig.cerebellum.requested[:, 0].tolist() == [0.1, 0.1]
+        assert not len(rig.cerebellum.fifo)
+    assert rig.mode == Mode.TRACKING
+
+
+def test_a_sequence_number_that_no_sender_reaches_is_refused_and_the_next_command_is_taken() -> None:
+    rig = base_rig()
+    assert rig.send(0.1).accepted.all()
+    for number in (2**62, 2**63, 2**70, -(2**70), 2 + 2**31):
+        rows = np.array([[0.2, 0.0]])
+        assert rig.cerebellum.offer(Setpoint(number, rig.now, rows)).reasons.tolist() == [Reason.OUT_OF_ORDER]
+    assert rig.refused(Reason.OUT_OF_ORDER) == 5
+    assert rig.send(0.1).accepted.all()
+    rig.tick(60)
+    assert rig.command[0] == pytest.approx(0.1)
+    assert rig.cerebellum.restart(np.array([0])) is None  # a sender counts on, and may have come far
+    assert [rig.request(one).accepted.all() for one in (Request.CONFIGURE, Request.ACTIVATE)] == [True, True]
+    assert rig.send(0.1, sequence=10**9).accepted.all()
+
+
+def test_a_due_time_that_no_clock_shows_is_refused_and_the_next_command_is_taken() -> None:
+    rig = base_rig()
+    bridge = LockstepBridge(rig.cerebellum, Rates(support.HZ, support.HZ, 10), lambda: None)
+    row = np.array([[0.1, 0.0]])
+    for due, reason in ((2**62, Reason.BEYOND_HORIZON), (2**70, Reason.BEYOND_HORIZON), (-(2**70), Reason.STALE)):
+        for replaces in (False, True):
+            assert bridge.send(row, due_ns=due, replaces=replaces).reasons.tolist() == [reason]
+        assert bridge.send(row).accepted.all()

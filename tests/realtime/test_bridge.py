@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -156,6 +157,46 @@ def test_invalid_setpoints_are_refused_at_once_with_the_reason(rig: Rig) -> None
     assert reason(drive(0.1), bridge.now_ns + 10 * TICK) == Reason.FIFO_FULL
     bridge.estop()
     assert reason(drive(0.1), bridge.now_ns + 11 * TICK) == Reason.ESTOP
+
+
+def test_a_command_that_is_refused_leaves_the_order_of_the_next_as_it_was(rig: Rig) -> None:
+    bridge = rig.bridge
+    absurd = ((2**62, Reason.BEYOND_HORIZON), (2**70, Reason.BEYOND_HORIZON), (-(2**70), Reason.STALE))
+    for due, reason in absurd:
+        assert bridge.send(drive(0.2), due_ns=due, replaces=True).reasons.tolist() == [reason]
+        assert bridge.send(drive(0.1)).accepted.all()
+    rig.tick(40)
+    assert bridge.state().command[0, 0] == pytest.approx(0.1)
+
+
+def test_after_activate_a_command_need_not_be_later_than_what_was_dropped(rig: Rig) -> None:
+    bridge = rig.bridge
+    assert bridge.send(drive(0.1), due_ns=bridge.now_ns + 9 * 10**9).accepted.all()
+    bridge.deactivate()
+    rig.tick(40)
+    assert bridge.reset().accepted.all()
+    assert bridge.activate().accepted.all()
+    assert bridge.send(drive(0.1)).accepted.all()
+    rig.tick(40)
+    assert bridge.state().command[0, 0] == pytest.approx(0.1)
+
+
+def test_a_second_bridge_moves_the_robot_and_what_the_first_sends_then_is_dropped_and_counted(rig: Rig) -> None:
+    bridge = rig.bridge
+    for _ in range(40):
+        assert bridge.send(drive(0.1)).accepted.all()
+        rig.tick()
+    with closing(LiveBlock.attach(rig.block.name)) as block:
+        second = LiveBridge(block, bridge.rates, bridge._client, rig.tick, rig.clock)
+        for _ in range(5):
+            assert second.send(drive(0.05)).accepted.all()
+            rig.tick(10)
+        assert rig.cerebellum.requested[0, 0] == 0.05
+        assert not rig.cerebellum.refusals.any()
+        bridge.send(drive(0.2))
+        rig.tick(10)
+        assert rig.cerebellum.requested[0, 0] == 0.05
+        assert rig.cerebellum.refusals[Reason.OUT_OF_ORDER, 0] == 1
 
 
 def test_an_emergency_stop_latches_and_motion_needs_reset_and_activate(rig: Rig) -> None:

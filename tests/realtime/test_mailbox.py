@@ -43,6 +43,18 @@ def test_a_record_is_a_copy_on_both_ways() -> None:
     assert number_of(taken) == 1
 
 
+@pytest.mark.parametrize("ends", [(2**62, 0), (0, 2**62), (-5, 3), (2**62, -(2**62))])
+def test_ends_that_cannot_be_empty_the_mailbox_and_what_is_posted_next_arrives(ends: tuple[int, int]) -> None:
+    mailbox = Mailbox(RECORD, 3)
+    mailbox.post(record(1))
+    mailbox._head[0], mailbox._tail[0] = ends
+    assert 0 <= len(mailbox) <= 3
+    assert mailbox.take() is None
+    assert mailbox.post(record(2))
+    assert number_of(mailbox.take()) == 2
+    assert mailbox.take() is None
+
+
 @pytest.mark.parametrize("capacity", [0, -1])
 def test_a_mailbox_has_room(capacity: int) -> None:
     with pytest.raises(ConfigError, match=str(capacity)):

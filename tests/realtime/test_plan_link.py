@@ -162,6 +162,24 @@ def test_a_newer_request_takes_the_place_of_one_that_was_not_dropped() -> None:
     assert len(planner.planned) == 1
 
 
+@pytest.mark.parametrize("number", [2**62, 2**63 - 1, -(2**63)])
+@pytest.mark.parametrize("field", ["request", "dropped", "answered"])
+def test_numbers_that_another_process_wrote_cost_one_request_at_the_most(field: str, number: int) -> None:
+    link, server, _, _ = linked()
+    link.request(0, ramp(3), STATE, None, 0)
+    header = server._memory.header[0]
+    if field == "request":
+        header["request"]["number"] = number
+    else:
+        header[field] = number
+    server.serve_once()
+    link.poll(0)
+    for ticks in (4, 5):
+        link.request(0, ramp(ticks), STATE, None, 0)
+        assert server.serve_once()
+        assert answer(link).trajectory.ticks == ticks
+
+
 @given(st.lists(st.sampled_from(["ask", "serve", "poll", "begin", "drop"]), max_size=60))
 def test_the_rows_that_are_played_are_never_written_to(steps: list[str]) -> None:
     link, server, _, _ = linked()

@@ -227,6 +227,27 @@ def test_a_cerebellum_that_does_not_answer_is_named_and_does_nothing_later(kind:
     assert pair.results() == [("live", ResultCode.SUCCEEDED)]
 
 
+def test_garbage_in_a_request_ends_nothing_and_the_next_request_is_answered() -> None:
+    random = np.random.default_rng(0)
+    pair = Pair()
+    for number in range(300):
+        record = np.frombuffer(random.bytes(pair.requests.dtype.itemsize), pair.requests.dtype)[0].copy()
+        record["expires_ns"] = 2**62
+        if number % 2:
+            record["kind"], record["mode"] = random.integers(3), random.integers(4)
+            record["goal"]["motion"], record["goal"]["name"], record["goal"]["name_size"] = 0, str(number), 3
+        assert pair.requests.post(record)
+        pair.tick()
+        pair.client.take_results()
+    assert pair.server.invalid > 100
+    pair.tick(200)
+    pair.client.request(Request.RESET)
+    pair.client.request(Request.ACTIVATE)
+    pair.client.submit(goal("a"))
+    pair.rest()
+    assert pair.results()[-1] == ("a", ResultCode.SUCCEEDED)
+
+
 def test_a_full_mailbox_is_waited_for_and_then_named() -> None:
     pair = Pair(capacity=2)
     pair.alive = False

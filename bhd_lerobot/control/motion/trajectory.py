@@ -13,7 +13,8 @@ from bhd_lerobot.control.commands import ResultCode
 Array = NDArray[np.float64]
 
 MAX_DURATION_S = 120.0  # [s] a trajectory is kept as a list of ticks; a longer one is a mistake in its limits
-_SLACK = 1e-9  # [rad or m] what rounding may add to a position
+_SLACK = 1e-9  # [rad or m; also per s, per s^2] what rounding may add to a state
+_ROUNDING = 1e-9  # as a share of a speed
 _CODES = {int(code): name for name, code in ruckig.Result.__members__.items()}
 
 
@@ -163,8 +164,12 @@ def to_target(
     """
     goal = np.asarray(target, np.float64)
     first = _calculate(start, goal, limits, hz, ruckig.Synchronization.Phase)
-    if isinstance(first, Trajectory) and _stays_within(first, start, limits):
-        return first
+    if isinstance(first, Trajectory):
+        straight = _straight(start, goal, limits, hz)
+        if straight is not None and straight.ticks <= first.ticks:
+            first = straight
+        if _stays_within(first, start, limits):
+            return first
     # Rounding may have put a state a hair outside of what Ruckig takes; or it came too close to a position limit.
     brake = to_rest(start, limits if brake_limits is None else brake_limits, hz)
     if isinstance(brake, PlanFailure):
@@ -218,6 +223,34 @@ def _stays_within(trajectory: Trajectory, start: State, limits: MotionLimits) ->
     return bool((position >= lower - _SLACK).all() and (position <= upper + _SLACK).all())
 
 
+def _straight(start: State, goal: Array, limits: MotionLimits, hz: int) -> Trajectory | None:
+    """Return the quickest trajectory on the straight line to a goal; None if the start does not move along that line.
+
+    Ruckig finds it from rest only: the state of a straight trajectory is off the line by rounding, and the dimensions
+    that wait for the slowest then take another way, with larger accelerations.
+    """
+    way = goal - start.position
+    lead = int(np.abs(way).argmax())
+    if len(way) == 1 or not start.moving or way[lead] == 0.0:
+        return None
+    share = way / way[lead]
+    one = slice(lead, lead + 1)
+    off = (start.velocity - share * start.velocity[lead], start.acceleration - share * start.acceleration[lead])
+    if np.abs(off).max() > _SLACK:
+        return None
+    with np.errstate(divide="ignore"):
+        velocity, acceleration, jerk = (
+            (limit / np.abs(share)).min(keepdims=True) for limit in (limits.velocity, limits.acceleration, limits.jerk)
+        )
+    most = replace(limits[one], velocity=velocity, acceleration=acceleration, jerk=jerk)
+    along = _calculate(start[one], goal[one], most, hz, ruckig.Synchronization.No)
+    if isinstance(along, PlanFailure):
+        return None
+    position = start.position + (along.position - start.position[lead]) * share
+    position[-1] = goal
+    return Trajectory(position, along.velocity * share, along.acceleration * share)
+
+
 def _calculate(
     start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: ruckig.Synchronization
 ) -> Trajectory | PlanFailure:
@@ -231,7 +264,7 @@ def _calculate(
     request.current_position = start.position
     request.current_velocity = start.velocity
     request.current_acceleration = start.acceleration
-    request.max_velocity = limits.velocity
+    request.max_velocity = _top_speed(start, limits)
     request.max_acceleration = limits.acceleration
     request.max_jerk = limits.jerk
     if target is None:
@@ -257,6 +290,17 @@ def _calculate(
     # What is left of rounding in the last tick.
     trajectory.velocity[-1] = trajectory.acceleration[-1] = 0.0
     return trajectory
+
+
+def _top_speed(start: State, limits: MotionLimits) -> Array:
+    """Return the largest speeds that Ruckig is given, shape (dof,).
+
+    A start whose speed is exactly the limit when its acceleration has fallen to zero, as everywhere on a ramp to the
+    limit, is given a hair more: by rounding alone Ruckig 0.19.4 finds a far slower profile from there.
+    """
+    peak = np.abs(start.velocity + np.copysign(start.acceleration**2 / (2 * limits.jerk), start.acceleration))
+    on_it = np.abs(peak - limits.velocity) <= _ROUNDING * limits.velocity
+    return np.where(on_it, np.maximum(peak, limits.velocity) * (1 + _ROUNDING), limits.velocity)
 
 
 def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:

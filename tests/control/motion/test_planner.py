@@ -261,3 +261,24 @@ def test_what_the_motors_cannot_carry_is_refused_with_the_load() -> None:
     assert not isinstance(failure, Plan)
     assert failure.code == ResultCode.OVERLOAD
     assert "load of 5 kg" in failure.message
+
+
+@each_case("load", (0.0, 4.0))
+def test_a_goal_that_is_planned_anew_on_its_way_is_neither_refused_nor_later(load: float) -> None:
+    arm = dataclasses.replace(ARM, load=load)
+    planner, random = GoalPlanner(arm, HZ), np.random.default_rng(0)
+    checked = 0
+    for _ in range(60):
+        goal, start = HOME[:6] + random.uniform(-0.8, 0.8, 6), HOME.copy()
+        start[:6] += random.uniform(-0.8, 0.8, 6)
+        command = BrainCommand("a", joint_target=tuple(goal))
+        whole = planner.plan(command, start, ZEROS, ZEROS)
+        if isinstance(whole, PlanFailure):
+            continue
+        rows = whole.trajectory
+        for row in random.integers(0, rows.ticks - 1, 5):
+            again = planner.plan(command, rows.position[row], rows.velocity[row], rows.acceleration[row])
+            assert isinstance(again, Plan), again
+            assert row + 1 + again.trajectory.ticks <= rows.ticks + 1
+            checked += 1
+    assert checked > 200

@@ -1,6 +1,7 @@
 """Trajectories: limits, ends, agreement with Ruckig's own evaluation, straightness of lines, and playing them back."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -136,6 +137,64 @@ def test_a_joint_that_cannot_stop_before_its_end_comes_to_rest_on_it() -> None:
     assert not brake.velocity[-1].any()
     # The shortest way to stop from 3 m/s: 0.4 s on average at half the speed.
     assert brake.position.max() <= 0.9 + 3.0 * 0.4 / 2 + 1e-3
+
+
+def random_limits(random: np.random.Generator, dof: int) -> MotionLimits:
+    rates = np.cumprod(random.uniform((0.2, 2.0, 4.0), (4.0, 10.0, 20.0), (dof, 3)), axis=1).T
+    return MotionLimits(*rates, np.full(dof, -10.0), np.full(dof, 10.0))
+
+
+def test_a_trajectory_planned_anew_from_its_own_state_is_not_later() -> None:
+    """Whatever is planned again on the way, a goal or a brake, at the most a tick is lost to sampling."""
+    random = np.random.default_rng(0)
+    checked = 0
+
+    def check(plan: Callable[[State], Trajectory | PlanFailure], start: State, ticks: int | None = None) -> None:
+        nonlocal checked
+        whole = planned(plan(start))
+        for row in range(whole.ticks - 1) if ticks is None else random.integers(0, max(1, whole.ticks - 1), ticks):
+            state = State(whole.position[row], whole.velocity[row], whole.acceleration[row])
+            late = row + 1 + planned(plan(state)).ticks - whole.ticks
+            assert late <= 1, f"{late} ticks late from tick {row + 1} of {whole.ticks}: {start}, {state}"
+            checked += 1
+
+    # The smallest case: its acceleration falls to zero at the limit of the speed.
+    limits = MotionLimits(*(np.array([value]) for value in (1.0, 8.0, 80.0, -10.0, 10.0)))
+    check(lambda state: to_target(state, [2.0], limits, HZ), State.at_rest([0.0]))
+    for number in range(150):
+        dof = (1, 6)[number % 2]
+        limits = random_limits(random, dof) if number % 3 else ARM[:dof].scaled(*random.uniform(0.1, 1.0, 2))
+        goal = random.uniform(-3, 3, dof)
+        begins = State.at_rest(random.uniform(-3, 3, dof)), viable(random.uniform(-1, 1, (3, dof)).tolist(), limits)
+        for start in begins:
+            check(lambda state: to_target(state, goal, limits, HZ), start, 8)  # noqa: B023  used at once
+        check(lambda state: to_rest(state, limits, HZ), begins[1], 4)  # noqa: B023
+    assert checked > 3000
+
+
+def test_what_was_straight_is_straight_when_planned_anew() -> None:
+    random = np.random.default_rng(1)
+    straight = 0
+    for _ in range(40):
+        start, goal = random.uniform(-2, 2, (2, 6))
+        way = (goal - start) / np.abs(goal - start).max()
+        lead = int(np.abs(way).argmax())
+        whole = planned(to_target(State.at_rest(start), goal, ARM, HZ))
+
+        def off(trajectory: Trajectory) -> float:
+            along = (trajectory.position[:, lead] - start[lead]) / way[lead]  # noqa: B023
+            return float(np.abs(trajectory.position - start - np.outer(along, way)).max())  # noqa: B023
+
+        if off(whole) > 1e-9:
+            continue  # a straight line would have taken longer
+        straight += 1
+        for row in random.integers(0, whole.ticks - 1, 10):
+            state = State(whole.position[row], whole.velocity[row], whole.acceleration[row])
+            again = planned(to_target(state, goal, ARM, HZ))
+            assert off(again) < 1e-6
+            assert excess(state, again, ARM) < 1e-6
+            assert np.array_equal(again.target, goal)
+    assert straight > 10
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
