@@ -11,8 +11,9 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.edit.edits import Change, EditReport, OnDone, check_episodes, rewrite
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import frames_of
 from bhd_lerobot.datasets.format.schema import as_numpy
-from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, read_frames, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.plugins import body_of
@@ -181,9 +182,7 @@ class _Changes:
     def _column(self, row: Row, key: str) -> np.ndarray:
         slot = slot_of(row, "data")
         path = self._state.root / layout.data_file(slot)
-        table = read_frames(path, [key])
-        first = row["dataset_from_index"] - self._slots[slot][0]["dataset_from_index"]
-        return as_numpy(table[key])[first : first + row["length"]].copy()
+        return as_numpy(frames_of(path, self._slots[slot], [key])[row["episode_index"]][key]).copy()
 
 
 def _interventions(row: Row) -> list[tuple[int, int, str]]:

@@ -50,7 +50,7 @@ def local_metadata(
         meta = checked(Metadata(repo_id, root=root, revision=revision))
         wanted = episodes if select is None else select(meta)
         if _missing(meta, wanted):
-            meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta
+            meta = checked(LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta)
     except BhdError:
         raise
     except Exception as error:  # of the Hub's client, of the network, of LeRobot: all mean that it is not there

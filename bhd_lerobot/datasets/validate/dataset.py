@@ -21,6 +21,7 @@ CHECKS = {
     "schema": "features, their shapes, names and columns",
     "files": "every file is there, and can be read to its last page",
     "counts": "meta/info.json, meta/episodes and the data files agree",
+    "order": "files, frames and instructions lie in the order of their numbers, by which LeRobot finds them",
     "stats": "statistics are there, and are those of the data",
     "video": "every video has as many frames as its episodes",
     "finite": "no NaN, no infinity, nothing missing",
