@@ -61,6 +61,7 @@ def write(
     lengths: Sequence[int] = LENGTHS,
     files: Sequence[int] | None = None,
     change: Callable[[int, Columns], object] = lambda episode, columns: None,
+    stats_of: Callable[[Columns], dict[str, statistics.Stats]] = statistics.column_stats,
 ) -> Path:
     """Write a dataset.
 
@@ -69,6 +70,7 @@ def write(
         lengths: frames of each episode.
         files: number of the data file of each episode; all in the first if None.
         change: changes an episode's columns, statistics following.
+        stats_of: computes the statistics of an episode.
     """
     slots = [0] * len(lengths) if files is None else list(files)
     starts = np.cumsum([0, *lengths]).tolist()
@@ -78,7 +80,7 @@ def write(
     for slot in set(slots):
         tables = [_table(one) for one, own in zip(episodes, slots, strict=True) if own == slot]
         _write(root / f"data/chunk-000/file-{slot:03d}.parquet", pa.concat_tables(tables))
-    stats = [statistics.column_stats(one) for one in episodes]
+    stats = [stats_of(one) for one in episodes]
     write_rows(root, starts, slots, stats)
     write_tasks(root, dict(enumerate(TASKS)))
     total = {
@@ -89,6 +91,16 @@ def write(
     counts = {"total_episodes": len(lengths), "total_frames": starts[-1], "total_tasks": len(TASKS)}
     _dump(root / "meta/info.json", {**INFO, **counts})
     return root
+
+
+def in_single_precision(columns: Columns) -> dict[str, statistics.Stats]:
+    """Return statistics with deviations as LeRobot computes them: the mean of the squares minus that of the values."""
+    stats = statistics.column_stats(columns)
+    for key, values in columns.items():
+        if values.dtype == np.float32:
+            variance = (values**2).mean(axis=0) - values.mean(axis=0) ** 2
+            stats[key]["std"] = np.sqrt(np.maximum(variance, 0)).astype(np.float64).reshape(-1)
+    return stats
 
 
 def write_rows(

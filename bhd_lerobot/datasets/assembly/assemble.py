@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
 from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format.columns import frames_of, to_numpy
 from bhd_lerobot.datasets.format.episode_table import PREFIX, stored_stats
 from bhd_lerobot.datasets.format.identity import comparable, differences
 from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
@@ -250,6 +251,7 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
             "task_index": plan.task_indexes(place),
             **pick.columns,
         }
+        columns |= _impossible(plan, place, own)
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
@@ -268,6 +270,26 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
                     "up. `lerobot-edit-dataset --operation.type recompute_stats` computes all of them."
                 )
     return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
+
+
+def _impossible(plan: Plan, place: int, stats: Mapping[str, statistics.Stats]) -> dict[str, np.ndarray]:
+    """Return the columns of an episode whose stored standard deviation cannot be theirs, each of shape (T, d)."""
+    source, row = plan.picks[place].source, plan.picks[place].row
+    features = source.info["features"]
+    wrong = [
+        key
+        for key, stat in stats.items()
+        if key in features
+        and features[key]["dtype"] not in ("image", "video")
+        and len(features[key]["shape"]) == 1
+        and not statistics.are_possible(stat).all()
+    ]
+    if not wrong:
+        return {}
+    slot = slot_of(row, "data")
+    path, rows = source.root / layout.data_file(slot), plan.files.rows(source, "data")[slot]
+    frames = frames_of(path, rows, wrong)[row["episode_index"]]
+    return {key: to_numpy(frames[key], tuple(features[key]["shape"])) for key in wrong}
 
 
 def _edits_of(source: DatasetState) -> list[str]:

@@ -196,7 +196,7 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
         raise corrupt(path, error) from error
     table = in_order(table, [row], path)
     return {
-        key: _to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
+        key: to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
         for key in table.column_names
         if key in state.info["features"]
     }
@@ -210,7 +210,8 @@ def _row(state: DatasetState, index: int) -> Row:
     return state.rows[index]
 
 
-def _to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
+def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
+    """Return a column of a data file as an array of shape (T, *shape), or (T,) of scalars."""
     array = column.combine_chunks()
     if pa.types.is_list(array.type) and pa.types.is_struct(array.type.value_type):
         rows = np.empty(len(array), dtype=object)  # language: a list of rows for every frame

@@ -7,19 +7,19 @@ from typing import Any
 import torch
 
 from bhd_lerobot.datasets.loader.table import FrameTable
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, quoted
 
 
 def check(dataset: Any, keys: Collection[str]) -> None:
-    """Check that a dataset has the features that a policy learns from, and that all of their values are finite.
+    """Check that a policy can learn from a dataset: it has the features, all values are finite, and can be normalised.
 
     Args:
         dataset: a `TableDataset` or `LeRobotDataset`.
         keys: features that the policy reads or predicts.
 
     Raises:
-        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; the message names
-            episode, frame and feature.
+        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; or a standard deviation
+            is stored as 0 though its feature changes. The message names episode, frame and feature.
     """
     meta = dataset.meta
     if not dataset.num_frames:
@@ -44,6 +44,7 @@ def check(dataset: Any, keys: Collection[str]) -> None:
         values = (column if rows is None else column[rows]).reshape(dataset.num_frames, -1)
         finite = torch.isfinite(values)
         if bool(finite.all()):
+            _check_deviation(meta, key, values)
             continue
         sample, element = (int(i) for i in (~finite).nonzero()[0])
         row = sample if rows is None else int(rows[sample])
@@ -53,4 +54,19 @@ def check(dataset: Any, keys: Collection[str]) -> None:
             f"{meta.root}, {table.place(row)}: {key!r}{which} is {float(values[sample, element])}, and "
             f"{int((~finite.all(1)).sum())} frames have such values. Leave their episodes out with dataset.episodes, "
             "or record them again."
+        )
+
+
+def _check_deviation(meta: Any, key: str, values: torch.Tensor) -> None:
+    stored = torch.as_tensor((meta.stats or {}).get(key, {}).get("std", ())).reshape(-1)
+    if len(stored) != values.shape[1]:
+        return
+    low, high = values.aminmax(dim=0)
+    for element in ((stored == 0) & (high > low)).nonzero()[:1, 0].tolist():
+        names = meta.features[key].get("names")
+        which = f" ({names[element]})" if isinstance(names, list) and len(names) == len(stored) > 1 else ""
+        raise DatasetError(
+            f"{meta.root}: the standard deviation of {key!r}{which} is stored as 0, and its values go from "
+            f"{float(low[element]):.6g} to {float(high[element]):.6g}. A policy would divide by it. Run `bhd-data "
+            f"check --fix {quoted(meta.root)}`, which computes the statistics again."
         )

@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
 from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
 from bhd_lerobot.datasets.validate.frozen import FrozenCheck
 from bhd_lerobot.datasets.validate.order import check_numbers
-from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_statistic
+from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_deviations, wrong_statistic
 from bhd_lerobot.datasets.validate.steps import StepCheck
 
 Limits = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -232,7 +232,7 @@ class ValueCheck:
                 continue
             if len(self._files.features[key]["shape"]) > 1:
                 continue  # LeRobot's are over other axes
-            wrong = wrong_statistic(known, column, self.frames, max(self._lengths))
+            wrong = wrong_statistic(known, column, max(self._lengths))
             if wrong is not None:
                 where, what = f"{layout.STATS}: {key}", f"{wrong} is not that of the data"
                 if key in UNREAD:
@@ -240,6 +240,24 @@ class ValueCheck:
                     self._findings.warning("stats", where, what, remedy)
                 else:
                     self._findings.error("stats", where, what, remedy)
+            elif "std" in known and key.startswith(("observation", "action")):
+                self._judge_deviation(key, column, known["std"], remedy)
+
+    def _judge_deviation(self, key: str, column: Moments, stored: NDArray[np.float64], remedy: str) -> None:
+        is_wrong, deviation = wrong_deviations(stored, column)
+        if not is_wrong.any():
+            return
+        wrong = np.flatnonzero(is_wrong)
+        is_zero = (stored[wrong] == 0).any()
+        number = wrong[np.argmax(stored[wrong] == 0)] if is_zero else wrong[0]
+        name = name_of(self._files.features[key], int(number))
+        what = (
+            f"the std of {few(name_of(self._files.features[key], int(n)) for n in wrong)} is not that of the data: of "
+            f"{name} it is {stored[number]:.3g}, and theirs is {deviation[number]:.3g}, as LeRobot rounds far from 0; "
+            "a policy that is normalised with it learns something else"
+        )
+        report = self._findings.error if is_zero else self._findings.warning
+        report("stats", f"{layout.STATS}: {key}", what, remedy)
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:
