@@ -17,6 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.storage.places import check_links
+from bhd_lerobot.datasets.storage.pointers import not_fetched
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
 
 UNREADABLE = (OSError, pa.ArrowException, ValueError)
@@ -109,8 +110,10 @@ class DamagedFileError(DatasetCorruptError):
         self.reason = self.wrong.removeprefix(f"{path} is corrupt: ")
 
 
-def corrupt(path: Path, reason: object) -> DamagedFileError:
-    """Return the error for a file that cannot be trusted."""
+def corrupt(path: Path, reason: object) -> DatasetError:
+    """Return the error for a file that cannot be trusted, or that was not fetched."""
+    if error := not_fetched(path.parent, [path]):
+        return error
     remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
     if path.as_posix().endswith(layout.INFO):
         remedy = repair_with_info(path.parents[1])

@@ -32,6 +32,7 @@ from bhd_lerobot.datasets.recovery.videos import whole_frames
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
+from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.datasets.validate.files import read_files
 from bhd_lerobot.datasets.validate.findings import Findings
 from bhd_lerobot.datasets.validate.order import check_numbers
@@ -48,13 +49,14 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
     Raises:
         DatasetLockedError: it is being recorded at this moment.
         DatasetCorruptError: files are damaged and no whole episode can be recovered; nothing was changed then.
-        DatasetError: there is no dataset at `root`, or one of its files cannot be read.
+        DatasetError: there is no dataset at `root`, or one of its files cannot be read, or was not fetched.
         ConfigError: `info` is not needed, cannot be read or describes other data.
         DatasetWriteError: the disk refuses the repaired files.
     """
     root = Path(root)
     if not root.is_dir():
         raise no_dataset(root)
+    check_fetched(root)
     lock = RootLock(root)
     try:
         disk = Disk()
@@ -212,6 +214,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     Raises:
         DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
     """
+    check_fetched(root)
     remove_abandoned(real(root))
     completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
     state = load_state(root)

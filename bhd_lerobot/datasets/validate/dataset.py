@@ -11,6 +11,7 @@ from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.format.episode_table import PREFIX
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, read_files
 from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
 from bhd_lerobot.datasets.validate.values import Limits, ValueCheck
@@ -76,10 +77,11 @@ def check_dataset(
         videos: read the videos, too, which takes longer than all the rest.
 
     Raises:
-        DatasetError: there is no dataset, or its `meta/info.json` cannot be read.
+        DatasetError: there is no dataset, its `meta/info.json` cannot be read, or files of it were not fetched.
     """
     findings = Findings()
     complete_interrupted(Path(root))
+    check_fetched(Path(root))
     files = read_files(Path(root), findings)
     robot = files.info.get("robot_type")
     if not files.info["total_episodes"]:
