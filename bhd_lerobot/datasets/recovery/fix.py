@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.format.state import DatasetState, load_info, load_stat
 from bhd_lerobot.datasets.format.statistics import Stats
 from bhd_lerobot.datasets.recovery.statistics import stats_of
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.atomic import Workspace, clean, has_unfinished_episodes, link_others
+from bhd_lerobot.datasets.storage.atomic import Workspace, has_unfinished_episodes, link_others, real, remove_abandoned
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.validate.findings import FIX, Finding, Severity
 
@@ -48,11 +48,11 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     """
     root = Path(root)
     wanted = [finding for finding in findings if is_fixable(finding)]
+    remove_abandoned(real(root))
     if not wanted or any(finding.severity is Severity.ERROR and not is_fixable(finding) for finding in findings):
         return []
     lock = RootLock(root)
     try:
-        clean(root)
         if has_unfinished_episodes(root):
             return []  # an interrupted recording, which is for `repair`
         with write_errors("repair the dataset", root, "It is as it was."):
@@ -98,7 +98,7 @@ def rebuild(state: DatasetState, disk: Disk, lock: RootLock, *, order: bool = Fa
             disk.write(new / layout.INFO, to_json(info))
         if known is not None:
             done.append(f"{layout.STATS} and meta/episodes: statistics of {len(rows)} episodes, from their frames")
-        space.publish(f"{root} had been corrected")
+        space.publish(f"the correction of {root} had been completed")
     disk.try_remove_tree(root / layout.STAGING)
     return done
 

@@ -30,7 +30,7 @@ from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
 from bhd_lerobot.datasets.recovery.salvage import RepairReport, salvage
 from bhd_lerobot.datasets.recovery.videos import whole_frames
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
+from bhd_lerobot.datasets.storage.atomic import clean, real, remove_abandoned, roll_forward
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
 from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.datasets.validate.files import read_files
@@ -117,6 +117,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
     consequence = "Its files are as they were."
     with write_errors("repair the dataset", root, consequence):
         roll_forward(root, disk)
+        clean(root)
         adopted, saved = adopt_info(root, donor, disk)
     try:
         report = _repair_foreign(root, disk, lock, adopted)
