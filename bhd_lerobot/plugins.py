@@ -39,6 +39,7 @@ _OPTION = "discover_packages_path"
 # This distribution, for LeRobot's commands. Ours register what they need; our environments take seconds to import.
 _OURS = "lerobot_robot_bhd"
 _imported: set[str] = set()
+_unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
 
 
 def load_plugins(report: Callable[[str], object] | None = None) -> None:
@@ -107,8 +108,9 @@ def body_of(robot_type: str | None) -> MobileBase | Arm | None:
     """
     if robot_type is None:
         return None
-    if robot_type not in BODIES:
+    if robot_type not in BODIES and robot_type not in _unknown:
         load_plugins()
+        _unknown.add(robot_type)
     return BODIES[robot_type]() if robot_type in BODIES else None
 
 

@@ -124,3 +124,16 @@ def test_a_module_that_an_option_names_is_imported_or_refused(installer, tmp_pat
     Path("in_this_folder.py").write_text("", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"write PYTHONPATH=\. before the command"):
         plugins.load_named(["--task.discover_packages_path=in_this_folder"])
+
+
+def test_a_robot_that_no_plug_in_has_is_looked_for_once(installer, monkeypatch) -> None:
+    """To list what is installed takes some hundredths of a second, and datasets are asked for each episode."""
+    looked = []
+    installed = plugins._installed
+    monkeypatch.setattr(plugins, "_installed", lambda: looked.append(1) or installed())
+    monkeypatch.setattr(plugins, "_unknown", set())
+    monkeypatch.setattr(plugins, "BODIES", dict(plugins.BODIES))
+    assert [plugins.body_of("toy") for _ in range(5)] == [None] * 5
+    assert len(looked) == 1
+    plugins.BODIES["toy"] = plugins.BODIES["ur5"]
+    assert plugins.body_of("toy") is not None

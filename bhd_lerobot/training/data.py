@@ -7,12 +7,14 @@ from typing import Any
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.transforms import ImageTransforms
 
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.state import load_info
+from bhd_lerobot.datasets.loader.check import beyond
 from bhd_lerobot.datasets.loader.loader import Loader, check, expert_stats, imagenet_stats, make_loader
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
@@ -97,6 +99,7 @@ def open_data(
     rank: int = 0,
     world_size: int = 1,
     report: Callable[[str], None] = lambda message: None,
+    by_own_statistics: bool = True,
 ) -> TrainingData:
     """Load the dataset.
 
@@ -107,7 +110,8 @@ def open_data(
         device: where batches are needed.
         rank: this process among `world_size`.
         world_size: processes that train together.
-        report: gets the reason why LeRobot's own loader is used, if it is.
+        report: gets the reason why LeRobot's own loader is used, if it is, and warnings.
+        by_own_statistics: whether the policy is normalised by the statistics of this dataset.
 
     Raises:
         BhdError: no episode is left, a value is not finite, or the dataset cannot be read.
@@ -132,6 +136,9 @@ def open_data(
     check(loaders.dataset, keep)
     if loaders.held_out is not None:
         check(loaders.held_out.dataset, keep)
+    for key in keep if by_own_statistics else ():
+        if warning := _beyond_quantiles(loaders.dataset, policy, key, config.rename_map.get(key, key)):
+            report(warning)
     size = getattr(loaders.dataset, "nbytes", None)
     return TrainingData(
         train=loaders.train,
@@ -140,6 +147,38 @@ def open_data(
         episodes=loaders.dataset.num_episodes,
         held_out_episodes=[] if loaders.held_out is None else sorted(loaders.held_out.dataset.episodes),
         how=f"LeRobot's, {config.num_workers} workers" if size is None else f"in memory, {size / 2**20:.3g} MiB",
+    )
+
+
+_QUANTILES = {
+    NormalizationMode.QUANTILES: ("q01", "q99", 0.02),
+    NormalizationMode.QUANTILE10: ("q10", "q90", 0.2),
+}
+"""By the way of normalising: what becomes -1 and 1, and the share of frames beyond."""
+
+
+def _beyond_quantiles(dataset: Any, policy: PreTrainedConfig, key: str, name: str) -> str:
+    """Return a warning if quantiles that a policy is normalised with are not those of the data.
+
+    Args:
+        dataset: what is learned from.
+        policy: the policy's configuration.
+        key: a feature of the dataset.
+        name: what the policy calls it.
+    """
+    features = {**(policy.input_features or {}), **(policy.output_features or {})}
+    kind = features[name].type.value if name in features else ""
+    mode = policy.normalization_mapping.get(kind)
+    if mode not in _QUANTILES:
+        return ""
+    low, high, expected = _QUANTILES[mode]
+    share = beyond(dataset, key, low, high)
+    if share <= 2 * expected:
+        return ""
+    return (
+        f"warning: {key} is normalised by {low} and {high}, and up to {100 * share:.0f} % of the frames lie beyond "
+        f"them, not {100 * expected:.0f} %: LeRobot takes the average of the episodes' quantiles. Set {kind} of "
+        "policy.normalization_mapping to MEAN_STD or MIN_MAX."
     )
 
 

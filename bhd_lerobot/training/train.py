@@ -101,6 +101,7 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         rank=accelerator.process_index,
         world_size=accelerator.num_processes,
         report=lambda message: console.print(escape(message), soft_wrap=True, highlight=False),
+        by_own_statistics=not keep,
     )
     contract = PolicyContract.from_dataset(meta, trainer="bhd-train")
     parts = TrainingParts(policy, optimizer, scheduler, preprocessor, postprocessor, contract)

@@ -44,6 +44,7 @@ def make_dataset(
     fps: int = FPS,
     robot: str = "toy",
     shift: float = 0.0,
+    spread: float = 0.0,
     instructions: int = 1,
 ) -> Path:
     """Record episodes in which the action follows from what is observed; return the dataset's folder."""
@@ -58,7 +59,7 @@ def make_dataset(
             event[:3] = 5
             columns = {
                 "observation.state": state,
-                "action": (np.tanh(goal - state[:, :2]) + shift).astype(np.float32),
+                "action": (np.tanh(goal - state[:, :2]) + shift + spread * episode).astype(np.float32),
                 "event": event,
             }
             if environment:

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -240,3 +241,22 @@ def test_help_names_lerobots_options_and_ours(capsys: pytest.CaptureFixture) -> 
     assert "--steps" in printed
     assert "--selection.outcome" in printed
     assert "bhd_mlp" in printed
+
+
+@pytest.mark.parametrize("mode", ["QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"])
+def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path, mode: str) -> None:
+    """Of episodes that differ, most values lie beyond what the policy takes for nearly all."""
+    mapping = {"STATE": "MEAN_STD", "ENV": "MEAN_STD", "ACTION": mode}
+    policy = {**MLP, "policy.normalization_mapping": json.dumps(mapping)}
+    root = make_dataset(tmp_path / "d", episodes=3, spread=100.0)
+    _, printed = run_train(options(root, tmp_path / "run", policy, steps=1))
+    is_by_quantiles = mode.startswith("QUANTILE")
+    assert ("warning: action is normalised by" in printed) == is_by_quantiles
+    if mode == "QUANTILES":
+        # Around 0, 100 and 200 the average of the quantiles is around 100: at most a third lies between.
+        found = re.search(r"by q01 and q99, and up to (\d+) % of the frames lie beyond them, not 2 %", printed)
+        assert found is not None
+        assert int(found[1]) >= 66
+    root = make_dataset(tmp_path / "one", episodes=1, frames=200)
+    _, printed = run_train(options(root, tmp_path / "other", policy, steps=1))
+    assert "warning: action is normalised by" not in printed

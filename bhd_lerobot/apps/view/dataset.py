@@ -17,6 +17,7 @@ from bhd_lerobot.apps.view.episode import packed_episode
 from bhd_lerobot.apps.view.marking import mark_episode
 from bhd_lerobot.datasets.edit.mark import possible_outcomes
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import NUMBERS, in_order
 from bhd_lerobot.datasets.format.episode_table import PREFIX
 from bhd_lerobot.datasets.format.expected import wrong_values
 from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
@@ -255,7 +256,7 @@ def _table(state: DatasetState, row: Row, columns: Sequence[str] | None = None) 
             columns = [k for k in there if k in features and k not in _COUNTERS and features[k]["dtype"] != "image"]
         table = pq.read_table(
             path,
-            columns=[*columns, "episode_index"],
+            columns=list(dict.fromkeys((*columns, *NUMBERS))),
             filters=[("episode_index", "=", row["episode_index"])],
             page_checksum_verification=True,
         )
@@ -263,9 +264,7 @@ def _table(state: DatasetState, row: Row, columns: Sequence[str] | None = None) 
         raise corrupt(path, error) from error
     if wrong := wrong_values(table):
         raise corrupt(path, wrong)
-    if table.num_rows != row["length"]:
-        raise corrupt(path, f"episode {row['episode_index']} has {table.num_rows} of {row['length']} frames")
-    return table.drop_columns(["episode_index"]) if "episode_index" not in columns else table
+    return in_order(table, [row], path).select(columns)
 
 
 def _instruction(row: Row) -> str:

@@ -18,7 +18,7 @@ from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
 from bhd_lerobot.datasets.timing.report import timing_of
-from bhd_lerobot.datasets.timing.tables import fitting, ms
+from bhd_lerobot.datasets.timing.tables import aligned, fitting, ms
 from bhd_lerobot.errors import DatasetError, counted
 
 
@@ -120,18 +120,12 @@ def info(root: Path, console: Console) -> None:
     console.print(features)
     if not summary.episodes:
         return
-    episodes = Table(title="Episodes", title_justify="left")
-    columns = _episode_columns(summary, timings)
-    has_tasks = len({episode.task for episode in summary.episodes}) > 1
-    # At least a few words of the instruction, if there is a column for it; it wraps.
-    shown = fitting(columns, console.width - 33 * has_tasks)
-    for heading, _ in shown:
-        episodes.add_column(heading, justify="left" if heading == "outcome" else "right", no_wrap=True)
-    if has_tasks:
-        episodes.add_column("instruction")
-    for row, episode in zip(zip(*(cells for _, cells in shown), strict=True), summary.episodes, strict=True):
-        episodes.add_row(*row, *[escape(episode.task)] * has_tasks)
-    console.print(episodes)
+    tasks = [" ".join(episode.task.split()) for episode in summary.episodes]
+    has_tasks = len(set(tasks)) > 1
+    # At least a few words of the instruction, if there is a column for it; it is the last one, and not cut off.
+    shown = fitting(_episode_columns(summary, timings), console.width - 33 * has_tasks)
+    shown += [("instruction", tasks)] if has_tasks else []
+    console.out(f"Episodes\n{aligned(shown, left=('outcome', 'instruction'))}", highlight=False)
 
 
 def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | None]) -> list[tuple[str, list[str]]]:

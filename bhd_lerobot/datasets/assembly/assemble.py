@@ -6,6 +6,7 @@ every column comes along, and the new dataset appears complete or not at all. Fi
 """
 
 import copy
+import datetime
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,10 +19,11 @@ import pyarrow.parquet as pq
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
 from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format.columns import frames_of, to_numpy
 from bhd_lerobot.datasets.format.episode_table import PREFIX, stored_stats
 from bhd_lerobot.datasets.format.identity import comparable, differences
 from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
-from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, read_frames, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, to_json
@@ -30,6 +32,9 @@ from bhd_lerobot.errors import DatasetError, DatasetMismatchError, quoted
 
 EDITS = "meta/edits.jsonl"
 """What was done to a dataset after its recording: one JSON object a line."""
+
+SORTED = "sort"
+"""Name of the edit that puts files, rows and instructions in the order of their numbers, which stay what they are."""
 
 WRITTEN = (
     "info.json",
@@ -52,6 +57,7 @@ def assemble(
     in_place: bool = False,
     edit: Mapping[str, Any],
     identity: Mapping[str, Any] | None,
+    known: Mapping[str, statistics.Stats] | None = None,
 ) -> None:
     """Write a dataset.
 
@@ -64,6 +70,7 @@ def assemble(
             never share one, because other programs write into files.
         edit: the entry in ``meta/edits.jsonl``.
         identity: content of ``meta/bhd.json``; no such file if None.
+        known: feature -> statistic -> values of all episodes of the only source; those that are stored if None.
 
     Raises:
         DatasetMismatchError: the sources have other columns, frame rates or robots.
@@ -71,14 +78,16 @@ def assemble(
         UnsupportedDatasetError: a video cannot be cut without encoding again.
         OSError: a file cannot be written.
     """
-    sources = _sources(picks)
+    sources = _sources(picks, known is not None)
     check_alike(sources)
     kinds = {**_types(sources, "metadata_types", PREFIX), **(types or {})}
     extra = _types(sources, "extra_types", "")
-    tasks = _tasks(picks)
+    files = Files(picks)
+    instructions = [files.instructions(pick) for pick in picks]
+    tasks = _tasks(sources, picks, instructions)
     info = _info(sources, len(picks), sum(pick.row["length"] for pick in picks), len(tasks))
-    rows = _rows(picks, kinds, extra)
-    plan = Plan(picks, rows, tasks, info, Files(picks))
+    rows = _rows(picks, instructions, kinds, extra)
+    plan = Plan(picks, rows, tasks, info, files)
     take = disk.link if in_place else disk.copy
     build_data(plan, data_groups(plan), new, disk, take=take)
     for key in sources[0].video_keys:
@@ -93,12 +102,17 @@ def assemble(
     sink = pa.BufferOutputStream()
     pq.write_table(tasks_table(list(tasks)), sink)
     disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
-    write_meta(new, info, rows, kinds, _stats(picks, rows, tasks), disk=disk, extra=extra)
+    write_meta(new, info, rows, kinds, _stats(plan, known), disk=disk, extra=extra)
     if identity is not None:
         disk.write(new / layout.IDENTITY, to_json(identity))
     lines = [line for source in sources for line in _edits_of(source)] + [json.dumps(edit, ensure_ascii=False)]
     disk.write(new / EDITS, "".join(f"{line}\n" for line in lines).encode())
     disk.write(new / layout.INFO, to_json(info))
+
+
+def logged_now(edit: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an entry of ``meta/edits.jsonl`` with the present time."""
+    return {"time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), **edit}
 
 
 def check_alike(sources: Sequence[DatasetState]) -> None:
@@ -138,14 +152,14 @@ def _is_meaning(name: str) -> bool:
     return "depth" in name or name.removeprefix("video.") in ("shift", "use_log")
 
 
-def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
+def _sources(picks: Sequence[Pick], has_stats: bool) -> list[DatasetState]:
     if not picks:
         raise DatasetError("No episode is left, and a dataset needs one. Nothing was changed.")
     sources: list[DatasetState] = []
     for pick in picks:
         if not any(pick.source is source for source in sources):
             sources.append(pick.source)
-    for source in sources:
+    for source in sources if not has_stats else ():
         if has_unfinished_episodes(source.root) or (source.without_stats and source.identity is not None):
             raise DatasetError(
                 f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
@@ -171,13 +185,13 @@ def _types(sources: Sequence[DatasetState], name: str, prefix: str) -> dict[str,
     return types
 
 
-def _tasks(picks: Sequence[Pick]) -> dict[str, int]:
+def _tasks(
+    sources: Sequence[DatasetState], picks: Sequence[Pick], instructions: Sequence[Sequence[str]]
+) -> dict[str, int]:
     """Return the index of each instruction that is used: those of the first dataset in its order, then the next's."""
     tasks: dict[str, None] = {}
-    for source in _sources(picks):
-        used = {task for pick in picks if pick.source is source for task in pick.row["tasks"]}
-        if unknown := used - set(source.tasks):
-            raise corrupt(source.root / layout.TASKS, f"it does not have the instruction {min(unknown)!r}")
+    for source in sources:
+        used = {task for pick, own in zip(picks, instructions, strict=True) if pick.source is source for task in own}
         tasks |= dict.fromkeys(task for task in source.tasks if task in used)
     return {task: index for index, task in enumerate(tasks)}
 
@@ -202,11 +216,13 @@ def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: in
     }
 
 
-def _rows(picks: Sequence[Pick], types: Iterable[str], extra: Iterable[str]) -> list[Row]:
+def _rows(
+    picks: Sequence[Pick], instructions: Sequence[Sequence[str]], types: Iterable[str], extra: Iterable[str]
+) -> list[Row]:
     rows, start = [], 0
-    for index, pick in enumerate(picks):
+    for index, (pick, tasks) in enumerate(zip(picks, instructions, strict=True)):
         length = pick.row["length"]
-        row = {"episode_index": index, "tasks": list(pick.row["tasks"]), "length": length}
+        row = {"episode_index": index, "tasks": list(tasks), "length": length}
         row |= {"dataset_from_index": start, "dataset_to_index": start + length}
         row |= {PREFIX + name: pick.metadata.get(name, pick.row.get(PREFIX + name)) for name in types}
         row |= {name: pick.row.get(name) for name in extra}
@@ -215,26 +231,27 @@ def _rows(picks: Sequence[Pick], types: Iterable[str], extra: Iterable[str]) -> 
     return rows
 
 
-def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int]) -> dict[str, statistics.Stats]:
+def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str, statistics.Stats]:
     """Return feature -> statistic -> values of all episodes, shape (E, ...): the old ones where nothing changed."""
     files: dict[tuple[int, Slot], tuple[dict[int, int], dict[str, statistics.Stats]]] = {}
     stacked: dict[str, dict[str, list[np.ndarray]]] = {}
-    for place, pick in enumerate(picks):
+    for place, pick in enumerate(plan.picks):
         slot = slot_of(pick.row, "meta/episodes")
         if (id(pick.source), slot) not in files:
-            order, stored = stored_stats(pick.source.root / layout.episodes_file(slot))
+            path = pick.source.root / layout.episodes_file(slot)
+            order, stored = stored_stats(path) if known is None else (range(len(pick.source.rows)), dict(known))
             files[id(pick.source), slot] = {index: place for place, index in enumerate(order)}, stored
         places, stored = files[id(pick.source), slot]
         index = places[pick.row["episode_index"]]
         own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
-        row, length = rows[place], pick.row["length"]
-        task = tasks[pick.row["tasks"][0]]
+        row = plan.rows[place]
         columns: dict[str, np.ndarray] = {
-            "episode_index": np.full(length, place),
+            "episode_index": np.full(row["length"], place),
             "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
-            "task_index": np.full(length, task) if len(pick.row["tasks"]) == 1 else _task_indexes(pick, tasks),
+            "task_index": plan.task_indexes(place),
             **pick.columns,
         }
+        columns |= _impossible(plan, place, own)
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
@@ -246,7 +263,7 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
                     f"The statistic {name} of {key} has {np.size(values[0])} numbers in one episode, and another "
                     "number of them in others. `lerobot-edit-dataset --operation.type recompute_stats` computes them."
                 )
-            if len(values) != len(picks):
+            if len(values) != len(plan.picks):
                 # Later files of LeRobot's would have more columns than these, and nothing would load any more.
                 raise DatasetMismatchError(
                     f"Only some of the datasets have the statistic {name} of {key}; there are others of before it came "
@@ -255,13 +272,24 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
     return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
 
 
-def _task_indexes(pick: Pick, tasks: Mapping[str, int]) -> np.ndarray:
-    """Return the new number of the instruction of every frame of an episode that has several."""
-    path = pick.source.root / layout.data_file(slot_of(pick.row, "data"))
-    table = read_frames(path, ["episode_index", "task_index"])
-    own = table["episode_index"].to_numpy() == pick.row["episode_index"]
-    renumbered = np.array([tasks.get(task, -1) for task in pick.source.tasks])
-    return renumbered[table["task_index"].to_numpy()[own]]
+def _impossible(plan: Plan, place: int, stats: Mapping[str, statistics.Stats]) -> dict[str, np.ndarray]:
+    """Return the columns of an episode whose stored standard deviation cannot be theirs, each of shape (T, d)."""
+    source, row = plan.picks[place].source, plan.picks[place].row
+    features = source.info["features"]
+    wrong = [
+        key
+        for key, stat in stats.items()
+        if key in features
+        and features[key]["dtype"] not in ("image", "video")
+        and len(features[key]["shape"]) == 1
+        and not statistics.are_possible(stat).all()
+    ]
+    if not wrong:
+        return {}
+    slot = slot_of(row, "data")
+    path, rows = source.root / layout.data_file(slot), plan.files.rows(source, "data")[slot]
+    frames = frames_of(path, rows, wrong)[row["episode_index"]]
+    return {key: to_numpy(frames[key], tuple(features[key]["shape"])) for key in wrong}
 
 
 def _edits_of(source: DatasetState) -> list[str]:

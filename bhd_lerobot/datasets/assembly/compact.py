@@ -13,14 +13,14 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
 from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format.columns import frames_of
 from bhd_lerobot.datasets.format.episode_table import stored_stats
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, write_meta
 from bhd_lerobot.datasets.format.schema import Schema, as_numpy
-from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots, read_frames, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock
-from bhd_lerobot.datasets.storage.layout import Slot
 
 EpisodeStats = dict[str, statistics.Stats]
 
@@ -54,7 +54,7 @@ def compact(
     if not rows or not (move_data or move_videos or not has_stats):
         return False
     with Workspace(state.root, disk, lock) as space:
-        stats = _all_stats(state, schema, known or {})
+        stats = episode_stats(state, schema, known or {})
         if move_data:
             link_others(state.root / "data", space.folder / "data", disk, "chunk-*/file-*.parquet")
             build_data(plan, data, space.folder, disk, take=disk.link, schema=schema.arrow)
@@ -89,8 +89,10 @@ def _build_meta(
     )
 
 
-def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeStats]) -> dict[str, statistics.Stats]:
-    """Return feature -> statistic -> values of all episodes, shape (E, ...)."""
+def episode_stats(
+    state: DatasetState, schema: Schema, known: Mapping[int, EpisodeStats]
+) -> dict[str, statistics.Stats]:
+    """Return feature -> statistic -> values of all episodes, shape (E, ...); see `compact`."""
     result: dict[str, statistics.Stats] = {}
     for key in [*schema.float_keys, *schema.videos]:
         width = (3, 1, 1) if key in schema.videos else tuple(schema.features[key]["shape"])
@@ -116,25 +118,23 @@ def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeS
                         raise corrupt(state.root / layout.episodes_file(slot), what)
                     result[key][name][[order[i] for i in places]] = values[places]
         unknown += [row for row in rows if row["episode_index"] in state.without_stats]
+    files = ordered_slots(state.rows, "data") if unknown else {}
     for slot, rows in ordered_slots(unknown, "data").items():
-        _stats_from_data(state, schema, slot, rows, result)
+        path = state.root / layout.data_file(slot)
+        frames = frames_of(path, files[slot], schema.float_keys)
+        for row in rows:
+            stats = _stats_from_data(schema, frames[row["episode_index"]], path)
+            _store(result, row["episode_index"], stats)
     return result
 
 
-def _stats_from_data(
-    state: DatasetState, schema: Schema, slot: Slot, rows: list[Row], result: dict[str, statistics.Stats]
-) -> None:
-    path = state.root / layout.data_file(slot)
+def _stats_from_data(schema: Schema, frames: pa.Table, path: Path) -> EpisodeStats:
     try:
         wanted = pa.schema([schema.arrow.field(key) for key in schema.float_keys])
-        table = read_frames(path, schema.float_keys).select(schema.float_keys).cast(wanted)
+        table = frames.select(schema.float_keys).cast(wanted)
     except (pa.ArrowException, ValueError) as error:
         raise corrupt(path, error) from error
-    first = min(row["dataset_from_index"] for row in state.rows if slot_of(row, "data") == slot)
-    columns = {key: as_numpy(table[key]) for key in schema.float_keys}
-    for row in rows:
-        span = slice(row["dataset_from_index"] - first, row["dataset_to_index"] - first)
-        _store(result, row["episode_index"], statistics.column_stats({k: v[span] for k, v in columns.items()}))
+    return statistics.column_stats({key: as_numpy(table[key]) for key in schema.float_keys})
 
 
 def _store(result: dict[str, statistics.Stats], episode: int, stats: EpisodeStats) -> None:

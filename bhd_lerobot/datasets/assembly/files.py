@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.assembly.picks import Group, Plan, Run
 from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.format.columns import NUMBERS, frames_of, numbers_of, wrong_number
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.datasets.format.state import corrupt, read_frames, slot_columns
 from bhd_lerobot.datasets.format.video_splice import Span, splice
@@ -67,7 +68,7 @@ def build_data(
         target = new / layout.data_file(group.target)
         disk.make_folder(target.parent)
         sources = [run.source.root / layout.data_file(run.slot) for run in group.runs]
-        if len(sources) == 1 and _is_same(group.runs[0], plan):
+        if len(sources) == 1 and _is_same(group.runs[0], sources[0], plan):
             take(sources[0], target)
         else:
             disk.write(target, b"")
@@ -139,17 +140,14 @@ def _groups(
     return groups
 
 
-def _is_same(run: Run, plan: Plan) -> bool:
-    """Return whether a data file can stay as it is."""
-    numbers = {task: index for index, task in enumerate(run.source.tasks)}
-    pairs = [(plan.picks[place], plan.rows[place]) for place in run.places]
-    return run.whole and all(
-        not pick.columns
-        and pick.row["episode_index"] == row["episode_index"]
-        and pick.row["dataset_from_index"] == row["dataset_from_index"]
-        and all(numbers.get(task) == plan.tasks.get(task) for task in row["tasks"])
-        for pick, row in pairs
-    )
+def _is_same(run: Run, path: Path, plan: Plan) -> bool:
+    """Return whether a data file can stay as it is: its frames have the numbers that they are to have."""
+    if not run.whole or any(plan.picks[place].columns for place in run.places):
+        return False
+    table = read_frames(path, [*NUMBERS, "task_index"])
+    tasks = np.concatenate([plan.task_indexes(place) for place in run.places])
+    is_numbered = not wrong_number(table, numbers_of([plan.rows[place] for place in run.places]))
+    return is_numbered and np.array_equal(table["task_index"].to_numpy(), tasks)
 
 
 def _schema(path: Path) -> pa.Schema:
@@ -161,25 +159,15 @@ def _schema(path: Path) -> pa.Schema:
 
 def _episodes(run: Run, path: Path, plan: Plan) -> Iterable[pa.Table]:
     """Yield the frames of each episode of a run, with their new numbers; readers fetch an episode as one row group."""
-    table = read_frames(path)
-    first = min(row["dataset_from_index"] for row in plan.files.rows(run.source, "data")[run.slot])
-    renumbered = np.array([plan.tasks.get(task, -1) for task in run.source.tasks])
+    frames = frames_of(path, plan.files.rows(run.source, "data")[run.slot])
     for place in run.places:
-        old, new, length = plan.picks[place].row, plan.rows[place], plan.rows[place]["length"]
-        part = table.slice(old["dataset_from_index"] - first, length)
-        if part.num_rows != length or part["episode_index"][0].as_py() != old["episode_index"]:
-            raise corrupt(path, f"the frames of episode {old['episode_index']} are not where they should be")
-        tasks = part["task_index"].to_numpy()
-        if tasks.min() < 0 or tasks.max() >= len(renumbered):
-            raise corrupt(path, f"episode {old['episode_index']} has an instruction that {layout.TASKS} does not have")
+        new, part = plan.rows[place], frames[plan.picks[place].row["episode_index"]]
         changed: dict[str, np.ndarray] = {
-            "episode_index": np.full(length, new["episode_index"]),
+            "episode_index": np.full(new["length"], new["episode_index"]),
             "index": np.arange(new["dataset_from_index"], new["dataset_to_index"]),
-            "task_index": renumbered[tasks],
+            "task_index": plan.task_indexes(place),
             **plan.picks[place].columns,
         }
-        if (changed["task_index"] < 0).any():
-            raise corrupt(path, f"episode {old['episode_index']} has an instruction that meta/episodes does not have")
         for name, values in changed.items():
             position = part.schema.get_field_index(name)
             part = part.set_column(position, part.schema.field(position), pa.array(values, part.schema.types[position]))

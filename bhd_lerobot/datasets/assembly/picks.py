@@ -5,8 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bhd_lerobot.datasets.format.columns import frames_of, instructions_of
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.layout import Slot
 
 
@@ -66,6 +69,7 @@ class Files:
         """Store the picks."""
         self._picks = picks
         self._rows: dict[tuple[int, str], dict[Slot, list[Row]]] = {}
+        self._tasks: dict[tuple[int, Slot], dict[int, tuple[NDArray[np.int64], list[str]]]] = {}
 
     def rows(self, source: DatasetState, kind: str) -> dict[Slot, list[Row]]:
         """Return the rows of every file of a kind (`slot_of`) in a dataset."""
@@ -73,6 +77,30 @@ class Files:
         if key not in self._rows:
             self._rows[key] = ordered_slots(source.rows, kind)
         return self._rows[key]
+
+    def task_indexes(self, pick: Pick) -> NDArray[np.int64]:
+        """Return the number of the instruction of each frame of an episode, shape (T,); see `instructions`."""
+        return self._of_frames(pick)[0]
+
+    def instructions(self, pick: Pick) -> list[str]:
+        """Return the instructions of an episode: those of its frames, whatever its row says.
+
+        Raises:
+            DatasetCorruptError: the data file cannot be read, or has a number that is no instruction's.
+        """
+        return self._of_frames(pick)[1]
+
+    def _of_frames(self, pick: Pick) -> tuple[NDArray[np.int64], list[str]]:
+        slot = slot_of(pick.row, "data")
+        key, path = (id(pick.source), slot), pick.source.root / layout.data_file(slot)
+        if key not in self._tasks:
+            rows = self.rows(pick.source, "data")[slot]
+            frames = frames_of(path, rows, ["task_index"])
+            found = [(row, frames[row["episode_index"]]["task_index"].to_numpy()) for row in rows]
+            self._tasks[key] = {
+                row["episode_index"]: (own, instructions_of(row, own, pick.source.tasks, path)) for row, own in found
+            }
+        return self._tasks[key][pick.row["episode_index"]]
 
     def runs(self, kind: str) -> Iterator[Run]:
         """Yield the runs of picks, in order."""
@@ -113,3 +141,11 @@ class Plan:
     tasks: Mapping[str, int]
     info: Mapping[str, Any]
     files: Files
+    _renumbered: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+
+    def task_indexes(self, place: int) -> NDArray[np.int64]:
+        """Return the new number of the instruction of each frame of an episode, shape (T,)."""
+        source = self.picks[place].source
+        if id(source) not in self._renumbered:
+            self._renumbered[id(source)] = np.array([self.tasks.get(task, -1) for task in source.tasks])
+        return self._renumbered[id(source)][self.files.task_indexes(self.picks[place])]

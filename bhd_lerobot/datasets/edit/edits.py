@@ -1,7 +1,6 @@
 """Other datasets out of datasets: merge several, keep some episodes, delete some, split one."""
 
 import contextlib
-import datetime
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike
+from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.format.identity import FORMAT
@@ -221,7 +220,7 @@ def rewrite(
             check_reported(root)
             state = _state_of(root)
             new, disk = change(state), Disk()
-            edit = _timed(new.edit)
+            edit = logged_now(new.edit)
             with (
                 write_errors(f"{edit['edit']} episodes", root, "The dataset is as it was."),
                 Workspace(root, disk, lock) as space,
@@ -308,7 +307,7 @@ def _fill(
         # Another program's dataset among them: then the whole was not recorded by this one.
         video = (identities[0] or {}).get("video", {})
         identity = {"format": FORMAT, "recording": {**recording, "edited": dict(edit)}, "video": video}
-    assemble(picks, folder, disk, edit=_timed(edit), identity=identity)
+    assemble(picks, folder, disk, edit=logged_now(edit), identity=identity)
 
 
 def _report(root: Path, picks: Sequence[Pick]) -> EditReport:
@@ -335,10 +334,6 @@ def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = Fals
             if of_one_type or "type" in options:
                 shared[name] = options
     return shared
-
-
-def _timed(edit: Mapping[str, Any]) -> dict[str, Any]:
-    return {"time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), **edit}
 
 
 def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:

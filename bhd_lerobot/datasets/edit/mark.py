@@ -11,9 +11,11 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.edit.edits import Change, EditReport, OnDone, check_episodes, rewrite
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import frames_of
 from bhd_lerobot.datasets.format.schema import as_numpy
-from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, read_frames, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
 from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.plugins import body_of
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
@@ -116,6 +118,7 @@ class _Changes:
         self.log: list[dict[str, Any]] = []
         self._state, self._outcome, self._intervention, self._clear = state, outcome, intervention, clear
         self._slots = ordered_slots(state.rows, "data")
+        self._frames: dict[tuple[Slot, str], dict[int, pa.Table]] = {}
         self._features = state.info["features"]
         # The meaning of the columns of another program is unknown.
         self._has_events = state.identity is not None and keys.EVENT in self._features
@@ -181,9 +184,9 @@ class _Changes:
     def _column(self, row: Row, key: str) -> np.ndarray:
         slot = slot_of(row, "data")
         path = self._state.root / layout.data_file(slot)
-        table = read_frames(path, [key])
-        first = row["dataset_from_index"] - self._slots[slot][0]["dataset_from_index"]
-        return as_numpy(table[key])[first : first + row["length"]].copy()
+        if (slot, key) not in self._frames:
+            self._frames = {(slot, key): frames_of(path, self._slots[slot], [key])}  # of one file: its episodes follow
+        return as_numpy(self._frames[slot, key][row["episode_index"]][key]).copy()
 
 
 def _interventions(row: Row) -> list[tuple[int, int, str]]:

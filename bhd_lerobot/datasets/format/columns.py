@@ -1,6 +1,11 @@
-"""Columns of episodes, straight from their Parquet files: all of one episode, or a few of many."""
+"""Columns of episodes, straight from their Parquet files, and the order in which frames have to lie in these.
 
-from collections.abc import Iterator, Sequence
+LeRobot takes frame i of a dataset for row i of all data files, sorted by their paths. Where files, or the rows in one,
+are in another order than their numbers, it serves frames of other episodes and reports nothing. Readers of this package
+go by the numbers.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +25,130 @@ from bhd_lerobot.datasets.format.state import (
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError
 
+NUMBERS = ("episode_index", "frame_index", "index")
+
+
+def numbers_of(rows: Sequence[Row]) -> dict[str, NDArray[np.int64]]:
+    """Return the numbers that the frames of a data file have to have, in order, each of shape (frames,).
+
+    Args:
+        rows: all episodes of the file, ascending.
+    """
+    lengths = np.array([row["length"] for row in rows], np.int64)
+    frame = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return {
+        "episode_index": np.repeat([row["episode_index"] for row in rows], lengths),
+        "frame_index": frame,
+        "index": np.repeat([row["dataset_from_index"] for row in rows], lengths) + frame,
+    }
+
+
+def order_of(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> NDArray[np.intp] | None:
+    """Return the rows of a data file in the order of their numbers; None if it does not hold these frames.
+
+    `index` follows from the others. It need not be right where they are in order, and else says whether they are to be
+    believed.
+
+    Args:
+        table: its columns, at least those of `NUMBERS`.
+        wanted: what they have to be, in order; see `numbers_of`.
+    """
+    got = {key: table[key].to_numpy() for key in NUMBERS}
+    if all(np.array_equal(got[key], wanted[key]) for key in ("episode_index", "frame_index")):
+        return np.arange(len(table))
+    order = np.lexsort((got["frame_index"], got["episode_index"]))
+    is_permuted = all(np.array_equal(got[key][order], wanted[key]) for key in NUMBERS)
+    return order if is_permuted else None
+
+
+def in_order(table: pa.Table, rows: Sequence[Row], path: Path) -> pa.Table:
+    """Return frames in the order of their numbers; the table itself if they are.
+
+    Args:
+        table: the frames, at least their numbers.
+        rows: the episodes whose frames they have to be, ascending.
+        path: the file that they were read from.
+
+    Raises:
+        DatasetCorruptError: they are others, or their numbers contradict each other.
+    """
+    wanted = numbers_of(rows)
+    order = order_of(table, wanted)
+    if order is None:
+        raise corrupt(path, wrong_number(table, wanted))
+    return table if np.array_equal(order, np.arange(len(table))) else table.take(order)
+
+
+def wrong_number(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> str:
+    """Return the first number that is not what it has to be, in words; empty if all are."""
+    frames = len(wanted["index"])
+    if len(table) != frames:
+        return f"it has {len(table)} frames; its episodes have {frames}"
+    for key, values in wanted.items():
+        got = table[key].to_numpy()
+        wrong = np.flatnonzero(got != values)
+        if len(wrong):
+            row = wrong[0]
+            return f"{key} is {got[row]} in row {row}, where meta/episodes has {values[row]}"
+    return ""
+
+
+def frames_of(path: Path, rows: Sequence[Row], columns: Sequence[str] | None = None) -> dict[int, pa.Table]:
+    """Return the frames of each episode of a data file, by its number.
+
+    Args:
+        path: the file.
+        rows: all episodes of the file, ascending.
+        columns: the columns that are needed; None for all.
+
+    Raises:
+        DatasetCorruptError: the file cannot be read, or does not hold the frames of these episodes.
+    """
+    table = read_frames(path, None if columns is None else list(dict.fromkeys((*NUMBERS, *columns))))
+    table = in_order(table, rows, path)
+    starts = np.cumsum([0, *(row["length"] for row in rows)]).tolist()
+    return {
+        row["episode_index"]: table.slice(start, row["length"]) for row, start in zip(rows, starts[:-1], strict=True)
+    }
+
+
+def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str], path: Path) -> list[str]:
+    """Return the instructions of the frames of an episode, each once, in the order in which its row names them.
+
+    If it does not name the same, in the order in which its frames have them.
+
+    Args:
+        row: of the episode.
+        task_index: number of the instruction of each frame, shape (T,).
+        tasks: the instructions in the order of their numbers.
+        path: the file of the frames.
+
+    Raises:
+        DatasetCorruptError: a number is no instruction's.
+    """
+    numbers, first = np.unique(task_index, return_index=True)
+    if numbers[0] < 0 or numbers[-1] >= len(tasks):
+        what = f"episode {row['episode_index']} has an instruction that {layout.TASKS} does not have"
+        raise corrupt(path, what)
+    words = list(dict.fromkeys(tasks[number] for number in numbers[np.argsort(first)]))
+    return row["tasks"] if set(row["tasks"]) == set(words) else words
+
+
+def wrong_order(slots: Sequence[layout.Slot]) -> str:
+    """Return in which way the data files do not have the order of the episodes; empty if they do.
+
+    Args:
+        slots: the file of each episode, in the order of the episodes.
+    """
+    names = [layout.data_file(slot) for slot in slots]
+    for episode in range(1, len(names)):
+        if names[episode] < names[episode - 1]:
+            return (
+                f"episode {episode} lies in {names[episode]}, which comes before {names[episode - 1]} of episode "
+                f"{episode - 1}"
+            )
+    return ""
+
 
 def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = None) -> list[dict[str, NDArray]]:
     """Return columns of scalars, by key, of one episode or of all, each of shape (frames,).
@@ -37,16 +166,12 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
     state = load_state(root)
     present = [key for key in keys if key in state.info["features"]]
     rows = state.rows if episode is None else [_row(state, episode)]
+    wanted = {slot_of(row, "data") for row in rows}
     result: dict[int, dict[str, NDArray]] = {}
-    for slot, inside in ordered_slots(rows, "data").items():
-        path = root / layout.data_file(slot)
-        table = read_frames(path, ["episode_index", *present])
-        indices = np.asarray(table["episode_index"])  # in ascending order, as LeRobot's format wants it
-        arrays = {key: np.asarray(table[key]) for key in present}
-        for row in inside:
-            index = row["episode_index"]
-            first, last = np.searchsorted(indices, [index, index + 1])
-            result[index] = {key: array[first:last] for key, array in arrays.items()}
+    for slot, inside in ordered_slots(state.rows, "data").items():
+        if slot in wanted:
+            for index, table in frames_of(root / layout.data_file(slot), inside, present).items():
+                result[index] = {key: np.asarray(table[key]) for key in present}
     return [result[row["episode_index"]] for row in rows]
 
 
@@ -63,13 +188,15 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
     """
     root = Path(root)
     state = load_state(root)
-    path = root / layout.data_file(slot_of(_row(state, index), "data"))
+    row = _row(state, index)
+    path = root / layout.data_file(slot_of(row, "data"))
     try:
         table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise corrupt(path, error) from error
+    table = in_order(table, [row], path)
     return {
-        key: _to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
+        key: to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
         for key in table.column_names
         if key in state.info["features"]
     }
@@ -83,7 +210,8 @@ def _row(state: DatasetState, index: int) -> Row:
     return state.rows[index]
 
 
-def _to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
+def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
+    """Return a column of a data file as an array of shape (T, *shape), or (T,) of scalars."""
     array = column.combine_chunks()
     if pa.types.is_list(array.type) and pa.types.is_struct(array.type.value_type):
         rows = np.empty(len(array), dtype=object)  # language: a list of rows for every frame

@@ -119,8 +119,8 @@ def wrong_types(schema: pa.Schema, cameras: Sequence[str]) -> str:
 def wrong_row(row: Mapping[str, Any], cameras: Sequence[str]) -> str:
     """Return what is wrong with the row of an episode in `meta/episodes`."""
     tasks = row.get("tasks")
-    if not isinstance(tasks, list) or not tasks or not all(isinstance(task, str) for task in tasks):
-        return "has no instruction"
+    if not isinstance(tasks, list) or not all(isinstance(task, str) for task in tasks):
+        return "has no list of instructions"
     for name in (*COUNTERS, "data/chunk_index", "data/file_index"):
         if not _is_counted(row.get(name), name):
             return f"has {row.get(name)!r} as {name}"

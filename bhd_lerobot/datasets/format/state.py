@@ -17,6 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.storage.places import check_links
+from bhd_lerobot.datasets.storage.pointers import not_fetched
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
 
 UNREADABLE = (OSError, pa.ArrowException, ValueError)
@@ -99,16 +100,20 @@ class DamagedFileError(DatasetCorruptError):
 
     Attributes:
         wrong: what is wrong with it, without a remedy.
+        reason: the same without the path.
         path: the file, or the folder that lacks it; None if there is none.
     """
 
     def __init__(self, message: str, path: Path | None = None, wrong: str | None = None) -> None:
         super().__init__(message)
         self.path, self.wrong = path, message if wrong is None else wrong
+        self.reason = self.wrong.removeprefix(f"{path} is corrupt: ")
 
 
-def corrupt(path: Path, reason: object) -> DamagedFileError:
-    """Return the error for a file that cannot be trusted."""
+def corrupt(path: Path, reason: object) -> DatasetError:
+    """Return the error for a file that cannot be trusted, or that was not fetched."""
+    if error := not_fetched(path.parent, [path]):
+        return error
     remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
     if path.as_posix().endswith(layout.INFO):
         remedy = repair_with_info(path.parents[1])
@@ -137,12 +142,13 @@ def no_dataset(root: Path) -> DatasetError:
     return DatasetError(message + hint)
 
 
-def load_state(root: Path, *, videos: bool = True) -> DatasetState:
+def load_state(root: Path, *, videos: bool = True, counted: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
 
     Args:
         root: the dataset.
         videos: whether videos must be there, too.
+        counted: whether ``info.json`` must count the frames that the episodes have.
 
     Reads file footers, not their pages: a damaged value inside a file is found by
     `bhd_lerobot.datasets.recovery.repair.repair`.
@@ -168,7 +174,7 @@ def load_state(root: Path, *, videos: bool = True) -> DatasetState:
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
-        _check_files(state, videos)
+        _check_files(state, videos, counted)
     return state
 
 
@@ -214,23 +220,35 @@ def load_info(root: Path) -> dict[str, Any]:
         raise corrupt(path, error) from error
 
 
-def read_tasks(path: Path) -> list[str]:
-    """Return the instructions in the order of their index.
+def numbered_tasks(path: Path) -> dict[int, str]:
+    """Return the instructions by their numbers, in the order of the file.
 
     Raises:
-        DatasetCorruptError: the file cannot be read.
+        DatasetCorruptError: the file cannot be read, or has a number twice or none.
     """
     try:
-        table = pq.ParquetFile(path).read(use_threads=False)
+        table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
         name = next(n for n in table.column_names if n != "task_index")
         tasks = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
     except (*UNREADABLE, KeyError, StopIteration, TypeError) as error:
         raise corrupt(path, error) from error
-    if table.num_rows != len(tasks) or tasks.keys() != set(range(len(tasks))):
-        raise corrupt(path, f"its numbers are not 0 to {table.num_rows - 1}, each once")
+    if table.num_rows != len(tasks) or not all(isinstance(number, int) and number >= 0 for number in tasks):
+        raise corrupt(path, "not every instruction has a number of its own, from 0 on")
     if not all(isinstance(task, str) for task in tasks.values()):
         raise corrupt(path, "not all of its instructions are texts")
+    return tasks
+
+
+def read_tasks(path: Path) -> list[str]:
+    """Return the instructions in the order of their numbers.
+
+    Raises:
+        DatasetCorruptError: the file cannot be read, or its numbers are not those of a list.
+    """
+    tasks = numbered_tasks(path)
+    if tasks.keys() != set(range(len(tasks))):
+        raise corrupt(path, f"its numbers are not 0 to {len(tasks) - 1}, each once")
     return [tasks[index] for index in range(len(tasks))]
 
 
@@ -298,14 +316,14 @@ def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, p
 _STRUCTURE = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
 
 
-def _check_files(state: DatasetState, videos: bool) -> None:
+def _check_files(state: DatasetState, videos: bool, counted: bool) -> None:
     start = 0
     for row in state.rows:
         if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
             path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))
             raise corrupt(path, f"episode {row['episode_index']} does not start at frame {start}")
         start += row["length"]
-    if start != state.info["total_frames"]:
+    if counted and start != state.info["total_frames"]:
         raise DatasetCorruptError(
             f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
             f"`bhd-data check {quoted(state.root)} --fix` corrects the count. Nothing was changed."

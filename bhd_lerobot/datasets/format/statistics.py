@@ -14,16 +14,19 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 _BLOCK = 32
+_SLACK = 1e-3  # relative, of limits and deviations that are rounded
 
 Stats = dict[str, np.ndarray]
 """Statistic name -> array: shape (d,) for columns, (3, 1, 1) for images, (1,) for the count."""
 
 
-def column_stats(columns: Mapping[str, np.ndarray]) -> dict[str, Stats]:
+def column_stats(columns: Mapping[str, np.ndarray], *, finite: bool = True) -> dict[str, Stats]:
     """Return the statistics of every numeric column of an episode.
 
     Args:
         columns: key -> array of shape (T,) or (T, d) with T > 0; bool, int64, float32 or float64.
+        finite: whether columns that a policy learns from must be finite; else the statistics are those of the finite
+            values.
 
     Returns:
         Statistics as float64 arrays of shape (d,); `count` is the number of frames.
@@ -46,7 +49,8 @@ def column_stats(columns: Mapping[str, np.ndarray]) -> dict[str, Stats]:
         for array, width in zip(arrays, widths, strict=True):
             rows[start : start + width] = array.T
             start += width
-        stats = _row_stats(rows, [key for key, width in zip(keys, widths, strict=True) for _ in range(width)])
+        owners = [key if finite else "" for key, width in zip(keys, widths, strict=True) for _ in range(width)]
+        stats = _row_stats(rows, owners)
         start = 0
         for key, width in zip(keys, widths, strict=True):
             result[key] = {name: values[start : start + width] for name, values in stats.items()}
@@ -142,6 +146,23 @@ def image_stats(histograms: np.ndarray) -> Stats:
     stats |= {name: (cumulated > _rank(share, pixels)).argmax(axis=1) for name, share in QUANTILES.items()}
     result = {name: (np.asarray(value, np.float64) / 255.0).reshape(3, 1, 1) for name, value in stats.items()}
     return {**result, "count": np.array([len(frames)])}
+
+
+def are_possible(stats: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which standard deviations any values between these limits can have, shape (d,).
+
+    Of n values from a to b that of a frame at each end is at least (b - a) / sqrt(2 n), and none is above (b - a) / 2.
+    LeRobot takes it as the mean of the squares minus the square of the mean, in single precision: far from zero nothing
+    of it is left, or much more than that. Numbers that do not change, or are not finite, are not judged.
+
+    Args:
+        stats: `min`, `max`, `std`, each of shape (d,), and `count`, of shape (1,).
+    """
+    with np.errstate(invalid="ignore"):
+        span = (stats["max"] - stats["min"]).astype(np.float64)
+        is_above = stats["std"] > span / 2 * (1 + _SLACK)
+        is_below = stats["std"] < span / np.sqrt(2 * stats["count"]) * (1 - _SLACK)
+    return ~((is_above | is_below) & (span > 0))
 
 
 def aggregate(stacked: Mapping[str, np.ndarray]) -> Stats:

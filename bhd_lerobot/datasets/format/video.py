@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.storage.pointers import not_fetched
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, FrameError, unknown_name
 
 
@@ -269,7 +270,7 @@ def stream_signature(path: Path) -> tuple[Any, ...]:
             codec = stream.codec_context
             signature = (codec.name, bytes(codec.extradata or b""), stream.height, stream.width, stream.time_base)
     except (av.error.FFmpegError, IndexError, OSError) as error:
-        raise DatasetCorruptError(
+        raise not_fetched(path.parent, [path]) or DatasetCorruptError(
             f"{path} is not a readable video ({error}). Restore this file from a copy; nothing was changed."
         ) from error
     return signature

@@ -1,25 +1,25 @@
 """Whether a policy can learn from a dataset, checked before training."""
 
 import difflib
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import torch
 
 from bhd_lerobot.datasets.loader.table import FrameTable
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, quoted
 
 
 def check(dataset: Any, keys: Collection[str]) -> None:
-    """Check that a dataset has the features that a policy learns from, and that all of their values are finite.
+    """Check that a policy can learn from a dataset: it has the features, all values are finite, and can be normalised.
 
     Args:
         dataset: a `TableDataset` or `LeRobotDataset`.
         keys: features that the policy reads or predicts.
 
     Raises:
-        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; the message names
-            episode, frame and feature.
+        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; or a standard deviation
+            is stored as 0 though its feature changes. The message names episode, frame and feature.
     """
     meta = dataset.meta
     if not dataset.num_frames:
@@ -32,25 +32,66 @@ def check(dataset: Any, keys: Collection[str]) -> None:
                 f"The policy needs the feature {key!r}, which {meta.root} does not have.{hint} It has: "
                 f"{', '.join(meta.features)}. Record with it, or leave it out of the policy's features."
             )
+    for key, values, place in _columns(dataset, keys):
+        finite = torch.isfinite(values)
+        if bool(finite.all()):
+            _check_deviation(meta, key, values)
+            continue
+        sample, element = (int(i) for i in (~finite).nonzero()[0])
+        raise DatasetError(
+            f"{meta.root}, {place(sample)}: {key!r}{_which(meta, key, element)} is {float(values[sample, element])}, "
+            f"and {int((~finite.all(1)).sum())} frames have such values. Leave their episodes out with "
+            "dataset.episodes, or record them again."
+        )
+
+
+def beyond(dataset: Any, key: str, low: str, high: str) -> float:
+    """Return the largest share of frames in which a number of a feature lies beyond two of its statistics, 0 to 1.
+
+    Args:
+        dataset: a `TableDataset` or `LeRobotDataset`.
+        key: the feature.
+        low: the lower statistic, such as `q01`.
+        high: the upper one.
+    """
+    stats = (dataset.meta.stats or {}).get(key, {})
+    if low not in stats or high not in stats:
+        return 0.0
+    least, most = (torch.as_tensor(stats[name]).reshape(-1) for name in (low, high))
+    shares = [0.0]
+    for _, values, _ in _columns(dataset, [key]):
+        shares += ((values < least) | (values > most)).float().mean(0).tolist()
+    return max(shares)
+
+
+def _columns(dataset: Any, keys: Collection[str]) -> Iterator[tuple[str, torch.Tensor, Callable[[int], str]]]:
+    """Yield the features that are real numbers: key, values of shape (N, d), and what names the place of a sample."""
     table, rows = getattr(dataset, "table", None), None
     if isinstance(table, FrameTable):
         rows = dataset.rows
     else:
-        table = FrameTable.open(meta, dataset.episodes, keys)
+        table = FrameTable.open(dataset.meta, dataset.episodes, keys)
     for key in keys:
         column = table.columns.get(key)
-        if column is None or not column.is_floating_point():
-            continue
-        values = (column if rows is None else column[rows]).reshape(dataset.num_frames, -1)
-        finite = torch.isfinite(values)
-        if bool(finite.all()):
-            continue
-        sample, element = (int(i) for i in (~finite).nonzero()[0])
-        row = sample if rows is None else int(rows[sample])
-        names = meta.features[key].get("names")
-        which = f" ({names[element]})" if isinstance(names, list) and len(names) == finite.shape[1] > 1 else ""
+        if column is not None and column.is_floating_point():
+            values = (column if rows is None else column[rows]).reshape(dataset.num_frames, -1)
+            yield key, values, lambda sample: table.place(sample if rows is None else int(rows[sample]))
+
+
+def _which(meta: Any, key: str, element: int) -> str:
+    names = meta.features[key].get("names")
+    return f" ({names[element]})" if isinstance(names, list) and len(names) > 1 and element < len(names) else ""
+
+
+def _check_deviation(meta: Any, key: str, values: torch.Tensor) -> None:
+    stored = torch.as_tensor((meta.stats or {}).get(key, {}).get("std", ())).reshape(-1)
+    if len(stored) != values.shape[1]:
+        return
+    low, high = values.aminmax(dim=0)
+    for element in ((stored == 0) & (high > low)).nonzero()[:1, 0].tolist():
+        name = f"{key!r}{_which(meta, key, element)}"
         raise DatasetError(
-            f"{meta.root}, {table.place(row)}: {key!r}{which} is {float(values[sample, element])}, and "
-            f"{int((~finite.all(1)).sum())} frames have such values. Leave their episodes out with dataset.episodes, "
-            "or record them again."
+            f"{meta.root}: the standard deviation of {name} is stored as 0, and its values go from "
+            f"{float(low[element]):.6g} to {float(high[element]):.6g}. A policy would divide by it. Run "
+            f"`bhd-data check --fix {quoted(meta.root)}`, which computes the statistics again."
         )

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from bhd_lerobot.datasets.loader.selection import EpisodeFilter, frame_weights, 
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import FrameTable, checked_episodes
 from bhd_lerobot.datasets.loader.table_dataset import TableDataset
-from bhd_lerobot.errors import ConfigError, DatasetError, MemoryBudgetError, UnsupportedDatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError, MemoryBudgetError, UnsupportedDatasetError, quoted
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -96,13 +97,11 @@ def make_loader(
         imagenet_stats(meta)
     if config.expert_action:
         expert_stats(meta)
-    whole, message = _in_memory(meta, chosen, config)
-    if message:
-        report(message)
+    whole, reason = _in_memory(meta, chosen, config)
 
     def load(part: Sequence[int], transforms: Any, choose: Callable[[Tensor, Tensor], Tensor], **order: Any) -> Loader:
         if whole is None:
-            dataset = _lerobot_dataset(meta, part, config, transforms)
+            dataset = _lerobot_dataset(meta, part, config, transforms, reason)
             columns = (dataset.hf_dataset.data.column(key) for key in ("index", "task_index"))
             index, task = (torch.from_numpy(column.to_numpy()[: len(dataset)].copy()) for column in columns)
         else:
@@ -125,6 +124,9 @@ def make_loader(
         drop_last=config.drop_last,
         weights=weights,
     )
+    message = reason and f"{reason}. LeRobot's own loader serves the same samples, decoding them anew every time."
+    if message:
+        report(message)
     rest = None
     if held_out:
         rest = load(held_out, None, lambda index, task: _per_task(task, config.max_eval_samples), seed=0, shuffle=False)
@@ -149,12 +151,12 @@ def _in_memory(
             meta=meta,
         )
     except (MemoryBudgetError, UnsupportedDatasetError) as error:
-        return None, f"{error}. LeRobot's own loader serves the same samples, decoding them anew every time."
+        return None, str(error)
     return dataset, ""
 
 
 def _lerobot_dataset(
-    meta: "LeRobotDatasetMetadata", episodes: Sequence[int], config: LoaderConfig, transforms: Any
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int], config: LoaderConfig, transforms: Any, reason: str
 ) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -170,11 +172,34 @@ def _lerobot_dataset(
         video_backend=config.video_backend,
         return_uint8=config.return_uint8,
     )
-    dataset.meta.stats = meta.stats
+    dataset.meta.stats, dataset.meta.tasks, dataset.meta.episodes = meta.stats, meta.tasks, meta.episodes
+    _check_positions(dataset, sorted(episodes), reason)
     if config.expert_action:
         frames = dataset.hf_dataset.remove_columns(ACTION)
         dataset.hf_dataset = frames.rename_column(EXPERT_ACTION, ACTION)
     return dataset
+
+
+def _check_positions(dataset: Any, episodes: Sequence[int], reason: str) -> None:
+    """Check that LeRobot's dataset finds the frames of a window: by their rows in the files, or by their numbers.
+
+    Raises:
+        DatasetError: it would serve frames of other episodes.
+    """
+    first, end = (np.asarray(dataset.meta.episodes[f"dataset_{one}_index"])[episodes] for one in ("from", "to"))
+    wanted = np.concatenate([np.arange(*span) for span in zip(first, end, strict=True)])
+    index = dataset.hf_dataset.data.column("index").to_numpy()
+    if dataset.episodes is None:  # by their rows
+        is_right = np.array_equal(wanted, np.arange(len(wanted))) and np.array_equal(index[: len(wanted)], wanted)
+    else:
+        is_right = np.array_equal(np.sort(index), wanted)
+    if not is_right:
+        root = dataset.meta.root
+        raise DatasetError(
+            f"{root} has to be read by LeRobot's own loader, because {reason}; and that one takes row i of the data "
+            "files for frame i, which it is not here: it would serve frames of other episodes. Run `bhd-data check "
+            f"--fix {quoted(root)}`, or raise budget_gib."
+        )
 
 
 def _first_frames(index: Tensor, meta: Any, drop_n_last_frames: int) -> Tensor:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.datasets.remote.hub_errors import explain
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -50,10 +51,11 @@ def local_metadata(
         meta = checked(Metadata(repo_id, root=root, revision=revision))
         wanted = episodes if select is None else select(meta)
         if _missing(meta, wanted):
-            meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta
+            meta = checked(LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta)
     except BhdError:
         raise
     except Exception as error:  # of the Hub's client, of the network, of LeRobot: all mean that it is not there
+        check_fetched(folder)
         if (folder / layout.INFO).is_file():
             found = "cannot be read"
         elif folder.is_dir():

@@ -41,14 +41,27 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
 
 
 def checked(meta: "LeRobotDatasetMetadata") -> "LeRobotDatasetMetadata":
-    """Return LeRobot's metadata if no name in them leads out of the dataset.
+    """Return LeRobot's metadata if no name in them leads out of the dataset, with all rows by their numbers.
+
+    LeRobot takes row i for instruction i, and for episode i.
 
     Raises:
-        DatasetCorruptError: one does.
+        DatasetCorruptError: a name does, or an episode or instruction is missing.
     """
     templates = {"data_path": meta.data_path, "video_path": meta.video_path}
     if wrong := wrong_info({"features": meta.features, **templates}):
         raise corrupt(Path(meta.root) / layout.INFO, wrong)
+    if meta.tasks is not None:
+        meta.tasks = meta.tasks.sort_values("task_index")
+        if not np.array_equal(meta.tasks["task_index"], np.arange(len(meta.tasks))):
+            raise corrupt(meta.root / layout.TASKS, f"its numbers are not 0 to {len(meta.tasks) - 1}, each once")
+    if meta.episodes is not None:
+        numbers = np.asarray(meta.episodes["episode_index"])
+        order = np.argsort(numbers, kind="stable")
+        if not np.array_equal(numbers[order][: meta.total_episodes], np.arange(meta.total_episodes)):
+            raise corrupt(meta.root / "meta/episodes", f"it does not describe episodes 0 to {meta.total_episodes - 1}")
+        if not np.array_equal(order, np.arange(len(order))):
+            meta.episodes = meta.episodes.select(order)
     return meta
 
 

@@ -131,11 +131,11 @@ class TableDataset:
 
     @property
     def absolute_to_relative_idx(self) -> dict[int, int] | None:
-        """Number of the frame in the whole dataset -> index of the sample; None if all episodes are selected."""
-        if self.episodes is None:
+        """Number of the frame in the whole dataset -> index of the sample; None if both are the same."""
+        index = self.table.columns["index"][self.rows]
+        if self.episodes is None and torch.equal(index, torch.arange(len(index))):
             return None
-        index = self.table.columns["index"][self.rows].tolist()
-        return dict(zip(index, range(len(index)), strict=True))
+        return dict(zip(index.tolist(), range(len(index)), strict=True))
 
     def set_image_transforms(self, image_transforms: Callable[[Tensor], Tensor] | None) -> None:
         """Replace the transform of the images."""

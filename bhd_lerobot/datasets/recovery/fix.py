@@ -1,37 +1,41 @@
 """`bhd-data check --fix`: repair what follows from the rest of a dataset, and nothing else.
 
-Statistics follow from the frames, and the number of frames from the episodes. What is damaged is for `repair`, and what
-is uncertain, such as a value that is out of range, is for a person.
+Statistics follow from the frames, the number of frames from the episodes, and the order of files, rows and
+instructions from their numbers. What is damaged is for `repair`, and what is uncertain, such as a value that is out of
+range, is for a person.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.assembly.compact import compact
+from bhd_lerobot.datasets.assembly.assemble import SORTED, assemble, logged_now
+from bhd_lerobot.datasets.assembly.compact import episode_stats
+from bhd_lerobot.datasets.assembly.picks import Pick
+from bhd_lerobot.datasets.format.columns import frames_of
 from bhd_lerobot.datasets.format.episode_table import stored_stats
 from bhd_lerobot.datasets.format.meta_files import write_meta
 from bhd_lerobot.datasets.format.schema import Schema
-from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_info, load_state, ordered_slots, read_frames
+from bhd_lerobot.datasets.format.state import DatasetState, load_info, load_state, ordered_slots
+from bhd_lerobot.datasets.format.statistics import Stats
 from bhd_lerobot.datasets.recovery.statistics import stats_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import Workspace, has_unfinished_episodes, link_others, real, remove_abandoned
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.datasets.validate.findings import Finding, Severity
+from bhd_lerobot.datasets.validate.findings import FIX, Finding, Severity
 
 
 def is_fixable(finding: Finding) -> bool:
-    """Return whether `fix` repairs what was found."""
-    if finding.severity is Severity.NOTE:
-        return False
-    return finding.check == "stats" or (finding.check == "counts" and finding.where == layout.INFO)
+    """Return whether `fix` repairs what was found: what its remedy says."""
+    return finding.severity is not Severity.NOTE and FIX in finding.remedy
 
 
 def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     """Repair what can be repaired, if everything that it follows from is valid; return a line for each thing.
+
+    A kill at any moment leaves either the old dataset or the new one.
 
     Args:
         root: the dataset.
@@ -45,56 +49,66 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     root = Path(root)
     wanted = [finding for finding in findings if is_fixable(finding)]
     remove_abandoned(real(root))
-    if has_unfinished_episodes(root):
-        return []  # an interrupted recording, which is for `repair`
     if not wanted or any(finding.severity is Severity.ERROR and not is_fixable(finding) for finding in findings):
         return []
-    disk = Disk()
     lock = RootLock(root)
-    done: list[str] = []
     try:
+        if has_unfinished_episodes(root):
+            return []  # an interrupted recording, which is for `repair`
         with write_errors("repair the dataset", root, "It is as it was."):
-            if any(finding.check == "counts" for finding in wanted):
-                done.append(_count_frames(root, disk))
-            if any(finding.check == "stats" for finding in wanted):
-                done.append(compute_stats(load_state(root), disk, lock))
-            disk.remove_tree(root / layout.STAGING)
+            order = any(finding.check != "stats" and finding.where != layout.INFO for finding in wanted)
+            stats = any(finding.check == "stats" for finding in wanted)
+            return rebuild(load_state(root, counted=False), Disk(), lock, order=order, stats=stats)
     finally:
         lock.release()
+
+
+def rebuild(state: DatasetState, disk: Disk, lock: RootLock, *, order: bool = False, stats: bool = False) -> list[str]:
+    """Count the frames, and write anew what follows from them, in one step; return a line for each thing.
+
+    Args:
+        state: what is on disk.
+        disk: how to write.
+        lock: of the dataset.
+        order: whether files, rows and instructions are put in the order of their numbers, and the frames numbered.
+        stats: whether the statistics of all episodes are computed.
+
+    Raises:
+        DatasetCorruptError: a file cannot be read.
+        OSError: a file cannot be written; the dataset is then as it was.
+    """
+    root, counted, done = state.root, load_info(state.root)["total_frames"], []
+    info = {**state.info, "total_frames": state.num_frames}
+    if counted != state.num_frames:
+        done.append(f"{layout.INFO}: total_frames is {state.num_frames}, as the episodes say; it was {counted}")
+    rows = [dict(row) for row in state.rows]
+    known = compute_stats(state) if stats or (order and state.without_stats) else None
+    with Workspace(root, disk, lock) as space:
+        new = space.folder
+        if order:
+            picks = [Pick(state, row) for row in state.rows]
+            edit = logged_now({"edit": SORTED, "episodes": list(range(state.num_episodes))})
+            assemble(picks, new, disk, in_place=True, edit=edit, identity=state.identity, known=known)
+            done.append("data, meta/episodes and meta/tasks.parquet: in the order of their numbers")
+        else:
+            skipped = ("episodes/chunk-*/file-*.parquet", "stats.json") if known is not None else ()
+            link_others(root / "meta", new / "meta", disk, "info.json", *skipped)
+            if known is not None:
+                write_meta(new, info, rows, state.metadata_types, known, disk=disk, extra=state.extra_types)
+            disk.write(new / layout.INFO, to_json(info))
+        if known is not None:
+            done.append(f"{layout.STATS} and meta/episodes: statistics of {len(rows)} episodes, from their frames")
+        space.publish(f"the correction of {root} had been completed")
+    disk.try_remove_tree(root / layout.STAGING)
     return done
 
 
-def _count_frames(root: Path, disk: Disk) -> str:
-    info = load_info(root)
-    frames = 0
-    for path in sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        try:
-            table = pq.ParquetFile(path).read(columns=["episode_index", "length"], use_threads=False)
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
-        rows = zip(table["episode_index"].to_pylist(), table["length"].to_pylist(), strict=True)
-        frames += sum(length for index, length in rows if index < info["total_episodes"])
-    before = info["total_frames"]
-    disk.publish(root / layout.INFO, to_json({**info, "total_frames": frames}), root / layout.STAGING)
-    return f"{layout.INFO}: total_frames is {frames}, as the episodes say; it was {before}"
-
-
-def compute_stats(state: DatasetState, disk: Disk, lock: RootLock) -> str:
-    """Compute the statistics of all episodes from their frames, store them, and return what was done in a line."""
+def compute_stats(state: DatasetState) -> Mapping[str, Stats]:
+    """Return feature -> statistic -> values of all episodes, shape (E, ...), computed from their frames."""
     if state.identity is not None:
         state.without_stats = set(range(state.num_episodes))
-        compact(state, Schema(state.info["features"]), disk, lock)
-    else:
-        rows = [dict(row) for row in state.rows]
-        depth = _stored_depth(state)
-        stats = stats_of(_tables(state), state.info["features"], state.root, rows, depth)
-        skipped = ("episodes/chunk-*/file-*.parquet", "stats.json")
-        with Workspace(state.root, disk, lock) as space:
-            new = space.folder
-            link_others(state.root / "meta", new / "meta", disk, *skipped)
-            write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, extra=state.extra_types)
-            space.publish(f"the statistics of {state.root} had been computed")
-    return f"{layout.STATS} and meta/episodes: statistics of {state.num_episodes} episodes, computed from their frames"
+        return episode_stats(state, Schema(state.info["features"]), {})
+    return stats_of(_tables(state), state.info["features"], state.root, state.rows, _stored_depth(state))
 
 
 def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]:
@@ -115,7 +129,5 @@ def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]
 def _tables(state: DatasetState) -> Iterator[pa.Table]:
     """Yield the frames of every episode."""
     for slot, rows in ordered_slots(state.rows, "data").items():
-        table = read_frames(state.root / layout.data_file(slot))
-        first = rows[0]["dataset_from_index"]
-        for row in rows:
-            yield table.slice(row["dataset_from_index"] - first, row["length"])
+        frames = frames_of(state.root / layout.data_file(slot), rows)
+        yield from (frames[row["episode_index"]] for row in rows)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from bhd_lerobot.datasets.assembly.assemble import EDITS
+from bhd_lerobot.datasets.assembly.assemble import EDITS, SORTED
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
@@ -96,7 +96,7 @@ def _marks(root: Path) -> tuple[dict[int, str], bool]:
             if edit["edit"] == "mark":
                 marks = {one["episode"]: one["outcome"][1] for one in edit["episodes"] if "outcome" in one}
                 outcomes |= {number: outcome for number, outcome in marks.items() if outcome in OUTCOMES}
-            elif edit["edit"] != RECOVERED or edit["episodes"] != list(range(len(edit["episodes"]))):
+            elif edit["edit"] not in (RECOVERED, SORTED) or edit["episodes"] != list(range(len(edit["episodes"]))):
                 is_older |= bool(outcomes)
                 outcomes = {}
         except (ValueError, KeyError, TypeError, IndexError):

@@ -3,11 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.assembly.compact import compact
 from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.format.columns import NUMBERS, numbers_of, wrong_number
 from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off, is_parquet
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import (
@@ -18,17 +20,22 @@ from bhd_lerobot.datasets.format.state import (
     load_state,
     no_dataset,
     ordered_slots,
+    read_frames,
     read_json,
     slot_of,
 )
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
-from bhd_lerobot.datasets.recovery.fix import compute_stats
+from bhd_lerobot.datasets.recovery.fix import is_fixable, rebuild
 from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
 from bhd_lerobot.datasets.recovery.salvage import RepairReport, salvage
 from bhd_lerobot.datasets.recovery.videos import whole_frames
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
+from bhd_lerobot.datasets.storage.atomic import clean, real, remove_abandoned, roll_forward
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
+from bhd_lerobot.datasets.storage.pointers import check_fetched
+from bhd_lerobot.datasets.validate.files import read_files
+from bhd_lerobot.datasets.validate.findings import Findings
+from bhd_lerobot.datasets.validate.order import check_numbers
 from bhd_lerobot.errors import DatasetCorruptError
 
 
@@ -42,13 +49,14 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
     Raises:
         DatasetLockedError: it is being recorded at this moment.
         DatasetCorruptError: files are damaged and no whole episode can be recovered; nothing was changed then.
-        DatasetError: there is no dataset at `root`, or one of its files cannot be read.
+        DatasetError: there is no dataset at `root`, or one of its files cannot be read, or was not fetched.
         ConfigError: `info` is not needed, cannot be read or describes other data.
         DatasetWriteError: the disk refuses the repaired files.
     """
     root = Path(root)
     if not root.is_dir():
         raise no_dataset(root)
+    check_fetched(root)
     lock = RootLock(root)
     try:
         disk = Disk()
@@ -76,6 +84,7 @@ def _repair_own(root: Path, disk: Disk, lock: RootLock) -> RepairReport:
                 what = f"compaction and statistics of {len(state.without_stats)} episodes"
                 disk.remove_tree(root / layout.STAGING)
                 report = replace(report, completed=(*report.completed, what))
+            report = _in_order(root, disk, lock, report)
     except DamagedFileError as error:
         # These two nothing else can replace: what the columns are, and who recorded it how.
         if error.path in (root / layout.INFO, root / layout.IDENTITY):
@@ -108,6 +117,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
     consequence = "Its files are as they were."
     with write_errors("repair the dataset", root, consequence):
         roll_forward(root, disk)
+        clean(root)
         adopted, saved = adopt_info(root, donor, disk)
     try:
         report = _repair_foreign(root, disk, lock, adopted)
@@ -135,11 +145,23 @@ def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> 
         _check_readable(state)
     except DatasetCorruptError as error:
         return _salvaged(root, disk, lock, error, completed)
-    if state.rows and not _has_stats(root):
-        with write_errors("repair the dataset", root, "Its files are as they were."):
-            completed = (*completed, compute_stats(state, disk, lock))
-            disk.remove_tree(root / layout.STAGING)
-    return RepairReport(root, state.num_episodes, state.num_frames, completed)
+    with write_errors("repair the dataset", root, "Its files are as they were."):
+        if state.rows and not _has_stats(root):
+            completed = (*completed, *rebuild(state, disk, lock, stats=True))
+        return _in_order(root, disk, lock, RepairReport(root, state.num_episodes, state.num_frames, completed))
+
+
+def _in_order(root: Path, disk: Disk, lock: RootLock, report: RepairReport) -> RepairReport:
+    """Put files, rows, frames and instructions in the order of their numbers, if they are in another one."""
+    findings = Findings()
+    files = read_files(root, findings)
+    for slot, positions in files.slots("data").items():
+        path = root / layout.data_file(slot)
+        table = read_frames(path, [*NUMBERS, "task_index"])
+        check_numbers(path, table, files.rows(positions), files.tasks, findings)
+    if not any(is_fixable(finding) and finding.check != "stats" for finding in findings):
+        return report
+    return replace(report, completed=(*report.completed, *rebuild(load_state(root), disk, lock, order=True)))
 
 
 def unfinished_files(root: Path) -> list[Path]:
@@ -168,8 +190,7 @@ def _has_stats(root: Path) -> bool:
 
 def _check_readable(state: DatasetState) -> None:
     """Check that all frames of all episodes can be read, where their rows say that they are."""
-    for slot in ordered_slots(state.rows, "data"):
-        _check_data(state.root / layout.data_file(slot))
+    _check_data(state)
     for key in state.video_keys:
         kind = f"videos/{key}"
         for slot, rows in ordered_slots(state.rows, kind).items():
@@ -194,6 +215,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     Raises:
         DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
     """
+    check_fetched(root)
     remove_abandoned(real(root))
     completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
     state = load_state(root)
@@ -216,8 +238,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
 
 
 def _check_deeply(state: DatasetState) -> None:
-    for slot in ordered_slots(state.rows, "data"):
-        _check_data(state.root / layout.data_file(slot))
+    _check_data(state)
     for key in state.video_keys:
         for slot, rows in ordered_slots(state.rows, f"videos/{key}").items():
             path = state.root / layout.video_file(key, slot)
@@ -230,10 +251,16 @@ def _check_deeply(state: DatasetState) -> None:
                 raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
 
 
-def _check_data(path: Path) -> None:
-    try:
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-        for group in range(file.num_row_groups):
-            file.read_row_group(group, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(path, error) from error
+def _check_data(state: DatasetState) -> None:
+    """Check that every data file can be read to its last page, and holds the frames of its episodes."""
+    for slot, rows in ordered_slots(state.rows, "data").items():
+        path = state.root / layout.data_file(slot)
+        try:
+            file = pq.ParquetFile(path, page_checksum_verification=True)
+            for group in range(file.num_row_groups):
+                file.read_row_group(group, use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        table, wanted = read_frames(path, list(NUMBERS)), numbers_of(rows)
+        if not np.array_equal(np.sort(table["episode_index"].to_numpy()), wanted["episode_index"]):
+            raise corrupt(path, wrong_number(table, wanted))

@@ -229,13 +229,13 @@ def _frames(root: Path, info: dict[str, Any], findings: Findings) -> tuple[list[
         table = table.select(schema.names)
         if not table.schema.metadata:
             table = table.replace_schema_metadata(schema.metadata)
-        for number, part in _episodes(table):
+        for number, part in _episodes(_sorted(table)):
             frames = part["frame_index"].to_numpy()
             if np.array_equal(frames, np.arange(len(frames))):
                 found.append(FoundEpisode(number, part))
             else:
                 findings.error("counts", name, f"episode {number}, whose frames are not numbered from 0 on")
-    return found, surplus, is_torn
+    return sorted(found, key=lambda episode: episode.number), surplus, is_torn
 
 
 def shapes_of(info: dict[str, Any]) -> dict[str, Sequence[int]]:
@@ -269,6 +269,14 @@ def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
     begins = np.flatnonzero((np.diff(numbers, prepend=-1) != 0) | (table["frame_index"].to_numpy() == 0))
     for start, end in zip(begins, [*begins[1:], len(numbers)], strict=True):
         yield int(numbers[start]), table.slice(start, end - start)
+
+
+def _sorted(table: pa.Table) -> pa.Table:
+    """Return frames in the order of their numbers, if all of these agree on one and no frame is there twice."""
+    order = np.lexsort((table["frame_index"].to_numpy(), table["episode_index"].to_numpy()))
+    index = table["index"].to_numpy()[order]
+    is_permuted = (np.diff(order) < 0).any() and (np.diff(index) > 0).all()
+    return table.take(order) if is_permuted else table
 
 
 def _keep_aside(root: Path, disk: Disk) -> Path:

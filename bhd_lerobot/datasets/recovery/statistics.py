@@ -1,4 +1,4 @@
-"""Statistics of what another program recorded: of columns by LeRobot's function, of images from the images."""
+"""Statistics of what another program recorded: exact, of images from the images, of matrices by LeRobot's function."""
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -40,7 +40,8 @@ def stats_of(
     stacked: dict[str, dict[str, list[np.ndarray]]] = {}
     for table, row in zip(episodes, rows, strict=True):
         columns = {key: _array(table, key, feature["shape"]) for key, feature in plain.items()}
-        own = dict(compute_episode_stats(columns, plain))
+        matrices = {key: columns.pop(key).astype(np.float64) for key in list(columns) if columns[key].ndim > 2}
+        own = {**statistics.column_stats(columns, finite=False), **compute_episode_stats(matrices, plain)}
         known = {} if stored is None else stored[row["episode_index"]]
         for key, feature in features.items():
             if feature["dtype"] not in ("video", "image"):

@@ -15,6 +15,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.storage.places import check_inside
+from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
 
 _TEMPORARY = ("images",)  # LeRobot's own, of frames whose video is not encoded yet
@@ -81,6 +82,7 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
                 f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all "
                 "of it first, or make a dataset of its own of these episodes."
             )
+        check_fetched(root)
         state = load_state(root)
         _refuse_unfinished(state)
         names, left_out = _files(state, stamps)

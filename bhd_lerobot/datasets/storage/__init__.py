@@ -1,3 +1,3 @@
 """Paths, locks and changes that are complete or not there."""
 
-__all__ = ["atomic", "disk", "layout", "places"]
+__all__ = ["atomic", "disk", "layout", "places", "pointers"]

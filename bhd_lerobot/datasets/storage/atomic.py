@@ -233,7 +233,7 @@ def remove_abandoned(place: Path) -> None:
         if ours.fullmatch(folder.name):
             with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(folder)):
                 shutil.rmtree(folder)
-    if os.path.isdir(place / layout.STAGING) and _names(place / layout.STAGING) <= {WORK.name}:
+    if os.path.isdir(place / layout.STAGING) and _kept(place) <= {WORK.name}:
         with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(place)):
             _clean_inside(place)
 
@@ -245,8 +245,11 @@ def clean(place: Path) -> None:
 
 
 def has_unfinished_episodes(root: Path) -> bool:
-    """Return whether a staging folder holds episodes that a recorder has not saved: anything but workspaces."""
-    return bool(_names(root / layout.STAGING) - _WORKSPACES)
+    """Return whether a staging folder holds episodes that a recorder has not saved.
+
+    That is anything but workspaces, and files that were being written to replace another one.
+    """
+    return bool(_kept(root) - _WORKSPACES)
 
 
 def is_decided(place: Path) -> bool:
@@ -442,6 +445,8 @@ def _clean_inside(place: Path) -> None:
     if not is_decided(place) and not (place / layout.STAGING).is_symlink():
         Disk().try_remove_tree(place / WORK)
         with contextlib.suppress(OSError):
+            for name in _names(place / layout.STAGING) - _kept(place):
+                (place / layout.STAGING / name).unlink()
             (place / layout.STAGING).rmdir()
 
 
@@ -533,6 +538,11 @@ def _make_shell(place: Path) -> tuple[Path, RootLock]:
 
 def _prefix(place: Path) -> str:
     return f".{place.name}.bhd-"
+
+
+def _kept(place: Path) -> set[str]:
+    """Return what is in a staging folder, but for the files that `Disk.publish` did not come to rename."""
+    return {name for name in _names(place / layout.STAGING) if not (name.startswith(".") and name.endswith(".part"))}
 
 
 def _names(folder: Path) -> set[str]:

@@ -30,11 +30,15 @@ Slot = tuple[int, int]
 
 
 def next_slot(slot: Slot | None, chunks_size: int) -> Slot:
-    """Return the slot after `slot`, or the first one if `slot` is None."""
+    """Return the slot after `slot`, or the first one if `slot` is None.
+
+    A chunk has at most 1000 files, whatever `chunks_size` says: LeRobot sorts their names, and file-1000 comes before
+    file-999.
+    """
     if slot is None:
         return 0, 0
     chunk, file = slot
-    return (chunk, file + 1) if file + 1 < chunks_size else (chunk + 1, 0)
+    return (chunk, file + 1) if file + 1 < min(chunks_size, CHUNKS_SIZE) else (chunk + 1, 0)
 
 
 def data_file(slot: Slot) -> str:

@@ -1,3 +1,3 @@
 """Whether a dataset is valid."""
 
-__all__ = ["dataset", "files", "findings", "frozen", "statistics", "steps", "values"]
+__all__ = ["dataset", "files", "findings", "frozen", "order", "statistics", "steps", "values"]

@@ -11,6 +11,7 @@ from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.format.episode_table import PREFIX
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, read_files
 from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
 from bhd_lerobot.datasets.validate.values import Limits, ValueCheck
@@ -21,6 +22,7 @@ CHECKS = {
     "schema": "features, their shapes, names and columns",
     "files": "every file is there, and can be read to its last page",
     "counts": "meta/info.json, meta/episodes and the data files agree",
+    "order": "files, frames and instructions lie in the order of their numbers, by which LeRobot finds them",
     "stats": "statistics are there, and are those of the data",
     "video": "every video has as many frames as its episodes",
     "finite": "no NaN, no infinity, nothing missing",
@@ -75,10 +77,11 @@ def check_dataset(
         videos: read the videos, too, which takes longer than all the rest.
 
     Raises:
-        DatasetError: there is no dataset, or its `meta/info.json` cannot be read.
+        DatasetError: there is no dataset, its `meta/info.json` cannot be read, or files of it were not fetched.
     """
     findings = Findings()
     complete_interrupted(Path(root))
+    check_fetched(Path(root))
     files = read_files(Path(root), findings)
     robot = files.info.get("robot_type")
     if not files.info["total_episodes"]:

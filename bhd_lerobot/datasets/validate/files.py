@@ -18,11 +18,19 @@ from bhd_lerobot.datasets.format.expected import wrong_types
 from bhd_lerobot.datasets.format.info import InfoError, parse_object, read_info, wrong_feature
 from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
-from bhd_lerobot.datasets.format.state import UNREADABLE, no_dataset, repair_with_info
+from bhd_lerobot.datasets.format.state import (
+    UNREADABLE,
+    DamagedFileError,
+    Row,
+    no_dataset,
+    numbered_tasks,
+    repair_with_info,
+)
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.atomic import WORK, is_decided
+from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, is_decided
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import Findings, few, one_line
+from bhd_lerobot.datasets.validate.findings import FIX, Findings, few, one_line
+from bhd_lerobot.datasets.validate.order import SORTS, check_order
 from bhd_lerobot.datasets.validate.statistics import UNREAD
 from bhd_lerobot.errors import DatasetError
 
@@ -45,8 +53,9 @@ class Files:
         root: the dataset.
         info: `meta/info.json`.
         episodes: columns of `meta/episodes` by name, one entry for each episode, in order, without statistics.
+        described: the number of the episode of each row of `meta/episodes`, in the order of the files.
         stats: `meta/stats.json`, by feature and name, flat; what is missing there, or no numbers, is not here.
-        tasks: how many instructions there are.
+        tasks: the instructions in the order of their numbers; none if these are not those of a list.
         is_ours: whether this package recorded it.
         has_stats: whether the statistics of every single episode are stored.
     """
@@ -54,8 +63,9 @@ class Files:
     root: Path
     info: dict[str, Any]
     episodes: dict[str, list[Any]] = field(default_factory=dict)
+    described: list[int] = field(default_factory=list)
     stats: dict[str, dict[str, NDArray[np.float64]]] = field(default_factory=dict)
-    tasks: int = 0
+    tasks: list[str] = field(default_factory=list)
     is_ours: bool = False
     has_stats: bool = True
 
@@ -74,11 +84,20 @@ class Files:
         """Features that are videos."""
         return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
+    def places(self, kind: str) -> list[layout.Slot]:
+        """Return the file of each episode, of one kind: `data` or `videos/KEY`."""
+        chunks, files = (self.episodes.get(f"{kind}/{name}_index", []) for name in ("chunk", "file"))
+        return list(zip(chunks, files, strict=True))
+
+    def rows(self, positions: NDArray[np.int64]) -> list[Row]:
+        """Return what `meta/episodes` says of some episodes' frames."""
+        names = ("episode_index", "length", "dataset_from_index", "tasks")
+        return [{name: self.episodes[name][position] for name in names} for position in positions]
+
     def slots(self, kind: str) -> dict[layout.Slot, NDArray[np.int64]]:
         """Return the files of one kind, `data` or `videos/KEY`, each with the positions of its episodes."""
         places: dict[layout.Slot, list[int]] = {}
-        chunks, files = (self.episodes.get(f"{kind}/{name}_index", []) for name in ("chunk", "file"))
-        for position, slot in enumerate(zip(chunks, files, strict=True)):
+        for position, slot in enumerate(self.places(kind)):
             places.setdefault(slot, []).append(position)
         return {slot: np.array(found) for slot, found in places.items()}
 
@@ -99,6 +118,7 @@ def read_files(root: Path, findings: Findings) -> Files:
     _read_episodes(files, findings)
     _check_counts(files, findings)
     _check_names(files, findings)
+    check_order(root, files.places("data"), files.described, findings)
     _read_stats(files, findings)
     return files
 
@@ -134,18 +154,21 @@ def _read_tasks(files: Files, findings: Findings) -> None:
     if not path.is_file() and not files.info["total_episodes"]:
         return
     try:
-        # All columns, though one is checked: the checksums of the pages show other damage.
-        table = pq.ParquetFile(path, page_checksum_verification=True).read()
-        indices = table["task_index"].to_pylist()
-        are_numbered = set(indices) == set(range(len(indices)))
-    except (*UNREADABLE, KeyError, TypeError) as error:
-        findings.error("files", layout.TASKS, f"it cannot be read: {one_line(error)}", _COPY)
+        tasks = numbered_tasks(path)
+    except DamagedFileError as error:
+        findings.error("files", layout.TASKS, f"it cannot be read: {error.reason}", _COPY)
         return
-    files.tasks = len(indices)
-    if not are_numbered:
-        findings.error("counts", layout.TASKS, f"its numbers are not 0 to {len(indices) - 1}, each once", _COPY)
-    elif files.tasks < files.info["total_tasks"]:
-        what = f"it holds {files.tasks} instructions; meta/info.json counts {files.info['total_tasks']}"
+    numbers = list(tasks)
+    if sorted(numbers) != list(range(len(numbers))):
+        what = f"its numbers are {few(numbers)}; they have to be 0 to {len(numbers) - 1}, for LeRobot counts rows"
+        findings.error("counts", layout.TASKS, what, "bhd-data repair numbers the instructions again.")
+        return
+    files.tasks = [tasks[number] for number in range(len(tasks))]
+    if numbers != sorted(numbers):
+        what = f"its rows have the numbers {few(numbers)}; LeRobot takes row i for that of number i"
+        findings.error("order", layout.TASKS, what, SORTS)
+    if len(tasks) < files.info["total_tasks"]:
+        what = f"it holds {len(tasks)} instructions; meta/info.json counts {files.info['total_tasks']}"
         findings.error("counts", layout.TASKS, what, _COPY)
 
 
@@ -181,6 +204,7 @@ def _read_episodes(files: Files, findings: Findings) -> None:
     # An episode that info.json does not count yet was being saved when the recording was cut off.
     keep = set.intersection(*(set(part) for part in parts))
     rows: dict[int, tuple[dict[str, list[Any]], int]] = {}
+    files.described = [index for part in parts for index in part["episode_index"]]
     for part in parts:
         for position, index in enumerate(part["episode_index"]):
             if index in rows:
@@ -207,13 +231,13 @@ def _check_counts(files: Files, findings: Findings) -> None:
         number = episodes["episode_index"][index]
         what = f"episode {number} has {length[index]} frames, from {first[index]} to {last[index]}"
         findings.error("counts", "meta/episodes", what, _COPY)
-    gaps = np.flatnonzero(first[1:] != last[:-1]) + 1
-    for index in gaps[:3]:
-        what = f"episode {episodes['episode_index'][index]} starts at frame {first[index]}, not at {last[index - 1]}"
+    begins = np.concatenate([[0], last[:-1]])
+    for index in np.flatnonzero(first != begins)[:3]:
+        what = f"episode {episodes['episode_index'][index]} starts at frame {first[index]}, not at {begins[index]}"
         findings.error("counts", "meta/episodes", what, _COPY)
     if length.sum() != files.info["total_frames"]:
         what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
-        findings.error("counts", layout.INFO, what, "bhd-data check --fix counts them.")
+        findings.error("counts", layout.INFO, what, f"{FIX} counts them.")
 
 
 def _check_names(files: Files, findings: Findings) -> None:
@@ -254,7 +278,7 @@ def _interrupted(files: Files) -> tuple[str, str]:
             "bhd-data repair completes it.",
         )
     is_whole = not files.is_ours or (bool(files.episodes) and files.has_stats)
-    if is_whole and {path.name for path in (files.root / layout.STAGING).iterdir()} == {WORK.name}:
+    if is_whole and not has_unfinished_episodes(files.root):
         # A recording whose files are being merged has episodes without statistics.
         return "an edit was interrupted; nothing of it was done", "bhd-data repair drops it. Repeat the edit."
     what = "a recording was interrupted; what it saved is complete, and not yet merged"
@@ -263,8 +287,7 @@ def _interrupted(files: Files) -> tuple[str, str]:
 
 def stats_remedy(files: Files) -> str:
     """Return what computes missing or wrong statistics."""
-    unfinished = (files.root / layout.STAGING).exists()
-    return "bhd-data repair computes them." if unfinished else "bhd-data check --fix computes them."
+    return f"{'bhd-data repair' if has_unfinished_episodes(files.root) else FIX} computes them."
 
 
 def _read_stats(files: Files, findings: Findings) -> None:

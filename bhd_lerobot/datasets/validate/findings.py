@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+FIX = "bhd-data check --fix"
+"""Of remedies: what the command corrects by itself."""
+
 
 class Severity(IntEnum):
     """How bad a finding is."""

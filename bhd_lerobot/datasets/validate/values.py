@@ -16,18 +16,19 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.expected import wrong_columns
+from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
 from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
 from bhd_lerobot.datasets.validate.frozen import FrozenCheck
-from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_statistic
+from bhd_lerobot.datasets.validate.order import check_numbers
+from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_deviations, wrong_statistic
 from bhd_lerobot.datasets.validate.steps import StepCheck
 
 Limits = Mapping[str, Mapping[str, tuple[float, float]]]
 """Feature -> name of one of its numbers -> least and largest value."""
 
 _TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
-_INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 _LEAVE = "Leave the episode out (dataset.episodes), or record it again."
 _MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # these should change; the environment state often does not, by design
 _LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
@@ -71,8 +72,8 @@ class ValueCheck:
                 table = tables.popleft().result()
                 if following is not None:
                     tables.append(reader.submit(self._read, following[0]))
-                if table is not None and self._check_rows(name, table, positions):
-                    self._check_table(table)
+                if table is not None and (table := self._in_order(name, table, positions)) is not None:
+                    self._check_table(table.select([key for key in table.column_names if key in self._files.features]))
         self._judge_columns()
         self._frozen.judge(self._findings)
         self._steps.judge(self._findings)
@@ -105,60 +106,38 @@ class ValueCheck:
                 self._findings.warning(
                     "schema", name, f"meta/info.json knows no {few(extra)}", "Programs leave it out."
                 )
-            return file.read(columns=stored)
+            return file.read(columns=list(dict.fromkeys((*stored, *DEFAULT_FEATURES))))
         except (OSError, pa.ArrowException, ValueError) as error:
             self._findings.error("files", name, f"it cannot be read: {one_line(error)}", RESTORE)
             return None
 
-    def _check_rows(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> bool:
-        """Check that the rows are those of these episodes, in order; return whether they are."""
-        episodes = self._files.episodes
-        wanted = np.array([episodes["episode_index"][i] for i in positions])
-        lengths = np.array([episodes["length"][i] for i in positions])
-        starts = np.array([episodes["dataset_from_index"][i] for i in positions])
-        if (lengths < 1).any():
-            return False  # reported already, of meta/episodes
-        if len(table) != lengths.sum():
-            what = f"it has {len(table)} frames; its episodes have {lengths.sum()}"
-            self._findings.error("counts", name, what, "bhd-data repair, or restore it from a copy.")
-            return False
-        got = {key: table[key].to_numpy() for key in _INDEX if key in table.column_names}
-        frame = np.arange(len(table)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        expected = {
-            "episode_index": np.repeat(wanted, lengths),
-            "frame_index": frame,
-            "index": np.repeat(starts, lengths) + frame,
-        }
-        for key, values in expected.items():
-            wrong: NDArray[np.intp] = np.flatnonzero(got[key] != values) if key in got else np.zeros(0, np.intp)
-            if len(wrong):
-                row = wrong[0]
-                what = f"{key} is {got[key][row]} in row {row}, where meta/episodes has {values[row]}"
-                self._findings.error("counts", name, what, "Restore the file, or meta/episodes, from a copy.")
-                return False
-        self._check_times(name, got, frame)
-        self._episodes += wanted.tolist()
-        self._lengths += lengths.tolist()
-        return True
+    def _in_order(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> pa.Table | None:
+        """Return the frames in the order of their numbers; None if they are not those of these episodes."""
+        rows = self._files.rows(positions)
+        if any(row["length"] < 1 for row in rows):
+            return None  # reported already, of meta/episodes
+        order = check_numbers(self._files.root / name, table, rows, self._files.tasks, self._findings)
+        if order is None:
+            return None
+        if (np.diff(order) < 0).any():
+            table = table.take(order)
+        self._check_times(name, table)
+        self._episodes += [row["episode_index"] for row in rows]
+        self._lengths += [row["length"] for row in rows]
+        return table
 
-    def _check_times(self, name: str, got: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]) -> None:
-        fps = self._files.fps
-        if "timestamp" in got:
-            off = np.abs(got["timestamp"] - frame / fps)
-            # Single precision cannot say it better after a while.
-            wrong = np.flatnonzero(~(off <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * frame / fps)))
-            if len(wrong):
-                row = wrong[0]
-                what = (
-                    f"{len(wrong)} timestamps are not frame_index / fps; the first in episode "
-                    f"{got['episode_index'][row]}, frame {frame[row]}: {got['timestamp'][row]:.6g} s"
-                )
-                self._findings.error("timing", name, what, "LeRobot refuses to load it; record it again.")
-        if "task_index" in got and self._files.tasks:
-            wrong = np.flatnonzero((got["task_index"] < 0) | (got["task_index"] >= self._files.tasks))
-            if len(wrong):
-                what = f"task_index is {got['task_index'][wrong[0]]}; there are {self._files.tasks} instructions"
-                self._findings.error("counts", name, what, "Restore meta/tasks.parquet from a copy.")
+    def _check_times(self, name: str, table: pa.Table) -> None:
+        frame, seconds = table["frame_index"].to_numpy(), table["timestamp"].to_numpy()
+        due = frame / self._files.fps
+        # Single precision cannot say it better after a while.
+        wrong = np.flatnonzero(~(np.abs(seconds - due) <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * due)))
+        if len(wrong):
+            row = wrong[0]
+            what = (
+                f"{len(wrong)} timestamps are not frame_index / fps; the first in episode "
+                f"{table['episode_index'][row]}, frame {frame[row]}: {seconds[row]:.6g} s"
+            )
+            self._findings.error("timing", name, what, "LeRobot refuses to load it; record it again.")
 
     # --- numbers -----------------------------------------------------------------------------------------------------
 
@@ -253,7 +232,7 @@ class ValueCheck:
                 continue
             if len(self._files.features[key]["shape"]) > 1:
                 continue  # LeRobot's are over other axes
-            wrong = wrong_statistic(known, column, self.frames, max(self._lengths))
+            wrong = wrong_statistic(known, column, max(self._lengths))
             if wrong is not None:
                 where, what = f"{layout.STATS}: {key}", f"{wrong} is not that of the data"
                 if key in UNREAD:
@@ -261,6 +240,24 @@ class ValueCheck:
                     self._findings.warning("stats", where, what, remedy)
                 else:
                     self._findings.error("stats", where, what, remedy)
+            elif "std" in known and key.startswith(("observation", "action")):
+                self._judge_deviation(key, column, known["std"], remedy)
+
+    def _judge_deviation(self, key: str, column: Moments, stored: NDArray[np.float64], remedy: str) -> None:
+        is_wrong, deviation = wrong_deviations(stored, column)
+        if not is_wrong.any():
+            return
+        wrong = np.flatnonzero(is_wrong)
+        is_zero = (stored[wrong] == 0).any()
+        number = wrong[np.argmax(stored[wrong] == 0)] if is_zero else wrong[0]
+        name = name_of(self._files.features[key], int(number))
+        what = (
+            f"the std of {few(name_of(self._files.features[key], int(n)) for n in wrong)} is not that of the data: of "
+            f"{name} it is {stored[number]:.3g}, and theirs is {deviation[number]:.3g}, as LeRobot rounds far from 0; "
+            "a policy that is normalised with it learns something else"
+        )
+        report = self._findings.error if is_zero else self._findings.warning
+        report("stats", f"{layout.STATS}: {key}", what, remedy)
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:

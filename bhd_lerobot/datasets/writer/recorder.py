@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.episode_table import checked_metadata, metadata_types
 from bhd_lerobot.datasets.format.identity import FORMAT, as_json, check_identity, default_root
 from bhd_lerobot.datasets.format.schema import Schema
-from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.datasets.format.state import DatasetState, corrupt, slot_of
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.recovery.repair import settle
 from bhd_lerobot.datasets.recovery.salvage import RepairReport
@@ -137,6 +137,7 @@ class DatasetRecorder:
         try:
             with write_errors("resume the dataset", root, _INTACT):
                 state, report = settle(root, disk)
+            _check_last(state)
             check_identity(
                 state,
                 schema=schema,
@@ -300,6 +301,19 @@ class DatasetRecorder:
     def _check_not_finalized(self) -> None:
         if self._finalized:
             raise DatasetError(f"The recording of {self.root} is finalised. Resume the dataset to add episodes.")
+
+
+def _check_last(state: DatasetState) -> None:
+    """Check that the files of the last episode are the last ones: those behind them are the next episode's.
+
+    Raises:
+        DatasetCorruptError: there are others behind them.
+    """
+    for kind in ("data", "meta/episodes", *(f"videos/{key}" for key in state.video_keys)):
+        slots = [slot_of(row, kind) for row in state.rows]
+        if slots and max(slots) != slots[-1]:
+            what = f"the file of episode {slots.index(max(slots))} comes after that of the last episode"
+            raise corrupt(state.root / kind, what)
 
 
 def _checked(

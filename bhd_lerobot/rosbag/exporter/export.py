@@ -10,8 +10,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.edit.edits import check_reported, opened
+from bhd_lerobot.datasets.format.columns import frames_of, instructions_of
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
-from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots, read_frames
+from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import refuse_inside
 from bhd_lerobot.errors import DatasetError
@@ -98,16 +99,14 @@ def _episodes(state: DatasetState, chosen: Sequence[Row]) -> Iterator[tuple[Row,
     """Yield episodes in order, with their columns; each data file is read once."""
     features = {key: one for key, one in state.info["features"].items() if key not in DEFAULT_FEATURES}
     stored = [key for key, feature in features.items() if feature["dtype"] != "video"]
+    files = ordered_slots(state.rows, "data")
     for slot, rows in ordered_slots(chosen, "data").items():
         path = state.root / layout.data_file(slot)
-        table = read_frames(path, ["episode_index", *stored])
-        indices = np.asarray(table["episode_index"])
+        frames = frames_of(path, files[slot], [*stored, "task_index"])
         for row in rows:
-            first, last = np.searchsorted(indices, [row["episode_index"], row["episode_index"] + 1])
-            if last - first != row["length"]:
-                raise corrupt(path, f"episode {row['episode_index']} has {last - first} of {row['length']} frames")
-            part = table.slice(first, last - first)
-            yield row, {key: _column(part[key], tuple(features[key]["shape"])) for key in stored}
+            part = frames[row["episode_index"]]
+            tasks = instructions_of(row, part["task_index"].to_numpy(), state.tasks, path)
+            yield {**row, "tasks": tasks}, {key: _column(part[key], tuple(features[key]["shape"])) for key in stored}
 
 
 def _column(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray[Any]:

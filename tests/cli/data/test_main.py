@@ -13,7 +13,7 @@ import pytest
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from tests.datasets import support
+from tests.datasets import foreign, support
 from tests.recording.support import run_record
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -33,6 +33,37 @@ def test_info_shows_outcome_and_timing_of_every_episode(recorded, capsys, monkey
     for part in ("turtlebot3, 10 frames/s", "finalised", "avoidance", "late p99", "overruns", "control.applied_action"):
         assert part in text
     assert "since the episode's start [s]" in text  # square brackets are not markup
+
+
+def test_the_table_of_episodes_has_a_line_for_each(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main.main(["info", str(foreign.write(tmp_path / "d", (12, 345)))]) == 0
+    wanted = """\
+Episodes
+episode  frames  seconds  outcome  score  seed  instruction
+      0      12      1.2                        lift the cup
+      1     345     34.5                        turn around
+"""
+    assert capsys.readouterr().out.endswith(wanted)
+
+
+def test_ten_times_the_episodes_take_at_most_twice_the_work(tmp_path, capsys):
+    """Counted in calls of Python's functions, which no other load changes."""
+    counts = []
+    for episodes in (30, 30, 300):  # what the first needs is imported now
+        root = foreign.write(tmp_path / f"d{len(counts)}", (2,) * episodes)
+        counts.append(0)
+
+        def count(frame, event, argument):
+            counts[-1] += event == "call"
+
+        sys.setprofile(count)
+        try:
+            assert main.main(["info", str(root)]) == 0
+        finally:
+            sys.setprofile(None)
+        assert len(capsys.readouterr().out.splitlines()) > episodes
+    assert counts[2] < 2 * counts[1]
 
 
 def test_info_as_json_holds_everything(recorded, capsys):

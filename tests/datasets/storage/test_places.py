@@ -238,3 +238,12 @@ def test_images_beside_the_data_are_within(root: Path) -> None:
     with pytest.raises(DatasetError, match="no file can be called"):
         check_inside(root, root / "a\0b")
     assert check_inside(root, root / "images/x.png") == root.resolve() / "images/x.png"
+
+
+@pytest.mark.parametrize("chunks_size", [1, 2, 1000, 5000])
+def test_files_are_numbered_in_the_order_of_their_names(chunks_size: int) -> None:
+    slot, names = None, []
+    for _ in range(2500 if chunks_size > 900 else 900):
+        slot = layout.next_slot(slot, chunks_size)
+        names.append(layout.data_file(slot))
+    assert names == sorted(set(names))

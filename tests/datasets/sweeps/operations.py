@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from bhd_lerobot.rosbag.exporter.export import export_bags
 from bhd_lerobot.rosbag.messages.views import RobotView
 from tests.datasets import support
 from tests.datasets.edit_support import record
+from tests.datasets.foreign import edit_json
 
 NOTES = "notes.txt"  # what somebody else put there; it must stay
 
@@ -31,6 +33,7 @@ class Operation:
         target: what the command makes or changes.
         is_new: whether nothing is there before.
         places: "no exchange" of names by the file system, or a "fixed" folder, such as a mount point.
+        is_refused: whether other commands refuse what is there before.
         repeated: exit status of the same command again, when it had been completed.
         says: what it says of that.
     """
@@ -41,6 +44,7 @@ class Operation:
     target: str
     is_new: bool = False
     places: tuple[str, ...] = ("plain",)
+    is_refused: bool = False
     repeated: int = 0
     says: str = ""
 
@@ -61,6 +65,44 @@ def _two(folder: Path) -> None:
 
 def _without_stats(folder: Path) -> None:
     (dataset(folder) / "meta/stats.json").unlink()
+
+
+def _miscounted(folder: Path) -> Path:
+    root = dataset(folder)
+    edit_json(root / "meta/info.json", lambda info: info.update(total_frames=info["total_frames"] - 3))
+    return root
+
+
+def _disordered(folder: Path) -> Path:
+    """Make a dataset with several faults of those that `--fix` corrects: order, counts, and statistics."""
+    root = _miscounted(folder)
+    path = next(root.glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.take(list(reversed(range(table.num_rows)))), path)
+    path = root / "meta/tasks.parquet"
+    pq.write_table(pq.read_table(path).take([1, 0]), path)
+    edit_json(root / "meta/stats.json", lambda stats: stats["observation.state"].update(std=[0.0, 0.0, 0.0]))
+    return root
+
+
+def _shuffled(folder: Path) -> None:
+    root = dataset(folder)
+    path = next(root.glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.take([3, 1, 2, 0, *range(4, table.num_rows)]), path)
+
+
+def _cut(folder: Path) -> None:
+    """Cut the footer of the data off: their episodes can be recovered."""
+    root = dataset(folder)
+    path = next(root.glob("data/*/*.parquet"))
+    os.truncate(path, path.stat().st_size - 8)
+
+
+def _without_info(folder: Path) -> None:
+    root = dataset(folder)
+    shutil.copy(root / "meta/info.json", folder / "info.json")
+    (root / "meta/info.json").write_text("{")
 
 
 def _into(folder: Path) -> None:
@@ -105,6 +147,19 @@ OPERATIONS = (
     ),
     Operation("mark", dataset, _edit("mark", "--episodes=1", "--outcome=failure"), "d 1", says="changed now"),
     Operation("fix", _without_stats, _edit("check", "--fix"), "d 1"),
+    Operation("fix the count", _miscounted, _edit("check", "--fix"), "d 1", places=ANYWHERE, is_refused=True),
+    Operation("fix everything", _disordered, _edit("check", "--fix"), "d 1", places=ANYWHERE, is_refused=True),
+    Operation("repair the order", _shuffled, _edit("repair"), "d 1", places=ANYWHERE),
+    Operation("repair damage", _cut, _edit("repair"), "d 1", places=ANYWHERE, is_refused=True),
+    Operation(
+        "repair with the info of another",
+        _without_info,
+        lambda folder: ["repair", str(folder / "d 1"), "--info", str(folder / "info.json")],
+        "d 1",
+        is_refused=True,
+        repeated=2,
+        says="can be read and fits its data",
+    ),
     Operation("repair", _killed, _edit("repair"), "d 1", places=ANYWHERE),
     Operation("resume", _killed, lambda folder: ["record", str(folder / "d 1"), "5"], "d 1"),
     Operation(
