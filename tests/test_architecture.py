@@ -28,10 +28,11 @@ _DATASETS = ("datasets.format", "datasets.storage")
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
     "renames": (),
+    "versions": (),
     "command_line": ("renames",),
     "bodies": (),
     "plugins": ("bodies",),
-    "sim": ("bodies.body", "bodies.tabletop"),
+    "sim": ("versions", "bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
     "control.geometry": ("bodies.body", "control"),
     "control.motion": ("bodies.body", "control", "control.geometry"),
@@ -83,7 +84,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("registry", "rollout", "cluster", "recording"),
     ),
     "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
-    "plugin": ("envs", "policies.*", "registry", "teleoperators"),
+    "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
         *("registry", "rollout", "hub"),
@@ -106,7 +107,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "datasets.edit",
     ),
     "apps.monitor": ("command_line", "control", "control.motion", "realtime"),
-    "apps.doctor": ("command_line", "plugins", "bodies", "sim", "realtime", "datasets.format"),
+    "apps.doctor": ("command_line", "versions", "plugins", "bodies", "sim", "realtime", "datasets.format"),
     "apps.demo": ("command_line", "rollout", "recording", "evaluation", "training"),
     "api": (
         *("plugins", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
