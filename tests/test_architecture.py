@@ -34,7 +34,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "plugins": ("bodies",),
     "sim": ("versions", "bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
-    "control.geometry": ("bodies.body", "control"),
+    "control.geometry": ("versions", "bodies.body", "control"),
     "control.motion": ("bodies.body", "control", "control.geometry"),
     "control.base": ("bodies.body", "control"),
     "control.arm": ("bodies.body", "control", "control.geometry", "control.motion"),
