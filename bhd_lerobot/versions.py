@@ -45,11 +45,12 @@ def check_version(name: str, version_of: Callable[[str], str] = metadata.version
         return  # a copy of the source that nobody installed: nothing says what it requires
     try:
         found = version_of(name)
-        if required.contains(found, prereleases=True):
-            return
-    except metadata.PackageNotFoundError:
-        found = "not installed"
-    raise VersionError(
-        f"{name} is {found}; {DISTRIBUTION} supports {name}{required}. If another package needs this one, give each an "
-        f"environment of its own; otherwise: pip install '{name}{required}'"
-    )
+    except metadata.PackageNotFoundError as error:
+        raise VersionError(
+            f"{name} is not installed; {DISTRIBUTION} needs {name}{required}: pip install '{name}{required}'"
+        ) from error
+    if not required.contains(found, prereleases=True):
+        raise VersionError(
+            f"{name} is {found}; {DISTRIBUTION} supports {name}{required}. If another package needs this one, give "
+            f"each an environment of its own; otherwise: pip install '{name}{required}'"
+        )

@@ -27,12 +27,12 @@ def other(version: str | None):
 @each_case("name", ["mujoco", "pin", "lerobot"])
 def test_the_sentence_names_the_version_the_valid_ones_and_how_to_get_one(name: str) -> None:
     check_version(name)
-    for version, found in (("0.0.1", f"{name} is 0.0.1"), (None, f"{name} is not installed")):
+    for version, found in (("0.0.1", f"{name} is 0.0.1; "), (None, f"{name} is not installed; ")):
         with pytest.raises(VersionError) as raised:
             check_version(name, other(version))
         text = str(raised.value)
         assert text.startswith(found)
-        assert f"supports {name}{required_versions()[name]}" in text
+        assert f"{'needs' if version is None else 'supports'} {name}{required_versions()[name]}" in text
         assert f"pip install '{name}{required_versions()[name]}'" in text
         assert not isinstance(raised.value, ImportError)  # LeRobot passes over those, and looks elsewhere
 
@@ -126,3 +126,38 @@ def test_lerobots_commands_go_on_beside_our_refusal_of_their_version(tmp_path: P
     assert done.returncode == 0
     assert "'so101_follower'" in done.stdout
     assert "lerobot is 0.9.0; lerobot_robot_bhd supports lerobot" in done.stderr
+
+
+WITHOUT_RUCKIG = """
+import sys
+from importlib import metadata
+sys.modules["ruckig"] = None  # an import of it fails
+from bhd_lerobot import versions
+from bhd_lerobot.control.motion import trajectory
+
+def absent(name):
+    raise metadata.PackageNotFoundError(name)
+
+trajectory.check_version = lambda name: versions.check_version(name, absent)
+from bhd_lerobot.errors import VersionError
+from bhd_lerobot.registry import make_simulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+
+with TurtleBot3(TurtleBot3Config(arena="empty")) as robot:
+    print("base", robot.send_action({"x.vel": 0.1, "theta.vel": 0.0}))
+try:
+    make_simulation(UR5Config())
+except VersionError as error:
+    print(error)
+"""
+
+
+def test_only_arms_need_ruckig_and_say_how_to_get_it() -> None:
+    program = [sys.executable, "-c", WITHOUT_RUCKIG]
+    done = subprocess.run(program, capture_output=True, text=True, check=True, cwd=ROOT)
+    base, arm = done.stdout.splitlines()
+    assert base.startswith("base {'x.vel': ")
+    assert arm.startswith("Arms need Ruckig. ruckig is not installed; lerobot_robot_bhd needs ruckig: pip install")
+    assert arm.endswith("apt-get install g++ cmake")

@@ -1,20 +1,39 @@
 """Jerk-limited trajectories sampled at control ticks: to a target, and to rest. Pure: no clock, no state, no plant."""
 
 from dataclasses import dataclass, replace
-from typing import Self
+from functools import cache
+from importlib import import_module
+from typing import Any, Self
 
 import numpy as np
-import ruckig
 from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.errors import VersionError
+from bhd_lerobot.versions import check_version
 
 Array = NDArray[np.float64]
 
 MAX_DURATION_S = 120.0  # [s] a trajectory is kept as a list of ticks; a longer one is a mistake in its limits
 _SLACK = 1e-9  # [rad or m] what rounding may add to a position
-_CODES = {int(code): name for name, code in ruckig.Result.__members__.items()}
+
+
+@cache
+def load_ruckig() -> Any:
+    """Return Ruckig, which only arms need: it is imported with the first, and not before its first motion.
+
+    Raises:
+        VersionError: it is not installed; the message says how to get it where there is no wheel.
+    """
+    try:
+        check_version("ruckig")
+    except VersionError as error:
+        raise VersionError(
+            f"Arms need Ruckig. {error}. Where there is no wheel, as for 64-bit ARM, that builds it, with a C++ "
+            "compiler: apt-get install g++ cmake"
+        ) from error
+    return import_module("ruckig")
 
 
 @dataclass(frozen=True)
@@ -162,14 +181,14 @@ def to_target(
         brake_limits: the limits to brake with if gentler ones do not suffice; `limits` if None.
     """
     goal = np.asarray(target, np.float64)
-    first = _calculate(start, goal, limits, hz, ruckig.Synchronization.Phase)
+    first = _calculate(start, goal, limits, hz, "Phase")
     if isinstance(first, Trajectory) and _stays_within(first, start, limits):
         return first
     # Rounding may have put a state a hair outside of what Ruckig takes; or it came too close to a position limit.
     brake = to_rest(start, limits if brake_limits is None else brake_limits, hz)
     if isinstance(brake, PlanFailure):
         return first if isinstance(first, PlanFailure) else brake
-    second = _calculate(State.at_rest(brake.target), goal, limits, hz, ruckig.Synchronization.Phase)
+    second = _calculate(State.at_rest(brake.target), goal, limits, hz, "Phase")
     return brake.then(second) if isinstance(second, Trajectory) else second
 
 
@@ -184,13 +203,13 @@ def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFai
         limits: the limits; those of a stop if it is urgent.
         hz: ticks a second [Hz].
     """
-    brake = _calculate(start, None, limits, hz, ruckig.Synchronization.No)
+    brake = _calculate(start, None, limits, hz, "No")
     if isinstance(brake, PlanFailure) or _stays_within(brake, start, limits):
         return brake
     lower, upper = _bounds(start, limits)
     outside = ((brake.position < lower - _SLACK) | (brake.position > upper + _SLACK)).any(axis=0)
     target = np.where(outside, np.clip(brake.target, lower, upper), brake.target)
-    back = _calculate(start, target, limits, hz, ruckig.Synchronization.No)
+    back = _calculate(start, target, limits, hz, "No")
     if isinstance(back, PlanFailure):
         return brake
     pick = np.flatnonzero(outside)
@@ -219,15 +238,15 @@ def _stays_within(trajectory: Trajectory, start: State, limits: MotionLimits) ->
 
 
 def _calculate(
-    start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: ruckig.Synchronization
+    start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: str
 ) -> Trajectory | PlanFailure:
     """Let Ruckig calculate a trajectory to a target, or to rest where the target is None."""
-    dof = len(start.position)
+    ruckig, dof = load_ruckig(), len(start.position)
     numbers = (start.position, start.velocity, start.acceleration, *(() if target is None else (target,)))
     if not np.isfinite(numbers).all():
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory from or to what is not finite: {numbers}.")
     request = ruckig.InputParameter(dof)
-    request.synchronization = synchronization
+    request.synchronization = getattr(ruckig.Synchronization, synchronization)
     request.current_position = start.position
     request.current_velocity = start.velocity
     request.current_acceleration = start.acceleration
@@ -244,7 +263,7 @@ def _calculate(
     except (ruckig.RuckigError, ValueError) as error:  # its bindings do not know all of its own results
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: {error}")
     if code < 0:
-        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_CODES.get(code, code)}.")
+        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_name_of(code)}.")
     if not answer.duration <= MAX_DURATION_S:
         return PlanFailure(
             ResultCode.PLANNING_FAILED,
@@ -259,7 +278,12 @@ def _calculate(
     return trajectory
 
 
-def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:
+def _name_of(code: int) -> str:
+    names = load_ruckig().Result.__members__.items()
+    return next((name for name, one in names if int(one) == code), str(code))
+
+
+def sample(answer: Any, hz: int) -> Trajectory:
     """Return what a Ruckig trajectory is at ticks 1 to T; T is the first at or after its end.
 
     Between two switches the jerk is constant. Each dimension has up to nine such segments: two in which it is brought
