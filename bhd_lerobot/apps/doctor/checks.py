@@ -121,7 +121,7 @@ ROWS: dict[str, Finding] = {
         _W,
         "what the plug-in has is an invalid choice for every command",
         "{error}",
-        "Mend the plug-in, or uninstall it: `uv pip uninstall NAME`.",
+        "repair the plug-in, or uninstall it: `uv pip uninstall NAME`",
     ),
     "opengl.missing": Finding(
         "OpenGL",
@@ -368,6 +368,7 @@ def check_plugins(outcome: Outcome) -> list[Finding]:
     others = [name for name in known["bodies"] if name not in ROBOTS]
     return [
         fine("plug-ins", f"LeRobot knows {', '.join((*ROBOTS, *others, *TELEOPERATORS))}"),
+        *(fine("plug-ins", text) for text in known.get("installed", ())),
         *(wrong("plugins.failed", text, error=text) for text in known["failed"]),
     ]
 
