@@ -15,12 +15,12 @@ import lerobot.policies  # noqa: F401  registers LeRobot's own
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot.utils.device_utils import auto_select_torch_device
 
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import find_checkpoint
 from bhd_lerobot.rollout import configuration
+from bhd_lerobot.stock import auto_select_torch_device
 from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig, plain
 
 

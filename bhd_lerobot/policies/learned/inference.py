@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
+from bhd_lerobot.stock import ACTTemporalEnsembler
 
 type Rows = dict[str, NDArray]
 """Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3).
