@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test sweep docs lint format bench bench-realtime results lock clean venv
+.PHONY: arm help demo test sweep docs lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Three test processes by default, for two processors: a quarter of their time they wait. `make test WORKERS=0` runs
@@ -47,6 +47,11 @@ lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
 	uv=$$(scripts/bootstrap.sh --print-uv) && printf 'hatchling\neditables\n' | "$$uv" pip compile --quiet \
 		--universal --python-version 3.12 --all-extras --no-header --no-annotate --no-emit-index-url \
 		--only-binary :all: $(LOCK_ARGS) --output-file constraints.txt pyproject.toml - >/dev/null
+
+arm: ## resolve what a base needs on 64-bit ARM Linux, with wheels only, and print it
+	uv=$$(scripts/bootstrap.sh --print-uv) && "$$uv" pip compile --quiet --python-version 3.12 \
+		--python-platform aarch64-manylinux_2_28 --only-binary :all: --constraint constraints.txt \
+		--no-header --no-annotate --no-emit-index-url pyproject.toml
 
 clean: ## remove .venv, .uv and every cache
 	rm -rf site .venv .uv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

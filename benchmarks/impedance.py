@@ -76,7 +76,7 @@ class Rig:
         self.plant = ImperfectPlant(self.world, late, noise)
         cerebellum = Cerebellum(arm, self.plant, _RATES.control_hz, controller=self.controller)
         self.bridge = LockstepBridge(cerebellum, _RATES, self._advance)
-        self._tool = self.world.site("tool")[0]
+        self._tool = self.world.site("tool").position
         self._force = self.world.sensor("force_fixture_0") if wall else np.zeros((n, 3))
         self.tool: list[NDArray] = []
         self.force: list[float] = []

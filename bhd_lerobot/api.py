@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
-from lerobot.robots.utils import make_robot_from_config
 from rich.console import Console
 
 from bhd_lerobot import registry
@@ -26,6 +25,7 @@ from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.rollout.configuration import decode, from_options
 from bhd_lerobot.rollout.replay import Divergence, ReplayConfig
 from bhd_lerobot.rollout.replay import replay as run_replay
+from bhd_lerobot.stock import make_robot_from_config
 from bhd_lerobot.tasks.task import Task, TaskConfig
 
 if TYPE_CHECKING:

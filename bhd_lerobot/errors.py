@@ -19,6 +19,10 @@ class ConfigError(BhdError, ValueError):
     """A configuration value that cannot be honoured."""
 
 
+class VersionError(BhdError):
+    """A package that this one needs is missing, or installed in a version that this one does not support."""
+
+
 class ActionError(BhdError, ValueError):
     """An action with the wrong keys, the wrong order, the wrong type or a non-finite value."""
 

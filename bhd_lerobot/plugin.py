@@ -1,5 +1,9 @@
 """Every registration with LeRobot. LeRobot imports it through the distribution's module `lerobot_robot_bhd`."""
 
+from bhd_lerobot.versions import check_version
+
+check_version("lerobot")
+
 import bhd_lerobot.policies.cnn.processor_cnn
 import bhd_lerobot.policies.mlp.processor_mlp
 import bhd_lerobot.policies.pixels.processor_pixels
@@ -11,6 +15,7 @@ from bhd_lerobot.policies.perception.configuration_perception import PerceptionC
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
+# Nothing here imports MuJoCo: LeRobot's commands import this module, whatever robot they are used with.
 # Importing a configuration registers its type with LeRobot's choice registries. A checkpoint's processors are loaded by
 # the names of their steps, by whatever program: LeRobot imports a policy's module when it makes the policy, and the
 # module of its processors only when it makes new ones.

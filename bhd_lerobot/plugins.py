@@ -7,7 +7,7 @@ one with an entry point of the group `ENTRY_POINTS`, or a module that a command 
 
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -49,16 +49,33 @@ def load_plugins(report: Callable[[str], object] | None = None) -> None:
         report: called with a sentence for each that cannot be imported, the others are imported all the same; printed
             on standard error if None.
     """
+    for name, reason in import_plugins():
+        if reason:
+            text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
+            report(text) if report else print(f"warning: {text}", file=sys.stderr)
+
+
+def import_plugins() -> Iterator[tuple[str, str]]:
+    """Import every plug-in that is installed and was not imported yet; yield its name, and why that failed."""
     for name, load in _installed():
         if name in _imported:
             continue
         _imported.add(name)
+        reason = ""
         try:
             load()
         except Exception as error:  # whatever a module raises while it is imported
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
-            report(text) if report else print(f"warning: {text}", file=sys.stderr)
+        yield name, reason
+
+
+def misnamed() -> list[tuple[str, str]]:
+    """Return the distributions that LeRobot passes over although they look like plug-ins, and why."""
+    return [
+        (name, f"LeRobot wants a name with underscores, {name.replace('-', '_')!r}.")
+        for name in map(_name_of, metadata.distributions())
+        if name.replace("-", "_").startswith(PREFIXES) and not name.startswith(PREFIXES)
+    ]
 
 
 def load_named(arguments: Sequence[str]) -> list[str]:
@@ -116,13 +133,17 @@ def body_of(robot_type: str | None) -> MobileBase | Arm | None:
 
 def _installed() -> list[tuple[str, Callable[[], Any]]]:
     found: dict[str, Callable[[], Any]] = {}
-    for distribution in metadata.distributions():
-        # Python tells it from the folder's name; to read all metadata takes a tenth of a second.
-        if not getattr(distribution, "_normalized_name", PREFIXES[0]).startswith(PREFIXES):
-            continue
-        name = str(distribution.metadata["Name"] or "")
+    for name in map(_name_of, metadata.distributions()):
         if name.startswith(PREFIXES) and name != _OURS:
             found[name] = partial(importlib.import_module, name)
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         found.setdefault(entry.value, entry.load)
     return sorted(found.items(), key=lambda item: item[0])
+
+
+def _name_of(distribution: metadata.Distribution) -> str:
+    """Return the name of a distribution, or nothing if it is none that may be a plug-in."""
+    # Python tells it from the folder's name; to read all metadata takes a tenth of a second.
+    if not getattr(distribution, "_normalized_name", PREFIXES[0]).startswith(PREFIXES):
+        return ""
+    return str(distribution.metadata["Name"] or "")

@@ -4,8 +4,9 @@ Those of this package are in the tables here; importing this module registers al
 packages add theirs with `register_robot`, `register_task`, `register_brain` and `register_arena`.
 """
 
+import pkgutil
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot.robots.config import RobotConfig
 
@@ -29,19 +30,18 @@ from bhd_lerobot.policies.manipulation.servo import (
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain, NavigatorConfig
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.host.host import Host
-from bhd_lerobot.robots.host.realtime import make_live
-from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import NEVER, Task, TaskConfig
+
+if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
+    from bhd_lerobot.robots.host.host import Host
+    from bhd_lerobot.robots.host.simulation import Simulation
+    from bhd_lerobot.robots.simulated_robot import SimulatedRobot
 
 
 class _Dagger(DaggerBrain):
@@ -78,8 +78,11 @@ class _Blanked(BlankedBrain):
         return robot_of_brain(config.brain)
 
 
-ROBOTS: dict[type[RobotConfig], type[Simulation]] = {TurtleBot3Config: BaseSimulation, UR5Config: UR5Simulation}
-"""The simulations of the robots, by configuration."""
+ROBOTS: dict[type[RobotConfig], "type[Simulation] | str"] = {
+    TurtleBot3Config: "bhd_lerobot.robots.base_simulation:BaseSimulation",
+    UR5Config: "bhd_lerobot.robots.ur5_simulation:UR5Simulation",
+}
+"""The simulations of the robots, by configuration: classes, or where they are, for those that import MuJoCo."""
 
 TASKS: dict[type[TaskConfig], Callable[..., Task]] = {
     AvoidConfig: AvoidTask,
@@ -110,7 +113,7 @@ BRAINS: dict[type[BrainConfig], Callable[[Any], Brain]] = {
 # --- registering -----------------------------------------------------------------------------------------------------
 
 
-def register_robot[T: type[SimulatedRobot]](robot: T) -> T:
+def register_robot[T: "type[SimulatedRobot]"](robot: T) -> T:
     """Register a simulated robot; a decorator of its class, which names its type, configuration and simulation.
 
     Raises:
@@ -180,7 +183,11 @@ def _made_by(choices: Any, table: dict[Any, Any], config: Any) -> Any:
             f"The {word} {name!r} has a configuration, {type(config).__module__}.{type(config).__qualname__}, and no "
             f"class: register that with bhd_lerobot.register_{word}."
         )
-    return table[type(config)]
+    return _resolved(table[type(config)])
+
+
+def _resolved(made: Any) -> Any:
+    return pkgutil.resolve_name(made) if isinstance(made, str) else made
 
 
 # --- what fits what --------------------------------------------------------------------------------------------------
@@ -194,7 +201,7 @@ def robot_configs() -> dict[str, type[RobotConfig]]:
 def kind_of_robot(robot_type: str) -> str:
     """Return the kind of a robot that can be simulated: ``"base"`` or ``"arm"``; nothing if it is not known."""
     config = robot_configs().get(robot_type)
-    return ROBOTS[config].robot_kind if config else ""
+    return str(_resolved(ROBOTS[config]).robot_kind) if config else ""
 
 
 def robots_of(wanted: str) -> list[str]:
@@ -284,7 +291,7 @@ def action_names_of(config: BrainConfig) -> tuple[str, ...]:
     """Return the names of the actions of the robots that a brain is for; none if it is for every robot."""
     wanted = robot_of_brain(config)
     robots = robots_of(wanted) if wanted else []
-    return tuple(ROBOTS[robot_configs()[robots[0]]].action_names) if robots else ()
+    return tuple(_resolved(ROBOTS[robot_configs()[robots[0]]]).action_names) if robots else ()
 
 
 def _with_article(wanted: str) -> str:
@@ -294,14 +301,14 @@ def _with_article(wanted: str) -> str:
 # --- making ----------------------------------------------------------------------------------------------------------
 
 
-def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
+def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> "Simulation":
     """Return n simulations of the robot that a configuration describes, on the lockstep clock whatever it says."""
     simulation: Any = _made_by(RobotConfig, ROBOTS, config)
     made: Simulation = simulation(config, n, threads)
     return made
 
 
-def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Host:
+def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Host":
     """Return n robots on the clock that the configuration asks for.
 
     Raises:
@@ -312,6 +319,8 @@ def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Host:
         return make_simulation(config, n, threads)
     if n != 1:
         raise ConfigError(f"n_envs is {n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1.")
+    from bhd_lerobot.robots.host.realtime import make_live
+
     return make_live(_made_by(RobotConfig, ROBOTS, config), config, config.id)
 
 

@@ -28,13 +28,15 @@ _DATASETS = ("datasets.format", "datasets.storage")
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
     "renames": (),
+    "versions": (),
+    "stock": (),
     "command_line": ("renames",),
     "bodies": (),
     "plugins": ("bodies",),
-    "sim": ("bodies.body", "bodies.tabletop"),
+    "sim": ("versions", "bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
-    "control.geometry": ("bodies.body", "control"),
-    "control.motion": ("bodies.body", "control", "control.geometry"),
+    "control.geometry": ("versions", "bodies.body", "control"),
+    "control.motion": ("versions", "bodies.body", "control", "control.geometry"),
     "control.base": ("bodies.body", "control"),
     "control.arm": ("bodies.body", "control", "control.geometry", "control.motion"),
     "realtime": ("bodies.body", "control.*"),
@@ -83,7 +85,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("registry", "rollout", "cluster", "recording"),
     ),
     "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
-    "plugin": ("envs", "policies.*", "registry", "teleoperators"),
+    "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
         *("registry", "rollout", "hub"),
@@ -106,7 +108,17 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "datasets.edit",
     ),
     "apps.monitor": ("command_line", "control", "control.motion", "realtime"),
-    "apps.doctor": ("command_line", "plugins", "bodies", "sim", "realtime", "datasets.format"),
+    "apps.doctor": (
+        "command_line",
+        "versions",
+        "plugins",
+        "tasks",
+        "policies",
+        "bodies",
+        "sim",
+        "realtime",
+        "datasets.format",
+    ),
     "apps.demo": ("command_line", "rollout", "recording", "evaluation", "training"),
     "api": (
         *("plugins", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
@@ -122,6 +134,19 @@ NEVER_IN = {
     "lerobot": ("errors", "bodies", "sim", "control", "realtime", "tasks"),
     "mujoco": ("bodies", "control", "realtime"),
 }
+# What of LeRobot is made for plug-ins; everything else moves from version to version, and only `stock` imports it.
+LEROBOT_MODULES = (
+    *(
+        "lerobot.cameras",
+        "lerobot.configs",
+        "lerobot.envs.configs",
+        "lerobot.lerobot_types",
+        "lerobot.optim.schedulers",
+    ),
+    *("lerobot.policies.pretrained", "lerobot.robots.config", "lerobot.robots.robot", "lerobot.teleoperators"),
+    *("lerobot.utils.constants", "lerobot.utils.errors"),
+)
+LEROBOT_PACKAGES = ("lerobot.optim", "lerobot.policies", "lerobot.processor", "lerobot.robots")  # what they export
 
 
 def module_name(path: Path, source: Path) -> str:
@@ -175,6 +200,14 @@ def is_allowed(name: str, allowed: tuple[str, ...]) -> bool:
     return False
 
 
+def is_for_plugins(name: str) -> bool:
+    """Tell whether what an import names is what LeRobot makes for plug-ins."""
+    packages = (name, name.rpartition(".")[0] if not name.rpartition(".")[2].islower() else "")
+    return f"{name}.".startswith(tuple(f"{one}." for one in LEROBOT_MODULES)) or any(
+        one in LEROBOT_PACKAGES for one in packages
+    )
+
+
 def wrong_imports(source: Path) -> list[str]:
     """Return one line of text for every import that breaks a rule in the package whose folder is `source`."""
     wrong = []
@@ -185,7 +218,8 @@ def wrong_imports(source: Path) -> list[str]:
         if package == "":
             allowed: tuple[str, ...] = ()
         elif package in ARROWS:
-            allowed = (package, "errors", *ARROWS[package])
+            stock = () if top_package in NEVER_IN["lerobot"] else ("stock",)
+            allowed = (package, "errors", *stock, *ARROWS[package])
         elif path.name == "__init__.py" and not list(imported_names(path, source)):
             continue
         else:
@@ -198,6 +232,8 @@ def wrong_imports(source: Path) -> list[str]:
                 wrong.append(f"{where}: {package or PACKAGE!r} may not import {name}")
             if top_package not in ONLY_IN.get(top, (top_package,)) or top_package in NEVER_IN.get(top, ()):
                 wrong.append(f"{where}: {package!r} may not import {top}")
+            elif top == "lerobot" and importer != "stock" and not is_for_plugins(name):
+                wrong.append(f"{where}: only 'stock' may import {name}")
     return wrong
 
 
@@ -230,6 +266,10 @@ def test_every_import_follows_an_arrow() -> None:
         ("data/recorder.py", "from bhd_lerobot.recording.record import main"),
         ("robots/turtlebot3.py", "from bhd_lerobot.datasets.format.features import ACTION"),
         ("robots/turtlebot3.py", "import mujoco.batch"),
+        ("robots/turtlebot3.py", "from lerobot.datasets.lerobot_dataset import LeRobotDataset"),
+        ("training/loop.py", "from lerobot.policies.factory import make_policy"),
+        ("training/loop.py", "from lerobot.optim import factory"),
+        ("sim/world.py", "from bhd_lerobot.stock import make_env"),
         ("errors.py", "from bhd_lerobot.bodies.body import Body"),
         ("cellar/wine.py", "x = 1"),
         ("__init__.py", "from bhd_lerobot.recording.record import main"),
@@ -253,6 +293,8 @@ def test_a_planted_wrong_import_is_found(tmp_path: Path, module: str, statement:
         ("robots/turtlebot3.py", "from bhd_lerobot.sim.world import World\nfrom lerobot.robots import Robot"),
         ("rollout/provenance.py", "from bhd_lerobot.policies.brain import Brain\nfrom bhd_lerobot import __version__"),
         ("plugin.py", "import bhd_lerobot.registry"),
+        ("training/loop.py", "from bhd_lerobot.stock import make_policy"),
+        ("training/loop.py", "from lerobot.optim.schedulers import LRSchedulerConfig\nimport lerobot.policies"),
     ],
 )
 def test_a_planted_right_import_is_accepted(tmp_path: Path, module: str, statement: str) -> None:

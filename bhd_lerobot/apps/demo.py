@@ -298,7 +298,7 @@ class Demo:
                 lines.append(f"replay of the {result.mode.replace('_', ' ')}: {same}")
 
     def _read(self, lesson: Lesson) -> None:
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+        from bhd_lerobot.stock import LeRobotDataset
 
         root = self.folder / lesson.name / "dataset"
         dataset = LeRobotDataset(f"bhd/demo_{lesson.name}", root=root, video_backend="pyav")

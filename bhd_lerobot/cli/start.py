@@ -13,6 +13,9 @@ from contextlib import contextmanager
 from types import FrameType
 
 from bhd_lerobot.command_line import INTERRUPTED, exit_status
+from bhd_lerobot.versions import check_version
+
+_WITHOUT_LEROBOT = ("bhd_lerobot.apps.doctor.doctor", "bhd_lerobot.apps.monitor.monitor")
 
 
 @contextmanager
@@ -47,10 +50,16 @@ def run(module: str) -> int:
     # on two processors, beside four busy processes, a training made a fiftieth of its steps. Asleep they compute the
     # same bits. OpenMP reads this once, when PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    try:
+
+    def program() -> int | None:
         with leaving_on_interrupt():
+            if module not in _WITHOUT_LEROBOT:
+                check_version("lerobot")
             main = importlib.import_module(module).main
-        return exit_status(main)
+        return main()
+
+    try:
+        return exit_status(program)
     finally:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # what libraries do at the very end is no traceback either

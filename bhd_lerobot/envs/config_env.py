@@ -3,7 +3,7 @@
 import multiprocessing
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium import spaces
@@ -13,11 +13,12 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from bhd_lerobot.envs.course import Course
-from bhd_lerobot.envs.gym_env import BhdEnv, check_render_mode
 from bhd_lerobot.envs.register import NAMESPACE
 from bhd_lerobot.envs.settings import Settings, make_settings
-from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError, unknown_name
+
+if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
+    from bhd_lerobot.envs.gym_env import BhdEnv
 
 VECTORS = ("bhd", "sync", "async")
 
@@ -67,7 +68,8 @@ class BhdEnvConfig(EnvConfig):
             raise ConfigError(unknown_name("env.vector", self.vector, VECTORS))
         if self.threads is not None and self.threads < 1:
             raise ConfigError(f"env.threads is {self.threads}; it must be at least 1.")
-        check_render_mode(self.render_mode)
+        from bhd_lerobot.envs.gym_env import BhdEnv
+
         Course(self.seed, self.split)  # type: ignore[arg-type]
         self.fps = self._settings().robot.fps
         with closing(BhdEnv(self.gym_id, **self.gym_kwargs)) as env:
@@ -111,6 +113,8 @@ class BhdEnvConfig(EnvConfig):
         mode = AutoresetMode.SAME_STEP
         vector: VectorEnv
         if self.vector == "bhd":
+            from bhd_lerobot.envs.vector import BhdVectorEnv
+
             name = self._settings().name
             vector = BhdVectorEnv(n_envs, name, **self.gym_kwargs, autoreset_mode=mode, threads=self.threads)
         else:
@@ -119,7 +123,7 @@ class BhdEnvConfig(EnvConfig):
                 vector = SyncVectorEnv(makers, autoreset_mode=mode)
             else:
                 # What is imported before the processes part need not be imported in each.
-                multiprocessing.set_forkserver_preload(["__main__", __name__])
+                multiprocessing.set_forkserver_preload(["__main__", __name__, "bhd_lerobot.envs.gym_env"])
                 vector = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=mode)
         return {self.type: {0: vector}}
 
@@ -133,7 +137,7 @@ class BhdEnvConfig(EnvConfig):
         robot = {**self.robot, "fps": given} if given else self.robot
         return make_settings(self.task or "", robot, self.task_options, cameras=self.cameras, obs_type=self.obs_type)
 
-    def _add_features(self, env: BhdEnv) -> None:
+    def _add_features(self, env: "BhdEnv") -> None:
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, env.action_space.shape or ())}
         self.features_map = {ACTION: ACTION}
         keys = {"agent_pos": (FeatureType.STATE, OBS_STATE), "environment_state": (FeatureType.ENV, OBS_ENV_STATE)}
@@ -156,4 +160,6 @@ class _Maker:
         self._kwargs = {**config.gym_kwargs, "first_episode": first}
 
     def __call__(self) -> gymnasium.Env:
+        from bhd_lerobot.envs.gym_env import BhdEnv
+
         return BhdEnv(self._name, **self._kwargs)

@@ -129,7 +129,7 @@ class LiveView:
             if options.display_mode == "rerun" and options.display_ip is not None:
                 # Rerun would go on looking for its viewer in silence.
                 socket.create_connection((options.display_ip, options.display_port or 0), _END_S).close()
-            from lerobot.utils import visualization_utils as helpers
+            from bhd_lerobot.stock import visualization_utils as helpers
 
             helpers.init_visualization(
                 options.display_mode, session_name="bhd-record", ip=options.display_ip, port=options.display_port
@@ -245,7 +245,7 @@ class RerunExtras:
             return
         self._arranged = True
         # LeRobot's helper sends a layout of its own with its first frame, unless there is one: it would know no points.
-        from lerobot.utils.rerun_visualization import log_rerun_data
+        from bhd_lerobot.stock import log_rerun_data
 
         log_rerun_data.blueprint = self._layout(observation, action)
         rerun.send_blueprint(log_rerun_data.blueprint)

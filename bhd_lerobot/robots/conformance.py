@@ -75,7 +75,7 @@ def check_robot(
         for _ in range(frames):
             _check_observation(robot, observation_features)
             _check_action(robot, action_features, chosen)
-        findings = _check_not_shared(robot, chosen)
+        findings = _dropped({**observation_features, **action_features}) + _check_not_shared(robot, chosen)
         if adversarial:
             _check_writes(robot, chosen)
             _check_not_finite(robot, chosen)
@@ -142,11 +142,17 @@ def _check_features(where: str, features: Mapping[str, Any]) -> None:
             kind is float or (is_image and where.startswith("observation")),
             f"{where}[{name!r}] is {kind!r}; LeRobot knows float, and for observations an image shape (H, W, C).",
         )
-        if kind is float:
-            _require(
-                name.endswith((".pos", ".vel")),
-                f"{where} has the float {name!r}; lerobot-rollout drops names that end in neither '.pos' nor '.vel'.",
-            )
+
+
+def _dropped(features: Mapping[str, Any]) -> list[str]:
+    """Return the finding on what stock policies on the robot do not get or give, if there is such."""
+    names = [name for name, kind in features.items() if kind is float and not name.endswith((".pos", ".vel"))]
+    if not names:
+        return []
+    return [
+        f"lerobot-rollout drops {', '.join(map(repr, names))}, whose names end in neither '.pos' nor '.vel'; recording "
+        "keeps them, so a policy that is trained on them does not run there."
+    ]
 
 
 def _check_features_stay(robot: Robot, observation: dict, action: dict, when: str) -> None:

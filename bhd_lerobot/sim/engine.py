@@ -7,6 +7,9 @@ it is imported without the variable; `camera.py` reads it when an image is rende
 
 import os
 
+from bhd_lerobot.versions import check_version
+
+check_version("mujoco")
 _chosen = os.environ.pop("MUJOCO_GL", None)
 try:
     import mujoco

@@ -1,13 +1,16 @@
 """A scanning range finder on simulated scenes."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.sim.world import World
+
+if TYPE_CHECKING:  # configurations check their beams without MuJoCo
+    from bhd_lerobot.sim.world import World
 
 
 class Lidar:
@@ -21,7 +24,7 @@ class Lidar:
         beams: number of beams kept, evenly spaced; a divisor of `spec.beams`. All of them if None.
     """
 
-    def __init__(self, world: World, spec: LidarSpec, beams: int | None = None) -> None:
+    def __init__(self, world: "World", spec: LidarSpec, beams: int | None = None) -> None:
         beams = spec.beams if beams is None else beams
         check_beams(beams, spec)
         self.spec = spec

@@ -77,7 +77,7 @@ class Tabletop:
         self._scene, self._light = model.camera("scene").id, model.light("main").id
         self._top = model.geom(TABLE_TOP).id
         self._wood = model.mat_rgba[model.geom_matid[self._top], :3].copy()
-        self._tool_pos, self._tool_quat = world.site("tool")
+        self._tool = world.site("tool")
         self._any = world.sensor("touch_any")[:, 0]
         self._table = world.sensor("touch_table")[:, 0]
         self._self = world.sensor("touch_self")[:, 0]
@@ -234,7 +234,7 @@ class Tabletop:
     @property
     def tool_pose(self) -> NDArray[np.float64]:
         """Position [m] and quaternion w, x, y, z of the tool in the base frame, shape (n, 7), a copy."""
-        return np.concatenate([self._tool_pos, self._tool_quat], axis=1)
+        return np.concatenate([self._tool.position, self._tool.quaternion], axis=1)
 
     @property
     def is_touching_more(self) -> bool:

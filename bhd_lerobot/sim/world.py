@@ -76,6 +76,30 @@ class Snapshot:
     constants: bool = False
 
 
+@dataclass(frozen=True)
+class Site:
+    """A site of n simulations.
+
+    MuJoCo has a field with the quaternions of sites since version 4 only.
+
+    Attributes:
+        position: live positions in the world frame [m], shape (n, 3).
+    """
+
+    position: NDArray[np.float64]
+    _body_quaternion: NDArray[np.float64]
+    _in_body: NDArray[np.float64]
+
+    @property
+    def quaternion(self) -> NDArray[np.float64]:
+        """Quaternions w, x, y, z in the world frame, shape (n, 4), a copy."""
+        result = self._body_quaternion.copy()
+        if self._in_body[0] != 1.0:
+            for quaternion in result:
+                mujoco.mju_mulQuat(quaternion, quaternion.copy(), self._in_body)
+        return result
+
+
 class World:
     """n simulations of one body in its scene.
 
@@ -304,17 +328,15 @@ class World:
             raise SimulationError(unknown_name("field", name, mujoco_batch.DATA_FIELDS))
         return self._batch.bind(name)
 
-    def site(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the live pose of a named site, like `derived`.
-
-        Returns:
-            Positions in the world frame [m], shape (n, 3), and quaternions w, x, y, z, shape (n, 4).
+    def site(self, name: str) -> "Site":
+        """Return a named site, whose pose is valid like a `derived` field.
 
         Raises:
             SimulationError: there is no such site; the message lists the valid names.
         """
         number = self._site_number(name)
-        return self.derived("site_xpos")[:, number], self.derived("site_xquat")[:, number]
+        orientations = self.derived("xquat")[:, self.model.site_bodyid[number]]
+        return Site(self.derived("site_xpos")[:, number], orientations, self.model.site_quat[number].copy())
 
     def _site_number(self, name: str) -> int:
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, name)

@@ -19,6 +19,17 @@ from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 
+class TeleoperatorConfigError(ConfigError, SystemExit):
+    """The brain does not drive the robot that there is.
+
+    LeRobot's commands catch nothing: as a `SystemExit` it ends them with its message, without a traceback.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.code = message
+
+
 class GoalStreamer:
     """Plans goals as the cerebellum does, and hands out where the reference is at the end of every frame.
 
@@ -130,10 +141,17 @@ class BhdBrain(Teleoperator):
 
         Raises:
             DeviceNotConnectedError: `connect` was not called.
-            ConfigError: there is no robot to drive, or several and `robot_id` does not choose.
+            TeleoperatorConfigError: there is no robot to drive, several and `robot_id` does not choose, or one that the
+                brain does not drive.
         """
         if not self._is_connected:
             raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
+        try:
+            return self._next_action()
+        except ConfigError as error:
+            raise TeleoperatorConfigError(str(error)) from error
+
+    def _next_action(self) -> dict[str, Any]:
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             if not is_for(robot_of_brain(self.config.brain), robot.name):

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.stock import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from bhd_lerobot.training.config import BhdTrainConfig
 
 LOOP_STATE = "bhd_loop.json"
@@ -57,18 +57,7 @@ def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str
     assert config.output_dir is not None
     final = get_step_checkpoint_dir(Path(config.output_dir), config.steps, step)
     with writing(final) as part:
-        save_checkpoint(
-            part,
-            step,
-            config,
-            parts.policy,
-            parts.optimizer,
-            parts.scheduler,
-            parts.preprocessor,
-            parts.postprocessor,
-            num_processes=processes,
-            batch_size=config.batch_size,
-        )
+        save_checkpoint(part, step, config, parts, processes)
         parts.contract.save(part / PRETRAINED_MODEL_DIR)
         (part / TRAINING_STATE_DIR / LOOP_STATE).write_text(json.dumps(loop), encoding="utf-8")
     return final
@@ -87,7 +76,7 @@ def load(checkpoint: Path, parts: TrainingParts) -> tuple[int, dict[str, Any]]:
         ConfigError: it is no checkpoint that training can go on from.
     """
     try:
-        step, _, _ = load_training_state(checkpoint, parts.optimizer, parts.scheduler)
+        step = load_training_state(checkpoint, parts.optimizer, parts.scheduler)
         path = checkpoint / TRAINING_STATE_DIR / LOOP_STATE
         loop = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except Exception as error:  # safetensors, JSON, PyTorch: each has its own

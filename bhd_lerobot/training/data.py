@@ -6,11 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs.policies import PreTrainedConfig
-from lerobot.configs.types import NormalizationMode
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.transforms import ImageTransforms
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.state import load_info
@@ -20,6 +16,7 @@ from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, quoted
+from bhd_lerobot.stock import ImageTransforms, LeRobotDatasetMetadata, resolve_delta_timestamps
 from bhd_lerobot.training.config import BhdTrainConfig
 
 
@@ -118,7 +115,8 @@ def open_data(
     """
     dataset = config.dataset
     keep = kept_features(meta, policy, config.rename_map)
-    deltas = {key: times for key, times in (resolve_delta_timestamps(policy, meta) or {}).items() if key in keep}
+    resolved = resolve_delta_timestamps(policy, meta, config.rename_map)
+    deltas = {key: times for key, times in resolved.items() if key in keep}
     for key, frames in getattr(policy, "own_delta_indices", {}).items():
         deltas |= {
             own: [frame / meta.fps for frame in frames] for own in deltas if config.rename_map.get(own, own) == key

@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.common.train_utils import get_step_identifier
-from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
-from lerobot.scripts.lerobot_eval import eval_policy_all
-from lerobot.utils.random_utils import seeded_context
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.stock import (
+    close_envs,
+    eval_policy_all,
+    get_step_identifier,
+    make_env,
+    make_env_pre_post_processors,
+    seeded_context,
+)
 from bhd_lerobot.training.checkpoint import TrainingParts
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.log import Row

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from lerobot.common.train_utils import push_checkpoint_to_hub
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from bhd_lerobot.datasets.remote.hub_errors import hub_errors
@@ -16,6 +15,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
+from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.checkpoint import TrainingParts
 from bhd_lerobot.training.config import BhdTrainConfig, plain
@@ -165,6 +165,6 @@ class RunOutput:
     def _make_wandb(self) -> Any:
         if not (self._config.wandb.enable and self._config.wandb.project):
             return None
-        from lerobot.common.wandb_utils import WandBLogger
+        from bhd_lerobot.stock import WandBLogger
 
         return WandBLogger(self._config)

@@ -1,7 +1,7 @@
 """What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
@@ -13,19 +13,22 @@ from accelerate import Accelerator  # type: ignore[import-untyped]
 from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.optim.factory import make_optimizer_and_scheduler
-from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
-from lerobot.utils.feature_utils import dataset_to_policy_features
-from lerobot.utils.random_utils import set_seed
 
 from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
 from bhd_lerobot.policies.mlp.processor_mlp import floored
+from bhd_lerobot.stock import (
+    LeRobotDatasetMetadata,
+    dataset_to_policy_features,
+    make_optimizer_and_scheduler,
+    make_policy,
+    make_pre_post_processors,
+    set_seed,
+)
 from bhd_lerobot.tasks.report import ReportConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 
@@ -79,14 +82,23 @@ def make_accelerator(config: BhdTrainConfig) -> Accelerator:
     return accelerator
 
 
+# `lerobot-train`'s own; the last four have come after version 0.6.1.
+_STOCK_ONLY = ("peft", "sample_weighting", "accelerator", "checkpoint_format", "ema", "parallelism")
+
+
 def refuse_unsupported(config: BhdTrainConfig) -> None:
     """Refuse what only LeRobot's own loop does.
 
     Raises:
         ConfigError: names the option.
     """
-    for name in ("peft", "sample_weighting"):
-        if getattr(config, name) is not None:
+    defaults = {one.name: one.default for one in fields(config)} | {
+        one.name: one.default_factory() for one in fields(config) if one.default_factory is not MISSING
+    }
+    given = {name: getattr(config, name, None) != defaults.get(name) for name in _STOCK_ONLY}
+    given["dataset.exclude_episodes"] = bool(getattr(config.dataset, "exclude_episodes", None))
+    for name, is_given in given.items():
+        if is_given:
             raise ConfigError(f"{name} is not for bhd-train; use lerobot-train, which reads the same configuration.")
 
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.utils.utils import has_method
 from torch import Tensor
+
+from bhd_lerobot.stock import has_method
 
 Batch = dict[str, Any]
 

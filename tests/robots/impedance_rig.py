@@ -41,7 +41,7 @@ class Rig:
         self._applied = self.world.derived("xfrc_applied")
         self._gripper = self.world.model.body("gripper").id
         self._centre = self.world.derived("xipos")
-        self._tool = self.world.site("tool")[0]
+        self._tool = self.world.site("tool").position
         self._force = self.world.sensor("force_fixture_0") if wall else np.zeros((n, 3))
         self.world.qpos[:, :6] = forward_posture()
         self.world.qpos[:, 6:8] = 0.0

@@ -200,7 +200,6 @@ BROKEN: dict[str, tuple[str, dict[str, Any]]] = {  # what is broken -> the messa
     "connected after an exception": ("left the robot connected", {"__exit__": lambda self, *error: None}),
     "features change": ("observation_features changed", {"observation_features": property(late_features)}),
     "array feature": ("LeRobot knows float", {"observation_features": {"scan.pos": (360,)}}),
-    "unusable name": ("lerobot-rollout drops", {"observation_features": {"scan_000": float}}),
     "no cameras": ("no attribute 'cameras'", {"__init__": without_cameras}),
 }
 SHARED_IMAGE = {"get_observation": lambda self: {**observed(self), "eye": self._image}}
@@ -226,6 +225,19 @@ def config(tmp_path: Path) -> RobotConfig:
 
 def test_a_good_robot_passes(config):
     assert check_robot(lambda: GoodRobot(config), adversarial=True) == ()
+
+
+def test_names_that_lerobot_rollout_drops_are_a_finding(config):
+    """The Unitree G1 of LeRobot has names that end in `.q`."""
+    renamed = {
+        "observation_features": {**GoodRobot.observation_features, "arm.q": float},
+        "action_features": {"a.vel": float, "gripper.value": float},
+        "get_observation": lambda self: {**observed(self), "arm.q": 0.5},
+    }
+    action = {"a.vel": 0.0, "gripper.value": 0.0}
+    [finding] = check_robot(lambda: broken(config, renamed), action, adversarial=True)
+    assert "lerobot-rollout drops 'arm.q', 'gripper.value'" in finding
+    assert "'a.vel'" not in finding
 
 
 @pytest.mark.parametrize("name", [*BROKEN, *ADVERSARIAL])

@@ -8,10 +8,12 @@ import pytest
 from bhd_lerobot.bodies.arenas import random_arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, SimulationError
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
-from bhd_lerobot.sim.world import World
+from bhd_lerobot.sim.tabletop import Tabletop
+from bhd_lerobot.sim.world import World, mujoco_batch
 from tests.cases import each_case
 
 BODY = turtlebot3_burger()
@@ -516,3 +518,27 @@ def test_images_and_scans_do_not_disturb_the_physics() -> None:
             each.ctrl[:] = (5.0, 4.0)
             each.step(10)
     assert [everything(world, sim) for sim in range(2)] == [everything(reference, sim) for sim in range(2)]
+
+
+TOOL = '<site name="tool" pos="0 0 0.150"'
+FIELDS_SINCE_4 = {"site_xquat", "geom_xquat", "xiquat", "plastic"}
+"""What `Batch` of MuJoCo 4.0 has and that of 3.17 has not."""
+
+
+@each_case("turn", ["", ' quat="0.5 0.5 0.5 -0.5"', ' quat="0.1 -0.7 0.3 0.6"'])
+def test_the_pose_of_a_site_agrees_with_its_matrix_in_every_supported_mujoco(
+    turn: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mujoco_batch, "DATA_FIELDS", frozenset(mujoco_batch.DATA_FIELDS) - FIELDS_SINCE_4)
+    arm = ur5()
+    assert arm.mjcf.count(TOOL) == 1
+    world = World(dataclasses.replace(arm, mjcf=arm.mjcf.replace(TOOL, TOOL + turn)), 3)
+    table = Tabletop(world)
+    matrices = world.derived("site_xmat")[:, world.model.site("tool").id]
+    for seed in range(10):
+        world.qpos[:, :6] = np.random.default_rng(seed).uniform(-3, 3, (3, 6))
+        world.forward()
+        for pose, matrix in zip(table.tool_pose, matrices, strict=True):
+            expected = np.empty(9)
+            mujoco.mju_quat2Mat(expected, pose[3:])
+            np.testing.assert_allclose(expected, matrix, atol=1e-12)

@@ -1,6 +1,7 @@
 """Brains as teleoperators, alone and under the stock command lines."""
 
 import json
+import subprocess
 import sys
 
 import numpy as np
@@ -46,6 +47,20 @@ def test_it_sees_the_last_observation_and_asks_for_none_of_its_own(robot, teleop
     robot.get_observation()
     monkeypatch.setattr(robot.simulation, "observe", lambda: pytest.fail("observed again"))
     teleop.get_action()
+
+
+def test_without_a_robot_a_command_that_catches_nothing_ends_with_the_message_alone() -> None:
+    program = (
+        "from bhd_lerobot.teleoperators.bhd_brain import BhdBrain\n"
+        "from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig\n"
+        "brain = BhdBrain(BhdBrainConfig())\n"
+        "brain.connect()\n"
+        "brain.get_action()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "connected are: none. Use --robot.type=turtlebot3 or ur5" in done.stderr
 
 
 def test_it_needs_exactly_one_robot(tmp_path, teleop):

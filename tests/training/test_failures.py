@@ -18,7 +18,7 @@ from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.training import output
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import MetricsFile
-from bhd_lerobot.training.setup import has_bfloat16
+from bhd_lerobot.training.setup import has_bfloat16, refuse_unsupported
 from bhd_lerobot.training.train import main
 from tests.cases import each_case
 from tests.training.support import ACT, MLP, curve, make_dataset, options, poison, run_train
@@ -419,3 +419,16 @@ def test_mixed_precision_that_the_processor_can_only_emulate(
         assert has_bfloat16()
     monkeypatch.delattr(torch.cpu, "get_capabilities")  # an older PyTorch: nothing is known, nothing refused
     assert has_bfloat16()
+
+
+@each_case("name", ["accelerator", "checkpoint_format", "ema", "parallelism", "peft", "sample_weighting"])
+def test_what_only_lerobots_loop_does_is_refused(name: str, tmp_path: Path) -> None:
+    """Some of these options came after version 0.6.1 of LeRobot."""
+    config = parse_train(options(tmp_path, tmp_path / "run")).config
+    refuse_unsupported(config)
+    for owner, option in ((config, name), (config.dataset, "exclude_episodes")):
+        before = vars(owner).get(option)
+        setattr(owner, option, [1])
+        with pytest.raises(ConfigError, match=f"{option} is not for bhd-train"):
+            refuse_unsupported(config)
+        setattr(owner, option, before)

@@ -15,10 +15,7 @@ from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 
-# LeRobot requires it, so it is there; its absence would be a finding of its own.
-from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
-from packaging.utils import canonicalize_name
 
 from bhd_lerobot.apps.doctor.trials import Outcome
 from bhd_lerobot.realtime.privileges import (
@@ -28,8 +25,8 @@ from bhd_lerobot.realtime.privileges import (
     Grant,
     real_interpreter,
 )
+from bhd_lerobot.versions import DISTRIBUTION, required_versions
 
-DISTRIBUTION = "lerobot_robot_bhd"
 ROBOTS = ("turtlebot3", "ur5")
 TELEOPERATORS = ("bhd_brain",)
 
@@ -124,7 +121,7 @@ ROWS: dict[str, Finding] = {
         _W,
         "what the plug-in has is an invalid choice for every command",
         "{error}",
-        "Mend the plug-in, or uninstall it: `uv pip uninstall NAME`.",
+        "repair the plug-in, or uninstall it: `uv pip uninstall NAME`",
     ),
     "opengl.missing": Finding(
         "OpenGL",
@@ -341,7 +338,7 @@ def check_versions(
         version_of: returns the version of an installed package.
     """
     try:
-        required = _requirements()
+        required = required_versions(DISTRIBUTION)
     except metadata.PackageNotFoundError:
         return [wrong("package.missing", "not installed", name=DISTRIBUTION)]
     findings = []
@@ -359,19 +356,6 @@ def check_versions(
     return findings
 
 
-def _requirements() -> dict[str, SpecifierSet]:
-    """Return which versions of which packages ours requires on this machine, without those of its extras.
-
-    A package may be named several times; all of that holds at once.
-    """
-    required: dict[str, SpecifierSet] = {}
-    for requirement in map(Requirement, metadata.requires(DISTRIBUTION) or []):
-        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-            name = canonicalize_name(requirement.name)
-            required[name] = required.get(name, SpecifierSet()) & requirement.specifier
-    return required
-
-
 def check_plugins(outcome: Outcome) -> list[Finding]:
     """Judge what `trials.list_plugins` found."""
     if outcome.kind != "value":
@@ -384,6 +368,7 @@ def check_plugins(outcome: Outcome) -> list[Finding]:
     others = [name for name in known["bodies"] if name not in ROBOTS]
     return [
         fine("plug-ins", f"LeRobot knows {', '.join((*ROBOTS, *others, *TELEOPERATORS))}"),
+        *(fine("plug-ins", text) for text in known.get("installed", ())),
         *(wrong("plugins.failed", text, error=text) for text in known["failed"]),
     ]
 

@@ -45,11 +45,13 @@ def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
         run: how to try something out in a process of its own.
     """
     rights, ffmpeg, opengl, plugins = run([["rights"], ["ffmpeg"], ["opengl"], ["plug-ins"]], TIMEOUT_S)
+    versions = checks.check_versions()
+    renders = not any(one.status is Status.PROBLEM and "mujoco" in one.found for one in versions)
     return [
         *checks.check_python(),
-        *checks.check_versions(),
+        *versions,
         *checks.check_plugins(plugins),
-        *checks.check_opengl(opengl),
+        *(checks.check_opengl(opengl) if renders else []),
         *checks.check_ffmpeg(ffmpeg),
         *checks.check_rights(rights),
         *checks.check_kernel(),

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from typing import Any, Literal
 
 from bhd_lerobot.apps.doctor.latency_test import measure
@@ -148,22 +149,63 @@ def render() -> dict[str, Any]:
 
 
 def list_plugins() -> dict[str, list[str]]:
-    """Return the types of robots and teleoperators that LeRobot knows after it has searched for plug-ins."""
+    """Return the types of robots and teleoperators that LeRobot knows after it has searched for plug-ins.
+
+    Also what each plug-in of other packages has registered, and which could not be imported, in sentences.
+    """
+    from lerobot.cameras.configs import CameraConfig
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
     from lerobot.robots.config import RobotConfig
     from lerobot.teleoperators.config import TeleoperatorConfig
-    from lerobot.utils.import_utils import register_third_party_plugins
 
-    from bhd_lerobot.plugins import BODIES, load_plugins
+    from bhd_lerobot.plugins import BODIES, import_plugins, misnamed
+    from bhd_lerobot.policies.brain import BrainConfig
+    from bhd_lerobot.stock import register_third_party_plugins
+    from bhd_lerobot.tasks.task import TaskConfig
 
-    failed: list[str] = []
-    load_plugins(failed.append)
+    kinds = {
+        "robot": RobotConfig,
+        "teleoperator": TeleoperatorConfig,
+        "camera": CameraConfig,
+        "policy": PreTrainedConfig,
+        "environment": EnvConfig,
+        "task": TaskConfig,
+        "brain": BrainConfig,
+    }
+    known: set[tuple[str, str]] = set()
+    registered: dict[str, list[str]] = {}
+    failed = [f"The plug-in {name} is not imported: {reason}" for name, reason in misnamed()]
+    for name, error in import_plugins():
+        if not error:
+            registered.setdefault(name, [])
+        else:
+            failed.append(f"The plug-in {name} cannot be imported, and what it has is missing: {error}")
+        for kind, registry in kinds.items():
+            for choice, config in registry.get_known_choices().items():
+                package = config.__module__.partition(".")[0]
+                if (kind, choice) in known or package in ("lerobot", "bhd_lerobot"):
+                    continue
+                known.add((kind, choice))
+                # One plug-in may have imported another.
+                registered.setdefault(package if package.startswith("lerobot_") else name, []).append(
+                    f"{kind} {choice}"
+                )
     register_third_party_plugins()
     return {
         "failed": failed,
+        "installed": [f"{_with_version(name)}: {', '.join(has) or 'nothing'}" for name, has in registered.items()],
         "bodies": list(BODIES),
         "robots": sorted(RobotConfig.get_known_choices()),
         "teleoperators": sorted(TeleoperatorConfig.get_known_choices()),
     }
+
+
+def _with_version(name: str) -> str:
+    try:
+        return f"{name} {metadata.version(name)}"
+    except metadata.PackageNotFoundError:  # the module of an entry point
+        return name
 
 
 TRIALS: dict[str, Callable[..., Any]] = {

@@ -112,7 +112,7 @@ def _selection(options: argparse.Namespace) -> "Select | None":
     wanted = EpisodeFilter(outcome=split_list(options.outcome) or "all", min_score=options.min_score)
 
     def select(folder: Path) -> Sequence[int]:
-        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+        from bhd_lerobot.stock import LeRobotDatasetMetadata
 
         try:
             return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)

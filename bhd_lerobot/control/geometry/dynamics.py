@@ -1,5 +1,6 @@
 """Rigid-body dynamics of an arm: what torques do to it, and what a tool sees of its inertia."""
 
+import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,11 @@ import pinocchio
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.versions import check_version
+
+check_version("pin")
 
 Array = NDArray[np.float64]
 
@@ -73,15 +78,18 @@ class ArmDynamics:
             )
         whole = _parse(arm)
         joints, wanted = tuple(whole.names)[1:], (*arm.chain.joints, *arm.gripper.joints)
-        if joints != wanted or not whole.existFrame(TOOL_SITE):
-            raise ConfigError(
-                f"The MJCF of {arm.name!r} has the joints {joints}; it needs {wanted} and a site {TOOL_SITE!r}."
-            )
+        if joints != wanted:
+            raise ConfigError(f"The MJCF of {arm.name!r} has the joints {joints}; it needs {wanted}.")
         posture = pinocchio.neutral(whole)
+        if not whole.existFrame(TOOL_SITE):
+            if not re.search(rf"<site\b[^>]*\bname=[\"']{TOOL_SITE}[\"']", arm.mjcf):
+                raise ConfigError(f"The MJCF of {arm.name!r} has no site {TOOL_SITE!r}, the tool centre point.")
+            _add_tool(whole, arm, posture)
         posture[-2:] = opening / 2
         locked = [whole.getJointId(name) for name in arm.gripper.joints]
         self.model = pinocchio.buildReducedModel(whole, locked, posture)
         self.dof = self.model.nv
+        self.model.armature = whole.armature[: self.dof]  # version 3 of Pinocchio drops it; the fingers are the last
         self._data = self.model.createData()
         self._tool = self.model.getFrameId(TOOL_SITE)
         if arm.load:
@@ -146,6 +154,15 @@ def acceleration_share(arm: Arm) -> float:
 def product(matrices: Array, vectors: Array) -> Array:
     """Return each matrix, shape (n, i, j), times its vector, shape (n, j); the same bits whatever n is."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _add_tool(whole: pinocchio.Model, arm: Arm, posture: Array) -> None:
+    """Add the tool frame, of the arm's chain: Pinocchio reads the sites of an MJCF since version 4 only."""
+    data = whole.createData()
+    pinocchio.forwardKinematics(whole, data, posture)
+    last = whole.getJointId(arm.chain.joints[-1])
+    tool = pinocchio.SE3(ForwardKinematics(arm.chain).tool(posture[:DOF]))
+    whole.addFrame(pinocchio.Frame(TOOL_SITE, last, 0, data.oMi[last].actInv(tool), pinocchio.FrameType.OP_FRAME))
 
 
 def _parse(arm: Arm) -> pinocchio.Model:

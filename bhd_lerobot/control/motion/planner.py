@@ -18,6 +18,7 @@ from bhd_lerobot.control.motion.trajectory import (
     State,
     Trajectory,
     at_once,
+    load_ruckig,
     to_rest,
     to_target,
 )
@@ -55,9 +56,13 @@ class GoalPlanner:
         arm: limits and geometry.
         control_hz: ticks a second [Hz].
         kinematics: the arm's; made from its chain if None.
+
+    Raises:
+        VersionError: Ruckig is not installed.
     """
 
     def __init__(self, arm: Arm, control_hz: int, kinematics: ArmKinematics | None = None) -> None:
+        load_ruckig()  # not in the tick that plans the first goal
         self.arm, self.hz = arm, control_hz
         self.kinematics = ArmKinematics(arm.chain, arm.limits) if kinematics is None else kinematics
         self.dof = dof = len(arm.chain.joints)

@@ -1,21 +1,40 @@
 """Jerk-limited trajectories sampled at control ticks: to a target, and to rest. Pure: no clock, no state, no plant."""
 
 from dataclasses import dataclass, replace
-from typing import Self
+from functools import cache
+from importlib import import_module
+from typing import Any, Self
 
 import numpy as np
-import ruckig
 from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.errors import VersionError
+from bhd_lerobot.versions import check_version
 
 Array = NDArray[np.float64]
 
 MAX_DURATION_S = 120.0  # [s] a trajectory is kept as a list of ticks; a longer one is a mistake in its limits
 _SLACK = 1e-9  # [rad or m; also per s, per s^2] what rounding may add to a state
 _ROUNDING = 1e-9  # as a share of a speed
-_CODES = {int(code): name for name, code in ruckig.Result.__members__.items()}
+
+
+@cache
+def load_ruckig() -> Any:
+    """Return Ruckig, which only arms need: it is imported with the first, and not before its first motion.
+
+    Raises:
+        VersionError: it is not installed; the message says how to get it where there is no wheel.
+    """
+    try:
+        check_version("ruckig")
+    except VersionError as error:
+        raise VersionError(
+            f"Arms need Ruckig. {error}. Where there is no wheel, as for 64-bit ARM, that builds it, with a C++ "
+            "compiler: apt-get install g++ cmake"
+        ) from error
+    return import_module("ruckig")
 
 
 @dataclass(frozen=True)
@@ -163,7 +182,7 @@ def to_target(
         brake_limits: the limits to brake with if gentler ones do not suffice; `limits` if None.
     """
     goal = np.asarray(target, np.float64)
-    first = _calculate(start, goal, limits, hz, ruckig.Synchronization.Phase)
+    first = _calculate(start, goal, limits, hz, "Phase")
     if isinstance(first, Trajectory):
         straight = _straight(start, goal, limits, hz)
         if straight is not None and straight.ticks <= first.ticks:
@@ -174,7 +193,7 @@ def to_target(
     brake = to_rest(start, limits if brake_limits is None else brake_limits, hz)
     if isinstance(brake, PlanFailure):
         return first if isinstance(first, PlanFailure) else brake
-    second = _calculate(State.at_rest(brake.target), goal, limits, hz, ruckig.Synchronization.Phase)
+    second = _calculate(State.at_rest(brake.target), goal, limits, hz, "Phase")
     return brake.then(second) if isinstance(second, Trajectory) else second
 
 
@@ -189,13 +208,13 @@ def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFai
         limits: the limits; those of a stop if it is urgent.
         hz: ticks a second [Hz].
     """
-    brake = _calculate(start, None, limits, hz, ruckig.Synchronization.No)
+    brake = _calculate(start, None, limits, hz, "No")
     if isinstance(brake, PlanFailure) or _stays_within(brake, start, limits):
         return brake
     lower, upper = _bounds(start, limits)
     outside = ((brake.position < lower - _SLACK) | (brake.position > upper + _SLACK)).any(axis=0)
     target = np.where(outside, np.clip(brake.target, lower, upper), brake.target)
-    back = _calculate(start, target, limits, hz, ruckig.Synchronization.No)
+    back = _calculate(start, target, limits, hz, "No")
     if isinstance(back, PlanFailure):
         return brake
     pick = np.flatnonzero(outside)
@@ -243,7 +262,7 @@ def _straight(start: State, goal: Array, limits: MotionLimits, hz: int) -> Traje
             (limit / np.abs(share)).min(keepdims=True) for limit in (limits.velocity, limits.acceleration, limits.jerk)
         )
     most = replace(limits[one], velocity=velocity, acceleration=acceleration, jerk=jerk)
-    along = _calculate(start[one], goal[one], most, hz, ruckig.Synchronization.No)
+    along = _calculate(start[one], goal[one], most, hz, "No")
     if isinstance(along, PlanFailure):
         return None
     position = start.position + (along.position - start.position[lead]) * share
@@ -252,15 +271,15 @@ def _straight(start: State, goal: Array, limits: MotionLimits, hz: int) -> Traje
 
 
 def _calculate(
-    start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: ruckig.Synchronization
+    start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: str
 ) -> Trajectory | PlanFailure:
     """Let Ruckig calculate a trajectory to a target, or to rest where the target is None."""
-    dof = len(start.position)
+    ruckig, dof = load_ruckig(), len(start.position)
     numbers = (start.position, start.velocity, start.acceleration, *(() if target is None else (target,)))
     if not np.isfinite(numbers).all():
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory from or to what is not finite: {numbers}.")
     request = ruckig.InputParameter(dof)
-    request.synchronization = synchronization
+    request.synchronization = getattr(ruckig.Synchronization, synchronization)
     request.current_position = start.position
     request.current_velocity = start.velocity
     request.current_acceleration = start.acceleration
@@ -277,7 +296,7 @@ def _calculate(
     except (ruckig.RuckigError, ValueError) as error:  # its bindings do not know all of its own results
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: {error}")
     if code < 0:
-        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_CODES.get(code, code)}.")
+        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_name_of(code)}.")
     if not answer.duration <= MAX_DURATION_S:
         return PlanFailure(
             ResultCode.PLANNING_FAILED,
@@ -303,7 +322,12 @@ def _top_speed(start: State, limits: MotionLimits) -> Array:
     return np.where(on_it, np.maximum(peak, limits.velocity) * (1 + _ROUNDING), limits.velocity)
 
 
-def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:
+def _name_of(code: int) -> str:
+    names = load_ruckig().Result.__members__.items()
+    return next((name for name, one in names if int(one) == code), str(code))
+
+
+def sample(answer: Any, hz: int) -> Trajectory:
     """Return what a Ruckig trajectory is at ticks 1 to T; T is the first at or after its end.
 
     Between two switches the jerk is constant. Each dimension has up to nine such segments: two in which it is brought

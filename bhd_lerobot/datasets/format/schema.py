@@ -164,7 +164,8 @@ def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
 def _language() -> tuple[pa.DataType, Any]:
     """Return the Arrow type of LeRobot's persistent language column, and its description for `datasets`."""
     from datasets import Features
-    from lerobot.datasets import language  # seconds to import, and rarely needed
+
+    from bhd_lerobot.stock import language  # seconds to import, and rarely needed
 
     described = Features({"column": language.language_persistent_column_feature()}).to_dict()["column"]
     return language.language_persistent_arrow_type(), described

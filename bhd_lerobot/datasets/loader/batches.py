@@ -87,7 +87,7 @@ class LeRobotLoader(Loader):
     ) -> None:
         """Start `num_workers` processes that decode, on the first batch."""
         super().__init__(dataset, order, device)
-        from lerobot.utils.collate import lerobot_collate_fn
+        from bhd_lerobot.stock import lerobot_collate_fn
 
         self._epoch = _Epoch()
         self._loader = torch.utils.data.DataLoader(

@@ -21,7 +21,7 @@ from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.errors import DatasetError, MemoryBudgetError, UnsupportedDatasetError
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 GIB = 2**30
 _MEMORY = Path("/proc/meminfo")
@@ -251,7 +251,7 @@ class FrameCache:
         )
 
     def _decode_lerobot(self, job: _Job) -> None:
-        from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
+        from bhd_lerobot.stock import FrameTimestampError, decode_video_frames
 
         for begin in range(0, len(job.times), 64):
             part = slice(begin, begin + 64)

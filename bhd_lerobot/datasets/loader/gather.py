@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, unknown_name
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 Batch = dict[str, Any]
 """Key -> tensor of shape (B, ...), or list of B strings: what PyTorch's default collate makes of LeRobot's samples."""

@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.loader.table_dataset import TableDataset
 from bhd_lerobot.errors import ConfigError, DatasetError, MemoryBudgetError, UnsupportedDatasetError, quoted
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 __all__ = [
     "Batch",
@@ -158,7 +158,7 @@ def _in_memory(
 def _lerobot_dataset(
     meta: "LeRobotDatasetMetadata", episodes: Sequence[int], config: LoaderConfig, transforms: Any, reason: str
 ) -> Any:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from bhd_lerobot.stock import LeRobotDataset
 
     times = config.delta_timestamps
     dataset = LeRobotDataset(

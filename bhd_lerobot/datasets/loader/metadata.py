@@ -4,11 +4,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets import Dataset
 from datasets.table import table_cast
-from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
-from lerobot.datasets.io_utils import load_info, load_stats, load_tasks
-from lerobot.datasets.utils import EPISODES_DIR, check_version_compatibility
 
 from bhd_lerobot.datasets.format.state import UNREADABLE, corrupt
+from bhd_lerobot.stock import (
+    CODEBASE_VERSION,
+    EPISODES_DIR,
+    LeRobotDatasetMetadata,
+    check_version_compatibility,
+    load_info,
+    load_stats,
+    load_tasks,
+)
 
 
 class Metadata(LeRobotDatasetMetadata):

@@ -19,7 +19,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 HOLD_OUTS = ("episode", "instruction")
 """Of what a share is held out: of all episodes, or of those of each instruction, as LeRobot does it."""

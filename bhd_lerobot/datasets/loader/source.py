@@ -11,7 +11,7 @@ from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 
 def local_metadata(
@@ -34,11 +34,11 @@ def local_metadata(
         ConfigError: a revision is named of a dataset that is on this machine, where nobody knows which it is.
         DatasetError: it is not on this machine, and downloading it failed.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     from bhd_lerobot.datasets.loader.metadata import Metadata
     from bhd_lerobot.datasets.loader.table import checked
+    from bhd_lerobot.stock import LeRobotDataset
 
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     if revision is not None and (folder / layout.INFO).is_file() and not (folder / ".cache/huggingface").is_dir():

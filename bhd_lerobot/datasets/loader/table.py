@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.storage.places import wrong_info
 from bhd_lerobot.errors import DatasetError, unknown_name
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 _TEXT = "string"
 

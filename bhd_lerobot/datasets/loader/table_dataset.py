@@ -15,14 +15,14 @@ from bhd_lerobot.datasets.loader.table import FrameTable, checked_episodes
 from bhd_lerobot.errors import DatasetError, MemoryBudgetError, unknown_name
 
 if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from bhd_lerobot.stock import LeRobotDatasetMetadata
 
 
 class TableDataset:
     """A LeRobot dataset that lies in memory: tables as tensors, camera frames decoded.
 
     `dataset[i]` is what `LeRobotDataset[i]` is, and `dataset.batch(indices)` what PyTorch's default collate makes of
-    such samples (LeRobot's collate if there are language columns, which it leaves out), key by key, to the last bit.
+    such samples (LeRobot's collate if there are language columns), key by key, to the last bit.
 
     Attributes:
         repo_id, root, revision, meta, delta_timestamps, image_transforms, tolerance_s: as in `LeRobotDataset`.
@@ -191,10 +191,21 @@ class TableDataset:
         Returns:
             What `default_collate([lerobot_dataset[i] for i in indices])` returns, in memory of its own.
         """
-        batch = self._store.gather(indices if self._rows is None else self._rows[indices], self.return_uint8)
+        rows = indices if self._rows is None else self._rows[indices]
+        batch = self._store.gather(rows, self.return_uint8) | self._language(rows)
         if self.image_transforms is not None:
             self._transform(batch, len(indices))
         return batch
+
+    def _language(self, rows: Tensor) -> Batch:
+        """Return what LeRobot's collate keeps of language columns: nothing in version 0.6.1, later lists of them."""
+        if not self.table.nested:
+            return {}
+        from bhd_lerobot.stock import lerobot_collate_fn
+
+        columns = self.table.nested.items()
+        samples = [{"index": 0} | {key: column[row].as_py() for key, column in columns} for row in rows.tolist()]
+        return {key: values for key, values in lerobot_collate_fn(samples).items() if key != "index"}
 
     def _transform(self, batch: Batch, size: int) -> None:
         # Sample by sample and camera by camera, so that random transforms draw as they do in LeRobot.

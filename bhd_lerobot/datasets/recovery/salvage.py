@@ -253,7 +253,7 @@ def schema_of(root: Path, info: dict[str, Any]) -> pa.Schema:
     Raises:
         DatasetCorruptError: it does not.
     """
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
+    from bhd_lerobot.stock import get_hf_features_from_features
 
     try:
         features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}

@@ -30,7 +30,7 @@ def stats_of(
         rows: of the episodes, with the places of their videos.
         stored: statistics of each episode's images that are known already. Those of depth are never computed here.
     """
-    from lerobot.datasets.compute_stats import compute_episode_stats
+    from bhd_lerobot.stock import compute_episode_stats
 
     plain = {
         key: {**feature, "shape": tuple(feature["shape"])}

@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
-from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.mlp.processor_mlp import floored
+from bhd_lerobot.stock import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 OBS_ODOMETRY = "observation.bhd_odometry"
 """Key of x [m], y [m] and yaw [rad] as they were measured, beside the normalised `observation.state`."""

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
+from bhd_lerobot.stock import ACTTemporalEnsembler
 
 type Rows = dict[str, NDArray]
 """Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3).
@@ -199,6 +199,7 @@ class BatchedInference:
 class StockInference:
     """LeRobot's own `select_action`, with a copy of the policy for every simulation: any policy there is.
 
+    Of a policy that has chunks and no `select_action`, the first `n_action_steps` of each chunk are carried out.
     The copies share the weights; only what a policy remembers is theirs. One simulation after the other, so n of them
     take n times as long as one.
 
@@ -214,6 +215,7 @@ class StockInference:
     def __init__(self, loaded: LoadedPolicy, *, threads: int | None) -> None:
         self.loaded, self._threads = loaded, threads
         self._policies: dict[int, Any] = {}
+        self._chunks: dict[int, list[Tensor]] = {}
         self._random: dict[int, list[Tensor]] = {}
         self._instructions: dict[int, str] = {}
         device = torch_device(loaded)
@@ -225,6 +227,7 @@ class StockInference:
             if sim not in self._policies:
                 self._policies[sim] = _twin(self.loaded.policy)
             self._policies[sim].reset()
+            self._chunks[sim] = []
             self._instructions[sim] = instructions[i] if i < len(instructions) else ""
             with torch.random.fork_rng(self._cuda):
                 torch.manual_seed(seed)
@@ -243,10 +246,33 @@ class StockInference:
                     torch.set_rng_state(self._random[sim][0])
                     if self._cuda:
                         torch.cuda.set_rng_state(self._random[sim][1], self._cuda[0])
-                    action = self.loaded.after(self._policies[sim].select_action(self.loaded.before(batch)))
+                    action = self.loaded.after(self._next_action(sim, self.loaded.before(batch)))
                     self._random[sim] = self._random_state()
                 actions.append(action.to("cpu", torch.float32).numpy())
         return np.stack(actions)
+
+    def _next_action(self, sim: int, batch: dict[str, Any]) -> Tensor:
+        policy, chunk = self._policies[sim], self._chunks[sim]
+        if not chunk:
+            try:
+                return policy.select_action(batch)
+            except NotImplementedError as error:
+                chunk += self._predict(policy, batch, error)
+        return chunk.pop(0)
+
+    def _predict(self, policy: Any, batch: dict[str, Any], missing: NotImplementedError) -> tuple[Tensor, ...]:
+        """Return the actions of a chunk that are carried out, each of shape (1, actions)."""
+        try:
+            chunk = policy.predict_action_chunk(batch)
+        except Exception as error:  # whatever it wants besides
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ConfigError(
+                f"The policy type {self.loaded.kind!r} cannot be executed here: it gives no single actions "
+                f"({' '.join(str(missing).split()) or 'no select_action'}), and no chunk for an observation alone "
+                f"({reason}). Run it with the program that it was made for."
+            ) from error
+        steps = getattr(self.loaded.config, "n_action_steps", None) or chunk.shape[1]
+        return chunk[:, :steps].unbind(1)
 
     def _random_state(self) -> list[Tensor]:
         return [torch.get_rng_state(), *(torch.cuda.get_rng_state(index) for index in self._cuda)]

@@ -11,7 +11,6 @@ from typing import Any
 import lerobot.policies  # noqa: F401 - registers LeRobot's own policies
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import RenameObservationsProcessorStep
 from lerobot.utils.constants import (
     ACTION,
@@ -20,12 +19,12 @@ from lerobot.utils.constants import (
     POLICY_POSTPROCESSOR_DEFAULT_NAME,
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
-from lerobot.utils.device_utils import is_torch_device_available
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.plugins import POLICIES, load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
+from bhd_lerobot.stock import get_policy_class, is_torch_device_available, make_pre_post_processors
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
@@ -13,6 +12,7 @@ from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.objects_mlp import ObjectOrderProcessorStep
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
 from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
+from bhd_lerobot.stock import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 type Pipelines = tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]

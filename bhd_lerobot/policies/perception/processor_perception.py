@@ -4,10 +4,10 @@ from typing import Any
 
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 from torch import Tensor
 
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
+from bhd_lerobot.stock import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 
 def make_bhd_perception_pre_post_processors(

@@ -8,13 +8,13 @@ import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import PolicyAction, TransitionKey
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
-from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.processor_mlp import floored
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
+from bhd_lerobot.stock import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 
 @ProcessorStepRegistry.register(name="bhd_instruction_processor")

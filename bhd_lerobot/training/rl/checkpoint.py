@@ -6,9 +6,9 @@ from typing import Any
 
 import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
-from lerobot.utils.random_utils import load_rng_state, save_rng_state
 
 from bhd_lerobot.errors import ConfigError, quoted
+from bhd_lerobot.stock import load_rng_state, save_rng_state
 from bhd_lerobot.training.checkpoint import writing
 from bhd_lerobot.training.rl.parts import RlParts
 

@@ -237,6 +237,53 @@ def test_nothing_is_wrong_with_a_healthy_machine(name: str, tmp_path: Path) -> N
     assert list(tmp_path.rglob("*bhd-doctor*")) == []
 
 
+PLUGIN = """
+from dataclasses import dataclass
+import bhd_lerobot as bhd
+from lerobot.robots.config import RobotConfig
+import lerobot.robots.so_follower
+
+@RobotConfig.register_subclass("alpha_robot")
+@dataclass
+class AlphaConfig(RobotConfig):
+    pass
+
+@dataclass
+class Config(bhd.BrainConfig):
+    pass
+
+bhd.BrainConfig.register_subclass("alpha_brain")(Config)
+"""
+
+
+def test_each_plugin_is_named_with_what_it_registered_or_why_it_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modules = {
+        "lerobot_robot_alpha": PLUGIN,
+        "lerobot_policy_beta": "import lerobot_robot_alpha",  # what that has is not its own
+        "lerobot_camera_gamma": "raise ImportError('no driver')",
+        "lerobot-robot-delta": "raise AssertionError('LeRobot does not import it')",
+    }
+    for name, text in modules.items():
+        (tmp_path / f"{name.replace('-', '_')}.py").write_text(text, encoding="utf-8")
+        about = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    findings = checks.check_plugins(run_trials([["plug-ins"]])[0])
+    assert [one.found for one in findings if one.status is Status.OK][1:] == [
+        "lerobot_policy_beta 1.0: nothing",
+        "lerobot_robot_alpha 1.0: robot alpha_robot, brain alpha_brain",
+    ]
+    causes = [one.cause for one in findings if one.status is not Status.OK]
+    assert len(causes) == 2
+    assert causes[0].startswith("The plug-in lerobot-robot-delta is not imported: ")
+    assert "'lerobot_robot_delta'" in causes[0]
+    assert causes[1].startswith("The plug-in lerobot_camera_gamma cannot be imported")
+    assert causes[1].endswith("ImportError: no driver")
+
+
 # --- what can be wrong -----------------------------------------------------------------------------------------------
 
 

@@ -1,14 +1,17 @@
 """The rigid-body model beside two oracles: the closed-form kinematics, and the engine that simulates the same MJCF."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
+import pinocchio
 import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 
@@ -93,3 +96,30 @@ def test_a_body_that_does_not_fit_its_chain_is_refused() -> None:
         ArmDynamics(replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="large"', 'name="knee" class="large"')))
     with pytest.raises(ConfigError, match="not valid"):
         ArmDynamics(replace(ARM, mjcf="<mujoco"))
+    with pytest.raises(ConfigError, match="has no site 'tool'"):
+        ArmDynamics(replace(ARM, mjcf=ARM.mjcf.replace('<site name="tool"', '<site name="tip"')))
+
+
+def test_it_is_the_same_with_version_3_of_pinocchio(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That one reads no sites, and drops the rotors' inertia where joints are held."""
+    read, reduce = pinocchio.buildModelFromMJCF, pinocchio.buildReducedModel
+
+    def without_sites(path: str) -> pinocchio.Model:
+        text = Path(path).read_text(encoding="utf-8")
+        Path(path).write_text(re.sub(r"<site[^>]*/>", "", text), encoding="utf-8")
+        return read(path)
+
+    def without_rotors(*arguments: object) -> pinocchio.Model:
+        model = reduce(*arguments)
+        model.armature = 0 * model.armature
+        return model
+
+    for load in (0.0, 1.5):
+        expected = ArmDynamics(replace(ARM, load=load)).terms(POSTURES, SPEEDS)
+        with monkeypatch.context() as patch:
+            patch.setattr(pinocchio, "buildModelFromMJCF", without_sites)
+            patch.setattr(pinocchio, "buildReducedModel", without_rotors)
+            assert not _parse(ARM).existFrame("tool")
+            terms = ArmDynamics(replace(ARM, load=load)).terms(POSTURES, SPEEDS)
+        for name in ("mass", "coriolis", "gravity", "jacobian", "tool"):
+            np.testing.assert_allclose(getattr(terms, name), getattr(expected, name), atol=1e-12)

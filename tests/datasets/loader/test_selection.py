@@ -99,7 +99,7 @@ def test_the_split_by_instruction_is_that_of_lerobot(plain: Path, share: float) 
 
     policy = SimpleNamespace(reward_delta_indices=None, action_delta_indices=[0, 1], observation_delta_indices=None)
     dataset = DatasetConfig("t/t", root=str(plain), eval_split=share, video_backend="pyav")
-    config: Any = SimpleNamespace(dataset=dataset, trainable_config=policy, tolerance_s=1e-4)
+    config: Any = SimpleNamespace(dataset=dataset, trainable_config=policy, tolerance_s=1e-4, rename_map={})
     theirs = make_train_eval_datasets(config)
     ours = split_episodes(open_metadata(plain), None, share, "instruction")
     assert ours == tuple(dataset.episodes for dataset in theirs)

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.policies.learned.inference import StockInference
@@ -69,6 +70,34 @@ def test_any_policy_runs_as_copies_with_the_actions_of_lerobot(checkpoints: dict
     own, copy = brain.loaded.policy, brain.inference._policies[0]
     assert own is not copy
     assert all(a is b for a, b in zip(own.parameters(), copy.parameters(), strict=True))
+
+
+def lacking(*arguments: Any) -> Any:
+    raise NotImplementedError("It has chunks only.")
+
+
+def test_the_chunks_of_a_policy_without_single_actions_are_carried_out(checkpoints: dict[str, Path]) -> None:
+    brain, stock = make_brain(checkpoints["act"]), Stock(checkpoints["act"])
+    brain.loaded.policy.select_action = lacking
+    brain.inference = StockInference(brain.loaded, threads=None)
+    for seeds in ([3, 4], [5, 6]):  # a second episode begins in the middle of the first one's chunk
+        seen = list(observations(2, FRAMES, seeds[0]))
+        actions = drive(brain, seen, seeds)
+        for sim, seed in enumerate(seeds):
+            stock.reset(seed)
+            wanted = np.array([stock.act(one, sim) for one in seen])
+            assert np.array_equal(actions[:, sim], wanted.astype(np.float64))
+
+
+def test_a_policy_whose_chunks_need_more_than_an_observation_is_refused(checkpoints: dict[str, Path]) -> None:
+    brain = make_brain(checkpoints["act"])
+    brain.loaded.policy.select_action = lacking
+    brain.loaded.policy.predict_action_chunk = lambda batch: batch["inference_action"]
+    brain.inference = StockInference(brain.loaded, threads=None)
+    with pytest.raises(ConfigError) as raised:
+        drive(brain, list(observations(1, 1)), [0])
+    for part in ("'act'", "It has chunks only.", "KeyError: 'inference_action'"):
+        assert part in str(raised.value)
 
 
 @pytest.mark.parametrize("kind", KINDS)
