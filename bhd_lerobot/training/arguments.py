@@ -21,7 +21,6 @@ from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import find_checkpoint
 from bhd_lerobot.rollout import configuration
-from bhd_lerobot.stock import auto_select_torch_device
 from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig, plain
 
 
