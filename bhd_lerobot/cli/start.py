@@ -8,10 +8,12 @@ import ctypes
 import importlib
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from bhd_lerobot import __version__
 from bhd_lerobot.command_line import INTERRUPTED, exit_status
 from bhd_lerobot.versions import check_version
 
@@ -50,6 +52,9 @@ def run(module: str) -> int:
     # on two processors, beside four busy processes, a training made a fiftieth of its steps. Asleep they compute the
     # same bits. OpenMP reads this once, when PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if sys.argv[1:] == ["--version"]:
+        print(f"lerobot_robot_bhd {__version__}")
+        return 0
 
     def program() -> int | None:
         with leaving_on_interrupt():

@@ -32,10 +32,10 @@ SHORTER = {
         "videos=1,": "videos=0,",
     },
     "train_and_evaluate": {
-        '"num_episodes": 8}': '"num_episodes": 3, "episode_time_s": 10}',
-        "n_envs=8": "n_envs=3",
-        "steps=300": "steps=20",
-        "n_episodes=8": "n_episodes=2, videos=0",
+        '"num_episodes": 16}': '"num_episodes": 3, "episode_time_s": 10}',
+        "n_envs=16": "n_envs=3",
+        "steps=1000": "steps=20",
+        "n_episodes=16": "n_episodes=2, videos=0",
         'task="avoid",\n    brains': 'task={"type": "avoid", "duration_s": 10},\n    brains',
     },
 }

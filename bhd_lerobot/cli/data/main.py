@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from bhd_lerobot.cli.start import leaving_on_interrupt
-from bhd_lerobot.command_line import Parser, exit_status
+from bhd_lerobot.command_line import FAILED, Parser, exit_status
 from bhd_lerobot.datasets.storage.atomic import noting_what_is_done
 from bhd_lerobot.plugins import load_named
 
@@ -41,7 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         nonlocal stopped
-        options = parser.parse(load_named(sys.argv[1:] if arguments is None else arguments))
+        given = load_named(sys.argv[1:] if arguments is None else arguments)
+        if not given:
+            parser.print_help(sys.stderr)
+            return FAILED
+        options = parser.parse(given)
         try:
             return int(options.run(options))
         finally:
