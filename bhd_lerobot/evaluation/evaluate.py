@@ -217,9 +217,8 @@ def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
 
 def _facts(config: EvalConfig, simulation: Host, runs: Sequence[BrainRun]) -> dict[str, Any]:
     """Return what decides the numbers, as plain values; how many run side by side does not."""
-    robot = describe(simulation.config)
     return {
-        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in robot.items()},
+        "robot": describe(simulation.config),
         "task": runs[0].loop.task.parameters(),
         "brains": {brain_run.label: brain_run.timed.parameters() for brain_run in runs},
         "baseline": config.reference,
