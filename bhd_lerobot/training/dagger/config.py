@@ -210,7 +210,7 @@ def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
     return configuration.parse(AggregationConfig, arguments)
 
 
-def kept(folder: Path) -> dict[str, Any] | None:
+def kept(folder: Path) -> AggregationConfig | None:
     """Return the configuration that a folder's rounds were made with; None if there is none.
 
     An option that was not there yet when they were made has its default.
@@ -221,4 +221,4 @@ def kept(folder: Path) -> dict[str, Any] | None:
     file = folder / "config.yaml"
     if not file.is_file():
         return None
-    return configuration.encode(parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"]))
+    return parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"])
