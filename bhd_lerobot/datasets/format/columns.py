@@ -1,6 +1,6 @@
 """Columns of episodes, straight from their Parquet files: all of one episode, or a few of many."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,18 +61,29 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
         DatasetError: there is no such dataset or episode.
         DatasetCorruptError: the file cannot be read.
     """
+    return next(read_episodes(root, [index]))
+
+
+def read_episodes(root: Path | str, indices: Iterable[int]) -> Iterator[dict[str, NDArray]]:
+    """Yield every column of episodes as `read_episode` returns them, one episode at a time.
+
+    Raises:
+        DatasetError: there is no such dataset or episode.
+        DatasetCorruptError: a file cannot be read.
+    """
     root = Path(root)
     state = load_state(root)
-    path = root / layout.data_file(slot_of(_row(state, index), "data"))
-    try:
-        table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise corrupt(path, error) from error
-    return {
-        key: _to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
-        for key in table.column_names
-        if key in state.info["features"]
-    }
+    for index in indices:
+        path = root / layout.data_file(slot_of(_row(state, index), "data"))
+        try:
+            table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise corrupt(path, error) from error
+        yield {
+            key: _to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
+            for key in table.column_names
+            if key in state.info["features"]
+        }
 
 
 def _row(state: DatasetState, index: int) -> Row:

@@ -147,7 +147,7 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
 def _check_same(folder: Path, before: AggregationConfig, config: AggregationConfig, files: dict[str, Any]) -> None:
     """Refuse a configuration other than that of the rounds in a folder.
 
-    Of a configuration file what is in it counts, and of a dataset which folder it is, not by which path either is named.
+    Of a configuration file its content counts, and of a dataset which folder it is, not by which path it is named.
 
     Args:
         folder: of the rounds.
@@ -175,8 +175,8 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
             same = then == now or one.name in ("rounds", "output_dir")
         if not same:
             raise ConfigError(
-                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. Go on "
-                "with the same, or set another --output_dir."
+                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. Go "
+                "on with the same, or set another --output_dir."
             )
 
 
