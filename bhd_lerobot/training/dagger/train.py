@@ -25,6 +25,8 @@ from bhd_lerobot.recording import record
 from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
+    CONFIG,
+    FILES,
     OWN,
     AggregationConfig,
     StageConfig,
@@ -37,7 +39,7 @@ from bhd_lerobot.training.dagger.config import (
 from bhd_lerobot.training.dagger.curve import draw_curve
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
-_CONFIG, _FILES, _DONE = "config.yaml", "files.yaml", "done.json"
+_DONE = "done.json"
 _OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _SIGNALLED = 128  # what an exit status is above if a signal stopped the program
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
@@ -138,7 +140,7 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         _check_same(folder, before, config, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, what in ((_CONFIG, encode(config)), (_FILES, files)):
+        for name, what in ((CONFIG, encode(config)), (FILES, files)):
             Disk().publish(folder / name, yaml.safe_dump(what, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
@@ -158,7 +160,7 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
     Raises:
         ConfigError: names what differs, with both values.
     """
-    known = read_file(folder / _FILES) if (folder / _FILES).exists() else {}
+    known = read_file(folder / FILES) if (folder / FILES).exists() else {}
     for one in fields(config):
         then, now = getattr(before, one.name), getattr(config, one.name)
         if isinstance(now, StageConfig):
@@ -170,7 +172,7 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
                 )
             same = then.options == now.options and (content is not None or then.config == now.config)
         elif one.name == "data":
-            same = [_place(root) for root in then] == [_place(root) for root in now]
+            same = then == now or [_place(root) for root in then] == [_place(root) for root in now]
         else:
             same = then == now or one.name in ("rounds", "output_dir")
         if not same:

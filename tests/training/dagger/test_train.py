@@ -189,7 +189,7 @@ def test_what_was_reported_stays(finished: Path, tmp_path: Path, monkeypatch: py
     shutil.copytree(finished, tmp_path / "copy")
     run = tmp_path / "copy" / "run"
     before = (run / "rounds.json").read_bytes()
-    argument = [f"--config_path={finished / 'dagger.yaml'}", f"--output_dir={run}"]
+    argument = [f"--config_path={run / 'config.yaml'}"]  # that of the copy, which is where it lies now
     assert main([*argument, "--rounds=0"]) == 0
     assert (run / "rounds.json").read_bytes() == before
     row = dagger._Rounds._row
@@ -200,7 +200,7 @@ def test_what_was_reported_stays(finished: Path, tmp_path: Path, monkeypatch: py
         return row(self, number, folder)
 
     monkeypatch.setattr(dagger._Rounds, "_row", stopped)
-    assert main(argument) == 130
+    assert main([*argument, "--rounds=1"]) == 130
     assert (run / "rounds.json").read_bytes() == before
 
 
