@@ -10,7 +10,7 @@ from rich.console import Console
 from bhd_lerobot.cluster.cluster import connected
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
-from bhd_lerobot.cluster.pool import WorkerPool
+from bhd_lerobot.cluster.pool import CONTINUE, WorkerPool
 from bhd_lerobot.cluster.task import Task as ClusterTask
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
@@ -131,8 +131,5 @@ class ClusterLoop(EpisodeLoop):
 
     def _is_stopped(self) -> bool:
         if self.simulation.bridge.estop_pressed:
-            raise ClusterError(
-                "Emergency stop. Episodes that were running on the cluster were dropped, all others are saved. Go on "
-                "with --resume=true: the dropped ones are run again, the same."
-            )
+            raise ClusterError(f"Emergency stop. Episodes that were running on the cluster were dropped. {CONTINUE}")
         return False

@@ -18,6 +18,7 @@ from bhd_lerobot.cluster.job import Job
 from bhd_lerobot.cluster.task import Call, Task, Worker, cause_of, error_of
 from bhd_lerobot.errors import ClusterError
 
+CONTINUE = "What was recorded is saved; the same command runs the rest, bhd-record with --resume=true."
 _QUEUED = 2  # tasks that a worker has at a time: it goes on with the next while a result travels
 _WINDOW = 4  # tasks for each worker, finished or not, by which the run may be ahead of the oldest that is missing
 _DEATHS = 3  # of workers, with the same task in hand
@@ -236,8 +237,7 @@ class WorkerPool:
                 raise ClusterError(
                     f"{_DEATHS} workers were lost while they ran {worker.tasks[0]}, the last on {worker.host}: {cause} "
                     "Perhaps it needs more memory than they have: lower --n_envs or --ray.episodes_per_task. Ray's "
-                    "logs are on that machine, in /tmp/ray/session_latest/logs. What was saved is there; go on with "
-                    "--resume=true."
+                    f"logs are on that machine, in /tmp/ray/session_latest/logs. {CONTINUE}"
                 ) from error
         for task in worker.tasks:
             heapq.heappush(self._waiting, task)
@@ -254,7 +254,7 @@ class WorkerPool:
             raise ClusterError(
                 f"No worker could be started within {self._config.timeout_s:g} s (ray.timeout_s): each asks for "
                 f"{size_of(self._config)}, which others perhaps use. There is: {describe_machines()}. See `ray "
-                "status`; what was saved is there, go on with --resume=true."
+                f"status`. {CONTINUE}"
             )
 
     def _check_facts(self, worker: Worker, facts: dict[str, str]) -> None:

@@ -1,6 +1,5 @@
 """`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and videos."""
 
-import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
@@ -20,7 +19,7 @@ from rich.table import Table
 
 from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
-from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, RenderingError, counted
 from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
 from bhd_lerobot.evaluation.metrics import JerkMeasure
 from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
@@ -30,10 +29,10 @@ from bhd_lerobot.evaluation.text import number, percent, perception_sentence
 from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import Host, describe
-from bhd_lerobot.rollout.configuration import run
+from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import versions
-from bhd_lerobot.rollout.run_folder import run_folder
+from bhd_lerobot.rollout.run_folder import CONFIG, run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 
 
@@ -74,7 +73,8 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         )
     if results.is_partial:
         by = f" by {result.stopped_by.name}" if result.stopped_by else ""
-        console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.")
+        again = " The same command runs those that are missing." if config.record.repo_id else ""
+        console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.{again}")
     for label in result.missed:
         low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
         console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
@@ -174,6 +174,11 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
                 if stop or any(other.loop.emergency_stop or other.loop.fault for other in runs):
                     break
                 run_episodes(config, one, lambda: bool(stop), _shower(progress, bar, one))
+        for one in (one for one in runs if one.recorded):
+            console.print(
+                f"{escape(one.label)}: {counted(len(one.recorded), 'episode')} of {len(config.indices)} had been "
+                "recorded before, and were not run again."
+            )
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
@@ -217,9 +222,8 @@ def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
 
 def _facts(config: EvalConfig, simulation: Host, runs: Sequence[BrainRun]) -> dict[str, Any]:
     """Return what decides the numbers, as plain values; how many run side by side does not."""
-    robot = describe(simulation.config)
     return {
-        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in robot.items()},
+        "robot": describe(simulation.config),
         "task": runs[0].loop.task.parameters(),
         "brains": {brain_run.label: brain_run.timed.parameters() for brain_run in runs},
         "baseline": config.reference,
@@ -299,16 +303,25 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
 
 
 def _refuse_results(config: EvalConfig) -> None:
-    """Refuse a folder that holds the results of another evaluation.
+    """Refuse a folder that holds the results of another evaluation, or of this one if it is complete.
 
     Raises:
         ConfigError: names the folder.
     """
-    if config.output_dir and os.path.isfile(os.path.join(os.path.expanduser(config.output_dir), RESULTS_NAME)):
+    folder = Path(config.output_dir or "").expanduser()
+    if config.output_dir and (folder / RESULTS_NAME).is_file() and not _is_continued(config, folder):
         raise ConfigError(
             f"The folder {config.output_dir} holds the results of an evaluation ({RESULTS_NAME}). Set another "
             "--output_dir, or remove it."
         )
+
+
+def _is_continued(config: EvalConfig, folder: Path) -> bool:
+    """Return whether a folder holds partial results of the same evaluation, whose episodes were recorded."""
+    if config.record.repo_id is None:
+        return False
+    partial = read_file(folder / RESULTS_NAME).get("partial") is True
+    return partial and (folder / CONFIG).is_file() and read_file(folder / CONFIG) == encode(config)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

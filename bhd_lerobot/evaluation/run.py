@@ -1,7 +1,9 @@
 """One brain's part of an evaluation: its episodes, and what results and report need of them."""
 
+import heapq
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +14,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.cluster.loop import ClusterLoop
 from bhd_lerobot.cluster.pool import WorkerPool
+from bhd_lerobot.datasets.format.columns import read_episodes
 from bhd_lerobot.datasets.format.features import PHYSICS_STATE
 from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.summary import EpisodeSummary, dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError
+from bhd_lerobot.errors import BhdError, DatasetMismatchError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.policies.brain import Brain, is_privileged
@@ -26,7 +30,7 @@ from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.plots import Trajectory
-from bhd_lerobot.rollout.provenance import episode_metadata
+from bhd_lerobot.rollout.provenance import episode_metadata, recorded_episode, versions
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.operator import judged
 from bhd_lerobot.tasks.task import episode_seed
@@ -46,6 +50,7 @@ class BrainRun:
         trajectories: its episodes from above, by number.
         videos: of what videos are to be made: episode, scene and recorded physics states.
         initial_states: the simulator's complete states at the episodes' starts.
+        recorded: numbers of the episodes that had been recorded before, and were not run again.
         wall_s: duration of the run [s].
     """
 
@@ -56,6 +61,7 @@ class BrainRun:
     trajectories: dict[int, Trajectory] = field(default_factory=dict)
     videos: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
     initial_states: list[NDArray[np.float64]] = field(default_factory=list)
+    recorded: Collection[int] = ()
     wall_s: float = 0.0
 
     @property
@@ -66,12 +72,13 @@ class BrainRun:
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""
         calls = np.array(self.timed.times)
-        simulated = sum(episode.length_s for episode in self.episodes)
+        ran = [episode for episode in self.episodes if episode.episode not in self.recorded]
+        simulated = sum(episode.length_s for episode in ran)
         quantiles = dict(zip(("p50_s", "p99_s", "max_s"), np.quantile(calls, (0.5, 0.99, 1.0)).tolist(), strict=True))
         per = self.wall_s if self.wall_s > 0 else np.inf
         return {
             "wall_s": self.wall_s,
-            "episodes_per_s": len(self.episodes) / per,
+            "episodes_per_s": len(ran) / per,
             "real_time_factor": simulated / per,
             "act": {"calls": len(calls), "robots_per_call": self.loop.simulation.n, **quantiles},
             "episodes": {str(episode.episode): episode.wall for episode in self.episodes if episode.wall},
@@ -111,11 +118,16 @@ def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], sh
     split: Any = config.split
     specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
     with _recorder(config, one.label, loop) as recorder:
+        rows = _rows_of(recorder, specs) if recorder else {}
+        one.recorded = set(rows)
+        missing = [spec for spec in specs if spec.index not in rows]
         started = time.perf_counter()
-        for episode in loop.run(specs, stop, recorder.begin_episode if recorder else None):
+        run = loop.run(missing, stop, recorder.begin_episode if recorder else None)
+        known = _recorded_episodes(recorder, rows.values()) if recorder else iter(())
+        for episode in heapq.merge(known, run, key=lambda episode: episode.spec.index):
             track = track_of(simulation, episode.columns)
             metrics = measure(one.label, episode, track, jerk, fps)
-            if recorder:
+            if recorder and metrics.episode not in rows:
                 task, brain = loop.task.parameters(), loop.brain.parameters()
                 save_episode(recorder, episode, episode_metadata(episode, split=split, task=task, brain=brain))
             one.episodes.append(metrics)
@@ -125,12 +137,39 @@ def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], sh
             show()
 
 
+def _rows_of(recorder: DatasetRecorder, specs: Sequence[EpisodeSpec]) -> dict[int, EpisodeSummary]:
+    """Return which of the episodes a dataset holds, by their numbers, in ascending order.
+
+    Raises:
+        DatasetMismatchError: they were recorded with other versions, with which the others would not be comparable.
+    """
+    seeds = {spec.index: str(spec.seed) for spec in specs}
+    rows = {int(row.metadata["episode"]): row for row in dataset_info(recorder.root).episodes}
+    wanted = {number: row for number, row in sorted(rows.items()) if seeds.get(number) == row.metadata["seed"]}
+    for row in wanted.values():
+        then, now = json.loads(row.metadata["versions"]), versions()
+        if changed := [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]:
+            raise DatasetMismatchError(
+                f"The episodes in {recorder.root} were recorded with {'; '.join(changed)}: with those that are missing "
+                "they would be no evaluation. Set another --record.root, or use the versions of the recording."
+            )
+    return wanted
+
+
+def _recorded_episodes(recorder: DatasetRecorder, rows: Collection[EpisodeSummary]) -> Iterator[Episode]:
+    columns = read_episodes(recorder.root, [row.index for row in rows])
+    for row, values in zip(rows, columns, strict=True):
+        yield recorded_episode(row.metadata, values, row.task)
+
+
 @contextmanager
 def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[DatasetRecorder | None]:
     """Open the dataset of a brain, written as `bhd-record` writes it and complete at the end; None if none is wanted.
 
+    One that a stopped evaluation left is continued.
+
     Raises:
-        DatasetError: there is one already, or it cannot be written.
+        DatasetError: there is one of another evaluation, or it cannot be written.
     """
     if config.record.repo_id is None:
         yield None
@@ -144,6 +183,7 @@ def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[Dat
         task=config.task,
         seed=config.seed,
         split=config.split,
+        resume=True,
     )
     with open_recorder(recording, root, loop.simulation, loop.task, loop.brain) as recorder:
         yield recorder

@@ -272,9 +272,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         _check_expert(brain)
     # What decides the episodes. How many there are, and how many run side by side, does not.
     recording: dict[str, Any] = {
-        "robot": {
-            key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()
-        },
+        "robot": describe(simulation.config),
         "task": task.parameters(),
         "brain": brain.parameters(),
         "seed": config.seed,
@@ -285,6 +283,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         if EFFORT not in info.features:
             features.pop(EFFORT, None)  # the dataset is older than this column
         recording["task"] = _without_new(recording["task"], info.recording.get("task"), type(config.task))
+        recording["brain"] = _as_named_then(recording["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
     return make(
         config.dataset.repo_id,
@@ -340,6 +339,19 @@ def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, 
         elif name in recorded and is_dataclass(made):
             kept[name] = _without_new(kept[name], recorded[name], type(made))
     return kept
+
+
+def _as_named_then(asked: Any, recorded: Any) -> Any:
+    """Return the parameters of a brain with each policy named as in the dataset, if its weights are those.
+
+    A policy is what its weights are: it may have been moved, and older datasets name it as the user did.
+    """
+    if not (isinstance(asked, Mapping) and isinstance(recorded, Mapping)):
+        return asked
+    named = {name: _as_named_then(value, recorded.get(name)) for name, value in asked.items()}
+    if "path" in recorded and "weights" in asked and asked["weights"] == recorded.get("weights"):
+        named["path"] = recorded["path"]
+    return named
 
 
 def _info(root: Path) -> DatasetSummary | None:

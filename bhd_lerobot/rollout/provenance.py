@@ -1,18 +1,24 @@
 """What is stored with every episode, so that it can be understood and run again."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib import metadata
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bhd_lerobot import __version__
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableObject, TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose
+from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rollout.types import Episode
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.task import Event, Outcome
 
 
 def versions() -> dict[str, str]:
@@ -48,6 +54,45 @@ def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brai
         **_goals(episode),
         **_interventions(episode),
     }
+
+
+_OF_AN_EPISODE = frozenset(
+    {
+        *("episode", "seed", "split", "success", "outcome", "score", "task", "brain", "scene", "initial_state"),
+        *("timing", "versions", "realtime", "plan", "goals", "results", "goal_frames"),
+        *("intervened_frames", "interventions"),
+    }
+)
+"""What `episode_metadata` writes besides the task's own details."""
+
+
+def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], instruction: str) -> Episode:
+    """Return an episode that was recorded: what can be measured of it, without images, goals and interventions.
+
+    Args:
+        recorded: what `episode_metadata` returned when it was recorded.
+        columns: its columns in the dataset.
+        instruction: its task in the dataset.
+
+    Raises:
+        DatasetError: the metadata are not those of an episode of this version.
+    """
+    try:
+        details = {name: value for name, value in recorded.items() if name not in _OF_AN_EPISODE}
+        event = Event[recorded["outcome"].upper()]
+        return Episode(
+            spec=EpisodeSpec(int(recorded["episode"]), int(recorded["seed"])),
+            scene=scene_from_json(recorded["scene"]),
+            instruction=instruction,
+            initial_state=np.asarray(recorded["initial_state"], np.float64),
+            columns=columns,
+            outcome=Outcome(bool(recorded["success"]), event, float(recorded["score"]), details),
+            timing=TimingSummary(**json.loads(recorded["timing"])),
+            writer=None,
+            plan=json.loads(recorded.get("plan") or "{}"),
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"The recorded episode cannot be read: {error!r}.") from error
 
 
 def _goals(episode: Episode) -> dict[str, Any]:

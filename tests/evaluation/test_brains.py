@@ -2,19 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.learned.contract import PolicyContract
-from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from tests.evaluation.test_evaluate import FAILING, results, run_eval
+from tests.recording.support import save_lidar_policy
 
-STATE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
-ACTIONS = ("x.vel", "theta.vel")
 LIVE = {
     "robot__clock": "realtime",
     "robot__realtime__brain_timeout_s": 20,
@@ -27,27 +20,7 @@ LIVE = {
 def checkpoint(tmp_path_factory) -> Path:
     """Return the folder of an untrained policy for the robot of these tests."""
     folder = tmp_path_factory.mktemp("policy")
-    config = MlpConfig(
-        device="cpu",
-        hidden_dims=[16],
-        chunk_size=4,
-        n_action_steps=2,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (len(STATE),))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTIONS),))},
-    )
-    torch.manual_seed(0)
-    sizes = {"observation.state": len(STATE), "action": len(ACTIONS)}
-    stats = {
-        key: {"mean": np.full(n, 0.1), "std": np.full(n, 0.3), "min": np.full(n, -1.0), "max": np.ones(n)}
-        for key, n in sizes.items()
-    }
-    before, after = make_pre_post_processors(config, dataset_stats=stats)
-    for part in (get_policy_class(config.type)(config), before, after):
-        part.save_pretrained(folder)
-    PolicyContract(
-        robot_type="turtlebot3", fps=10, observation_names=STATE, action_names=ACTIONS, environment_names=(), cameras={}
-    ).save(folder)
-    return folder
+    return save_lidar_policy(folder)
 
 
 def test_a_checkpoint_is_compared_with_rules_and_gives_the_same_bytes_if_that_is_asked_for(checkpoint, tmp_path):

@@ -1,8 +1,10 @@
 """bhd-eval: the same bytes for any number of simulations and twice, the same episodes for every brain, and its ends."""
 
 import io
+import itertools
 import json
 import os
+import re
 import shlex
 import signal
 
@@ -12,15 +14,18 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetMismatchError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
+from bhd_lerobot.evaluation import run as evaluation_run
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate, main
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
+from bhd_lerobot.rollout import provenance
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.task import episode_seed
-from tests.recording.support import run_record
+from tests.forks import Fork
+from tests.recording.support import data_columns, episode_rows, run_record
 
 
 def options(folder, **overrides) -> list[str]:
@@ -164,6 +169,71 @@ def test_runs_are_recorded_as_a_dataset_for_each_brain(whole, tmp_path):
         assert [row.metadata["score"] for row in info.episodes] == [one.score for one in mine]
         assert [row.frames for row in info.episodes] == [one.frames for one in mine]
     assert (tmp_path / "e" / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+
+
+RECORDED = {"record__repo_id": "me/eval", "n_episodes": 9, **FAILING}
+
+
+def killed_at(brain, call, arguments):
+    """Run bhd-eval, and end the process at once at a call of a brain."""
+    calls, act = itertools.count(1), brain.act
+
+    def acting(self, seen):
+        if next(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return act(self, seen)
+
+    brain.act = acting
+    return main(arguments)
+
+
+def test_a_killed_evaluation_runs_the_missing_episodes_and_ends_as_if_nothing_had_happened(whole, tmp_path):
+    recorded = {**RECORDED, "record__root": tmp_path / "data", "n_envs": 2}
+    for brain, call in ((AvoidanceBrain, 95), (GapFollowerBrain, 60)):
+        killed = Fork(killed_at, brain, call, options(tmp_path / "e", **recorded))
+        assert killed.wait() == -signal.SIGKILL
+        assert not (tmp_path / "e" / "results.json").exists()
+    result, printed = run_eval(tmp_path / "e", **recorded)
+    assert "old: 9 episodes of 9 had been recorded before, and were not run again." in printed
+    assert re.search(r"new: [2-7] episodes? of 9 had been recorded before", printed)
+    assert (tmp_path / "e" / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+    assert list(result.timing["brains"]) == ["new"]
+    with np.load(whole[0] / "initial_states.npz") as one, np.load(tmp_path / "e" / "initial_states.npz") as other:
+        assert all(np.array_equal(one[name], other[name]) for name in one.files)
+    run_eval(tmp_path / "f", **RECORDED, record__root=tmp_path / "undisturbed")
+    for label in ("old", "new"):
+        roots = [tmp_path / folder / label for folder in ("undisturbed", "data")]
+        assert data_columns(roots[0]) == data_columns(roots[1])
+        assert episode_rows(roots[0]) == episode_rows(roots[1])
+
+
+def test_partial_results_of_the_same_evaluation_are_completed_and_no_others(whole, tmp_path, monkeypatch):
+    recorded = {**RECORDED, "record__root": tmp_path / "data"}
+    with pytest.MonkeyPatch.context() as patch:
+        act, calls = GapFollowerBrain.act, itertools.count(1)
+        patch.setattr(
+            GapFollowerBrain,
+            "act",
+            lambda self, seen: (next(calls) == 45 and os.kill(os.getpid(), signal.SIGTERM), act(self, seen))[1],
+        )
+        result, printed = run_eval(tmp_path / "e", **recorded)
+    assert result.exit_status == 143
+    assert "The same command runs those that are missing." in printed
+    assert "--resume" not in printed
+    with pytest.raises(ConfigError, match="holds the results of an evaluation"):
+        run_eval(tmp_path / "e", **{**recorded, "seed": 1})
+    run_eval(tmp_path / "e", **recorded)
+    assert (tmp_path / "e" / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+    with pytest.raises(ConfigError, match="holds the results of an evaluation"):
+        run_eval(tmp_path / "e", **recorded)
+    # Episodes of another evaluation, or of other versions, are not taken for those of this one.
+    with pytest.raises(DatasetMismatchError, match=r"recording\.seed: recorded 0, requested 1") as caught:
+        run_eval(tmp_path / "f", **{**recorded, "seed": 1})
+    assert "--resume" not in str(caught.value)
+    now = {**provenance.versions(), "mujoco": "5.0"}
+    monkeypatch.setattr(evaluation_run, "versions", lambda: now)
+    with pytest.raises(DatasetMismatchError, match=r"recorded with mujoco .*, now 5\.0.*--record\.root"):
+        run_eval(tmp_path / "f", **recorded)
 
 
 def test_a_failed_episode_is_run_again_by_the_command_in_the_report(whole, tmp_path):

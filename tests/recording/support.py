@@ -4,9 +4,15 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from rich.console import Console
 
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import main, record
 from bhd_lerobot.recording.report import RecordResult
@@ -65,3 +71,32 @@ def episode_rows(root: Path) -> list[dict]:
     """Return the episodes' metadata, without where they are stored and without statistics."""
     rows = pq.read_table(root / "meta" / "episodes").to_pylist()
     return [{k: v for k, v in row.items() if k.startswith(("bhd/", "length", "tasks", "dataset_"))} for row in rows]
+
+
+STATE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
+ACTIONS = ("x.vel", "theta.vel")
+
+
+def save_lidar_policy(folder: Path) -> Path:
+    """Save an untrained policy for the robot of these options; return the folder."""
+    config = MlpConfig(
+        device="cpu",
+        hidden_dims=[16],
+        chunk_size=4,
+        n_action_steps=2,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (len(STATE),))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTIONS),))},
+    )
+    torch.manual_seed(0)
+    sizes = {"observation.state": len(STATE), "action": len(ACTIONS)}
+    stats = {
+        key: {"mean": np.full(n, 0.1), "std": np.full(n, 0.3), "min": np.full(n, -1.0), "max": np.ones(n)}
+        for key, n in sizes.items()
+    }
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    for part in (get_policy_class(config.type)(config), before, after):
+        part.save_pretrained(folder)
+    PolicyContract(
+        robot_type="turtlebot3", fps=10, observation_names=STATE, action_names=ACTIONS, environment_names=(), cameras={}
+    ).save(folder)
+    return folder

@@ -12,14 +12,16 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetExistsError, DatasetMismatchError, RenderingError
+from bhd_lerobot.hub.card import CardOptions, make_card
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import encode, parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.cases import each_case
-from tests.recording.support import data_columns, episode_rows, options, run_record, start
+from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
 
 
 def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
@@ -323,3 +325,39 @@ def test_a_dataset_that_is_older_than_an_option_of_its_task_is_resumed_while_tha
     result, _ = run_record(root, **arm, resume="true", dataset__num_episodes=2, dataset__episode_time_s=1)
     assert (result.recorded, result.episodes) == (1, 2)
     assert json.loads(path.read_text()) == identity
+
+
+def test_a_policy_is_recorded_as_what_it_is_and_not_where_it_lies(tmp_path, monkeypatch):
+    """Neither dataset nor card names a folder of this machine, and a policy that was moved is still the same."""
+    run = tmp_path / "alice" / "run"
+    save_lidar_policy(run / "checkpoints" / "000004" / "pretrained_model")
+    (run / "checkpoints" / "last").symlink_to("000004")
+    (tmp_path / "link").symlink_to(run)
+    monkeypatch.chdir(tmp_path)
+    brain = {"brain__type": "dagger", "brain__learner__type": "learned", "brain__expert__type": "gap_follower"}
+    brain |= {"dataset__episode_time_s": 0.5}
+    root = tmp_path / "data"
+    checkpoint = "checkpoints/last/pretrained_model"
+    moved = tmp_path / "bob" / "run"
+    for number, named in enumerate([run, "alice/run", f"../{tmp_path.name}/link", run / checkpoint, moved], start=1):
+        if named == moved:
+            run.parent.rename(moved.parent)
+        run_record(root, **brain, brain__learner__path=named, dataset__num_episodes=number, resume=number > 1)
+    identity = json.loads((root / "meta/bhd.json").read_text())
+    learner = identity["recording"]["brain"]["learner"]
+    assert learner["path"] == "run/checkpoints/000004"
+    rows = dataset_info(root).episodes
+    assert {row.metadata["brain"] for row in rows} == {rows[0].metadata["brain"]}
+    assert json.loads(rows[0].metadata["brain"])["learner"] == learner
+    card = make_card(load_state(root), CardOptions("me/data")).text
+    for text in (card, json.dumps(identity), *(str(row.metadata) for row in rows)):
+        assert str(tmp_path) not in text
+        assert "alice" not in text
+    # A dataset of an older version names the folder as the user did.
+    learner["path"] = str(run)
+    (root / "meta/bhd.json").write_text(json.dumps(identity))
+    run_record(root, **brain, brain__learner__path=moved, dataset__num_episodes=6, resume="true")
+    learner["weights"] = "sha256:0"
+    (root / "meta/bhd.json").write_text(json.dumps(identity))
+    with pytest.raises(DatasetMismatchError, match=r"brain\.learner\.weights"):
+        run_record(root, **brain, brain__learner__path=moved, dataset__num_episodes=7, resume="true")

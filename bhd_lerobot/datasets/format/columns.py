@@ -5,7 +5,7 @@ are in another order than their numbers, it serves frames of other episodes and 
 go by the numbers.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -186,20 +186,31 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
         DatasetError: there is no such dataset or episode.
         DatasetCorruptError: the file cannot be read.
     """
+    return next(read_episodes(root, [index]))
+
+
+def read_episodes(root: Path | str, indices: Iterable[int]) -> Iterator[dict[str, NDArray]]:
+    """Yield every column of episodes as `read_episode` returns them, one episode at a time.
+
+    Raises:
+        DatasetError: there is no such dataset or episode.
+        DatasetCorruptError: a file cannot be read.
+    """
     root = Path(root)
     state = load_state(root)
-    row = _row(state, index)
-    path = root / layout.data_file(slot_of(row, "data"))
-    try:
-        table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise corrupt(path, error) from error
-    table = in_order(table, [row], path)
-    return {
-        key: to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
-        for key in table.column_names
-        if key in state.info["features"]
-    }
+    for index in indices:
+        row = _row(state, index)
+        path = root / layout.data_file(slot_of(row, "data"))
+        try:
+            table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise corrupt(path, error) from error
+        table = in_order(table, [row], path)
+        yield {
+            key: to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
+            for key in table.column_names
+            if key in state.info["features"]
+        }
 
 
 def _row(state: DatasetState, index: int) -> Row:

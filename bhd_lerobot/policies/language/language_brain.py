@@ -141,7 +141,8 @@ class LanguageBrain(PickBrain):
         """Return the parameters, and which weights it sees with."""
         values = super().parameters()
         if self.perceiver is not None:
-            values["perception"] |= {"weights": self.perceiver.weights, "dataset": self.perceiver.dataset}
+            seen = self.perceiver
+            values["perception"] |= {"path": seen.path, "weights": seen.weights, "dataset": seen.dataset}
         return values
 
     def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:

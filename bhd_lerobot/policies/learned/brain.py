@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
-from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ class LearnedBrain:
 
         self.config, self.name = config, config.name
         folder = find_checkpoint(config.path)
+        self._recorded_path = recorded_path(config.path, folder)
         self.contract = PolicyContract.load(folder)
         self.loaded = load_policy(folder, config.device, config.n_action_steps)
         self.uses_images = bool(self.loaded.cameras)
@@ -201,7 +202,7 @@ class LearnedBrain:
         """Return the parameters, and which weights they are."""
         return {
             "type": "learned",
-            "path": self.config.path,
+            "path": self._recorded_path,
             "policy": self.loaded.kind,
             "weights": self._weights,
             "n_action_steps": getattr(self.loaded.config, "n_action_steps", 1),

@@ -23,6 +23,27 @@ def weights_digest(folder: Path) -> str:
         return f"sha256:{file_digest(file, 'sha256').hexdigest()}"
 
 
+def recorded_path(given: str, folder: Path) -> str:
+    """Return what datasets and results call a policy: nothing of where it lies on this machine.
+
+    Args:
+        given: how it was named.
+        folder: where `find_checkpoint` found it.
+
+    Returns:
+        ``RUN/checkpoints/STEP`` of a training run, the name of any other folder, or the name on the Hub. However a
+        folder is named, this is the same; which weights are in it, `weights_digest` says.
+    """
+    if not Path(given).expanduser().is_dir():
+        return given
+    folder = folder.resolve()
+    if folder.name == PRETRAINED_MODEL_DIR:
+        folder = folder.parent
+    if folder.parent.name == CHECKPOINTS_DIR:
+        return "/".join(folder.parts[-3:])
+    return folder.name
+
+
 def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:
     """Return the folder with a policy's configuration and weights.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import COLOURS
 from bhd_lerobot.errors import ConfigError, PerceptionError
-from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.manipulation.grasp import SeenObject
 
@@ -74,6 +74,7 @@ class Perceiver:
         camera: name of the camera that it looks through.
         image_size: width and height of its images [px].
         dataset: what it was trained on.
+        path: which checkpoint it is, without where that lies on this machine.
         weights: which weights it has.
 
     Args:
@@ -87,6 +88,7 @@ class Perceiver:
         from bhd_lerobot.policies.learned.policy import load_perception
 
         folder = find_checkpoint(options.path)
+        self.path = recorded_path(options.path, folder)
         self.who = f"The perception {options.path!r}"
         self.dataset = dict(PolicyContract.load(folder).dataset or {})
         self._policy = load_perception(folder, options.device)

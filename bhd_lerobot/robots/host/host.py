@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -418,14 +419,21 @@ LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "co
 
 
 def describe(config: Any) -> dict[str, Any]:
-    """Return everything about a robot that shapes its data, as plain values."""
+    """Return everything about a robot that shapes its data, as plain values; of an absolute path its name."""
     left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", *config.not_recorded]
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
     left_out += [name for name in LEFT_OUT_IF_OFF if not getattr(config, name, None)]
-    values = {key: value for key, value in vars(config).items() if key not in left_out}
+    values = {key: _without_place(value) for key, value in vars(config).items() if key not in left_out}
     return {
         "type": config.type,
         **values,
         **({"realtime": asdict(config.realtime)} if config.clock == "realtime" else {}),
     }
+
+
+def _without_place(value: Any) -> Any:
+    """Return an option of a robot as it is recorded: nothing of where something lies on this machine."""
+    if not isinstance(value, Path):
+        return value
+    return value.name if value.expanduser().is_absolute() else str(value)

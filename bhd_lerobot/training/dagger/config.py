@@ -13,6 +13,8 @@ from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.arguments import parse_train
 
 ALGORITHM = "dagger"
+CONFIG, FILES = "config.yaml", "files.yaml"
+"""What a run's folder keeps: the configuration, and what the files in it say."""
 OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
@@ -207,10 +209,15 @@ def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
     Raises:
         ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
     """
-    return configuration.parse(AggregationConfig, arguments)
+    config = configuration.parse(AggregationConfig, arguments)
+    given = configuration.read_overrides(arguments)
+    file = Path(str(given.get(configuration.CONFIG_PATH, ""))).expanduser()
+    if "output_dir" not in given and file.name == CONFIG and (file.parent / FILES).is_file():
+        config.output_dir = str(file.parent)  # it is that of a run, which may have been moved
+    return config
 
 
-def kept(folder: Path) -> dict[str, Any] | None:
+def kept(folder: Path) -> AggregationConfig | None:
     """Return the configuration that a folder's rounds were made with; None if there is none.
 
     An option that was not there yet when they were made has its default.
@@ -218,7 +225,7 @@ def kept(folder: Path) -> dict[str, Any] | None:
     Raises:
         ConfigError: it cannot be read, or has what is no option.
     """
-    file = folder / "config.yaml"
+    file = folder / CONFIG
     if not file.is_file():
         return None
-    return configuration.encode(parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"]))
+    return parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"])

@@ -6,10 +6,12 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import yaml
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from rich.console import Console
 from rich.table import Table
 
@@ -23,6 +25,8 @@ from bhd_lerobot.recording import record
 from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
+    CONFIG,
+    FILES,
     OWN,
     AggregationConfig,
     StageConfig,
@@ -35,8 +39,9 @@ from bhd_lerobot.training.dagger.config import (
 from bhd_lerobot.training.dagger.curve import draw_curve
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
-_CONFIG, _FILES, _DONE = "config.yaml", "files.yaml", "done.json"
+_DONE = "done.json"
 _OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
+_SIGNALLED = 128  # what an exit status is above if a signal stopped the program
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
     "bhd-record": record.main,
     "bhd-train": training.main,
@@ -127,28 +132,62 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         ConfigError: it differs, or the folder holds something else.
         BhdError: the folder cannot be written.
     """
-    values, before = encode(config), kept(folder)
+    before = kept(folder)
     if before is None and folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"The folder {folder} holds something else. Set another --output_dir.")
-    for name in () if before is None else [name for name in values if name not in ("rounds", "output_dir")]:
-        if before is not None and before.get(name) != values[name]:
-            raise ConfigError(
-                f"The rounds in {folder} were made with {name} = {before.get(name)}, and now it is {values[name]}. Go "
-                "on with the same, or set another --output_dir."
-            )
     files = {stage.config: read_file(Path(stage.config).expanduser()) for stage in config.stages}
-    for name, content in (read_file(folder / _FILES) if (folder / _FILES).exists() else {}).items():
-        if differing := _differing(content, files.get(name, content)):
-            raise ConfigError(
-                f"{name} says something else than when the rounds in {folder} were made: {', '.join(differing)}. Undo "
-                "that, or set another --output_dir."
-            )
+    if before is not None:
+        _check_same(folder, before, config, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, what in ((_CONFIG, values), (_FILES, files)):
+        for name, what in ((CONFIG, encode(config)), (FILES, files)):
             Disk().publish(folder / name, yaml.safe_dump(what, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+
+
+def _check_same(folder: Path, before: AggregationConfig, config: AggregationConfig, files: dict[str, Any]) -> None:
+    """Refuse a configuration other than that of the rounds in a folder.
+
+    Of a configuration file its content counts, and of a dataset which folder it is, not by which path it is named.
+
+    Args:
+        folder: of the rounds.
+        before: their configuration.
+        config: the requested one.
+        files: what the requested one's files say, by their paths.
+
+    Raises:
+        ConfigError: names what differs, with both values.
+    """
+    known = read_file(folder / FILES) if (folder / FILES).exists() else {}
+    for one in fields(config):
+        then, now = getattr(before, one.name), getattr(config, one.name)
+        if isinstance(now, StageConfig):
+            content = known.get(then.config)
+            if content is not None and (differing := _differing(content, files[now.config])):
+                raise ConfigError(
+                    f"{now.config} says something else than when the rounds in {folder} were made: "
+                    f"{', '.join(differing)}. Undo that, or set another --output_dir."
+                )
+            same = then.options == now.options and (content is not None or then.config == now.config)
+        elif one.name == "data":
+            same = then == now or [_place(root) for root in then] == [_place(root) for root in now]
+        else:
+            same = then == now or one.name in ("rounds", "output_dir")
+        if not same:
+            raise ConfigError(
+                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. Go "
+                "on with the same, or set another --output_dir."
+            )
+
+
+def _place(root: str) -> Path:
+    return Path(root).expanduser().resolve()
+
+
+def _shown(value: Any) -> Any:
+    return encode(value) if isinstance(value, StageConfig) else value
 
 
 def _differing(before: Any, now: Any, name: str = "") -> list[str]:
@@ -165,7 +204,7 @@ def _differing(before: Any, now: Any, name: str = "") -> list[str]:
 class _Rounds:
     def __init__(self, config: AggregationConfig, stages: Stages, folder: Path, console: Console) -> None:
         self._config, self._stages, self._folder, self._console = config, stages, folder, console
-        self._rows: list[dict[str, Any]] = []
+        self._rows = _reported(folder)
         self._expert: dict[str, Any] = {}
         self._seconds = 0.0
 
@@ -189,17 +228,18 @@ class _Rounds:
             seconds += time.perf_counter() - started
             self._note(folder, done, seconds)
         self._seconds += seconds
-        self._rows.append(self._row(number, folder))
-        rows = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": self._rows}
-        Disk().publish(self._folder / ROUNDS, (json.dumps(rows, indent=2) + "\n").encode())
-        draw_curve(self._rows, self._expert, self._folder / CURVE, str(self._folder))
+        self._rows = dict(sorted({**self._rows, number: self._row(number, folder)}.items()))
+        rows = list(self._rows.values())
+        report = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": rows}
+        Disk().publish(self._folder / ROUNDS, (json.dumps(report, indent=2) + "\n").encode())
+        draw_curve(rows, self._expert, self._folder / CURVE, self._folder.resolve().name)
 
     def conclude(self) -> None:
         """Show the rounds, and how to judge the last policy."""
         table = Table(title=None, box=None, pad_edge=False)
         for column in ("round", "episodes", "expert drove", "success, 95 %", "score, 95 %", "time so far"):
             table.add_column(column)
-        for row in self._rows:
+        for row in self._rows.values():
             share = "all" if row["expert_share"] is None else f"{row['expert_share']:.1%}"
             level = _interval(row["success"]), _interval(row["score"])
             spent = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f} min"
@@ -207,7 +247,7 @@ class _Rounds:
         level = _interval(self._expert["success"]), _interval(self._expert["score"])
         table.add_row("", "", self._stages.expert, *level, "")
         self._console.print(table)
-        policy = self._policy(self._config.rounds)
+        policy = self._policy(max(self._rows))
         evaluation = " ".join([self._config.evaluation.config, *self._config.evaluation.options])
         self._console.print(
             f"Policies, data and curve: {self._folder}. Judge the last policy by episodes that nobody has looked at:\n"
@@ -239,10 +279,11 @@ class _Rounds:
 
     def _train(self, number: int, folder: Path) -> None:
         run_folder = folder / "policy"
-        if (last := run_folder / "checkpoints" / "last").exists():
-            if int(last.resolve().name) >= self._stages.steps:
+        if (last := _last_checkpoint(run_folder)) is not None:
+            if int(last.name) >= self._stages.steps:
                 return  # it was stopped between its last checkpoint and the note of it
-            self._call(number, "bhd-train", ["--resume=true", f"--config_path={run_folder}"])
+            data = f"--dataset.root={self._data_at(number, folder)}"  # the run may have been moved
+            self._call(number, "bhd-train", ["--resume=true", f"--config_path={last}", data])
             return
         shutil.rmtree(run_folder, ignore_errors=True)
         own: dict[str, Any] = {
@@ -257,13 +298,17 @@ class _Rounds:
             own["selection.learner_weight"] = 0
         self._run(number, "bhd-train", self._config.policy, own)
 
+    def _data_at(self, number: int, folder: Path) -> Path:
+        """Return where the dataset of all rounds so far is."""
+        return folder / ("all" if number or self._config.data else "data")
+
     def _data(self, number: int, folder: Path) -> Path:
-        """Return the dataset of all rounds so far."""
-        if not number and not self._config.data:
-            return folder / "data"
+        """Return the dataset of all rounds so far, after merging them if there are several."""
+        target = self._data_at(number, folder)
+        if target.name == "data":
+            return target
         parts = [self._folder / f"round_{one}" / "data" for one in range(number + 1)]
         parts += [Path(root).expanduser() for root in self._config.data]
-        target = folder / "all"
         # Merging is quick, and a merge that was cut short leaves nothing.
         shutil.rmtree(target, ignore_errors=True)
         self._say(number, f"merge {' '.join(map(str, parts))}")
@@ -302,9 +347,14 @@ class _Rounds:
         self._say(number, f"{program} {' '.join(arguments)}")
         status = _PROGRAMS[program](arguments)
         if status:
+            again = (
+                "the same command goes on there"
+                if status > _SIGNALLED
+                else "when the cause is resolved, the same command repeats this step"
+            )
             self._console.print(
-                f"Round {number}: {program} ended with status {status}. What is done is kept in {self._folder}; the "
-                "same command goes on there.",
+                f"Round {number}: {program} ended with status {status}. What is done is kept in {self._folder}; "
+                f"{again}.",
                 soft_wrap=True,
                 highlight=False,
             )
@@ -354,6 +404,25 @@ class _Rounds:
             "seconds": None if math.isnan(self._seconds) else self._seconds,
             **_level(results["policy"]),
         }
+
+
+def _reported(folder: Path) -> dict[int, dict[str, Any]]:
+    """Return the rows of `rounds.json`, by their rounds; none if it cannot be read: each round makes its own anew."""
+    file = folder / ROUNDS
+    try:
+        return {row["round"]: row for row in json.loads(file.read_text(encoding="utf-8"))["rounds"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _last_checkpoint(run_folder: Path) -> Path | None:
+    """Return the folder of a training's last checkpoint, which a copy may have lost the link to; None without one."""
+    checkpoints = run_folder / CHECKPOINTS_DIR
+    last = (checkpoints / LAST_CHECKPOINT_LINK).resolve()
+    if last.is_dir() and last.name.isdigit():
+        return last
+    numbered = [one for one in checkpoints.glob("*") if one.name.isdigit()]
+    return max(numbered, key=lambda one: int(one.name), default=None)
 
 
 def _level(brain: dict[str, Any]) -> dict[str, Any]:

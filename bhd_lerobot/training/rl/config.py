@@ -8,6 +8,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from lerobot.robots.config import RobotConfig
+from lerobot.utils.constants import CHECKPOINTS_DIR
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
@@ -336,7 +337,12 @@ def parse_rl(arguments: Sequence[str]) -> RlConfig:
         f"{prefix}{config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument
         for argument in arguments
     ]
-    return configuration.parse(RlConfig, found)
+    config = configuration.parse(RlConfig, found)
+    given = configuration.read_overrides(found)
+    run = Path(str(given.get(configuration.CONFIG_PATH, ""))).parent
+    if config.resume and "output_dir" not in given and (run / CHECKPOINTS_DIR).is_dir():
+        config.output_dir = str(run)  # it may have been moved
+    return config
 
 
 def config_file(path: Path) -> Path:

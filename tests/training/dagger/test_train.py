@@ -1,6 +1,7 @@
 """Aggregation in rounds: every program runs once, a stop loses nothing, and what cannot be is said before the first."""
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -12,11 +13,12 @@ import yaml
 from bhd_lerobot.cli.train import algorithm_of, main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.dagger import train as dagger
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
-from tests.recording.support import run_record
+from tests.recording.support import episode_rows, run_record
 
 CONFIGS = Path("configs").absolute()
 BRIEF = ["--robot.beams=36", "--task.duration_s=2"]
@@ -33,7 +35,7 @@ def settings(folder: Path, **changed: Any) -> Path:
         },
         "learner": {
             "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
-            "options": [*record["options"], "--brain.expert.margin_m=0.08"],
+            "options": [*record["options"], "--brain.expert.margin_m=0.08", "--brain.learner.exact=true"],
         },
         "policy": {
             "config": str(CONFIGS / "train/bc_turtlebot3_avoid.yaml"),
@@ -97,7 +99,7 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert learned is not None
     assert (learned["episodes"], learned["frames"]) == (4, first.frames + second.frames)
     brain = json.loads(second.episodes[0].metadata["brain"])
-    assert brain["learner"]["path"] == str(run / "round_0" / "policy")
+    assert brain["learner"]["path"] == "policy/checkpoints/000004"
 
     found = results(tmp_path)
     assert found["expert"]["type"] == "gap_follower"
@@ -126,6 +128,90 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     assert results(tmp_path)["rounds"] == [{**row, "seconds": None} for row in found["rounds"]]
     assert main([argument, "--seed=1"]) == 2
     assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run with two rounds that nothing disturbed, named from beside it, and its `dagger.yaml`."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main([f"--config_path={settings(folder, output_dir='run')}"]) == 0
+    return folder
+
+
+def test_a_run_that_was_moved_or_is_named_by_another_path_ends_as_if_nothing_had_happened(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs = dict(dagger._PROGRAMS)
+
+    def record_one(arguments: list[str]) -> int:
+        if "--dataset.num_episodes=2" in arguments and "round_1" in " ".join(arguments):
+            programs["bhd-record"]([one.replace("num_episodes=2", "num_episodes=1") for one in arguments])
+            return 130
+        return programs["bhd-record"](arguments)
+
+    def train_half(arguments: list[str]) -> int:
+        assert programs["bhd-train"](arguments) == 0
+        checkpoints = Path(next(one for one in arguments if one.startswith("--output_dir=")).partition("=")[2])
+        shutil.rmtree(checkpoints / "checkpoints/000004")
+        (checkpoints / "checkpoints/last").unlink()  # as a copy without links leaves it
+        return 143
+
+    monkeypatch.chdir(tmp_path)
+    argument = f"--config_path={settings(tmp_path, output_dir='run')}"
+    monkeypatch.setitem(dagger._PROGRAMS, "bhd-record", record_one)
+    assert main([argument]) == 130
+    monkeypatch.setitem(dagger._PROGRAMS, "bhd-record", programs["bhd-record"])
+    monkeypatch.setitem(dagger._PROGRAMS, "bhd-train", train_half)
+    (tmp_path / "link").symlink_to("run")
+    assert main([argument, f"--output_dir={tmp_path / 'link'}"]) == 143
+    monkeypatch.setitem(dagger._PROGRAMS, "bhd-train", programs["bhd-train"])
+    moved = tmp_path / "elsewhere" / "again"
+    shutil.copytree(tmp_path / "run", moved)
+    shutil.rmtree(tmp_path / "run")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    near = [f"--expert.config={os.path.relpath(CONFIGS / 'record/turtlebot3_avoid.yaml')}"]
+    assert main([argument, "--output_dir=again", *near]) == 0
+
+    for number in (0, 1):
+        policies = [run / f"round_{number}" / "policy" for run in (finished / "run", moved)]
+        assert weights_digest(find_checkpoint(policies[0])) == weights_digest(find_checkpoint(policies[1]))
+        rows = [episode_rows(run / f"round_{number}" / "data") for run in (finished / "run", moved)]
+        assert rows[0] == rows[1]
+    reports = [json.loads((run / "rounds.json").read_text()) for run in (finished / "run", moved)]
+    for row in (*reports[0]["rounds"], *reports[1]["rounds"]):
+        assert row.pop("seconds") > 0
+    assert reports[0] == reports[1]
+
+
+def test_what_was_reported_stays(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(finished, tmp_path / "copy")
+    run = tmp_path / "copy" / "run"
+    before = (run / "rounds.json").read_bytes()
+    argument = [f"--config_path={run / 'config.yaml'}"]  # that of the copy, which is where it lies now
+    assert main([*argument, "--rounds=0"]) == 0
+    assert (run / "rounds.json").read_bytes() == before
+    row = dagger._Rounds._row
+
+    def stopped(self: Any, number: int, folder: Path) -> Any:
+        if number == 1:
+            raise KeyboardInterrupt
+        return row(self, number, folder)
+
+    monkeypatch.setattr(dagger._Rounds, "_row", stopped)
+    assert main([*argument, "--rounds=1"]) == 130
+    assert (run / "rounds.json").read_bytes() == before
+
+
+def test_after_a_failure_the_same_command_is_said_to_repeat_the_step_and_not_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(dagger._PROGRAMS, "bhd-record", lambda _: 2)
+    assert main([f"--config_path={settings(tmp_path)}"]) == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "when the cause is resolved, the same command repeats this step" in printed
+    assert "goes on there" not in printed
 
 
 def test_files_that_say_something_else_than_before_are_not_gone_on_with(

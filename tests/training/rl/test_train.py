@@ -123,6 +123,14 @@ def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished
     assert contract.action_names == ("x.vel", "theta.vel")
 
 
+def test_a_run_that_was_moved_is_resumed_where_it_lies_now(finished: RlResult, tmp_path: Path) -> None:
+    moved = shutil.copytree(finished.output_dir, tmp_path / "moved", symlinks=True)
+    for named in (moved, moved / "config.yaml"):
+        assert parse_rl([f"--config_path={named}", "--resume=true"]).output_dir == str(moved)
+    elsewhere = [f"--config_path={moved}", "--resume=true", "--output_dir=elsewhere"]
+    assert parse_rl(elsewhere).output_dir == "elsewhere"
+
+
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: RlResult, tmp_path: Path) -> None:
     same = run(tmp_path / "same", validation__rule="{type: gap_follower}")
     assert finished.checkpoint is not None
