@@ -1,7 +1,8 @@
 """`make results`: everything that is claimed about learning, made again, into `docs/reference/results.md`.
 
 It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew. With `--only`, the
-other sections of the page stay as they are; with `--seeds`, what was measured of other training seeds does.
+other sections of the page stay as they are; with `--seeds`, what was measured of other training seeds does. With
+`--kept` nothing is run: the sections about trainings are written again from what was measured.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from benchmarks.results.learning import avoid, reach
 from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
-from benchmarks.results.runner import REPOSITORY, FailedError, Runner, empty, lock
+from benchmarks.results.runner import REPOSITORY, FailedError, Kept, Runner, empty, lock
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
@@ -44,13 +45,14 @@ GROUPS: tuple[tuple[tuple[str, str, Measure], ...], ...] = (
     (
         ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
         ("move_camera", "Fine-tune: 20 tables before a camera that was moved", move_camera),
-        ("pixels", "Pick, from pixels: the same end to end", pixels),
+        ("pixels", "Pick, from pixels: one network at run time, trained in privileged stages, looks once", pixels),
     ),
     (("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),),
 )
 _SMALL = ("avoid", "navigate")  # fill what the others leave of the cores at the end
 LAST = ("speed", "Speed", speed)  # alone, whatever else runs side by side
 MEASURES = (*(one for group in GROUPS for one in group), LAST)
+_BENCHMARKS = ("navigate", "speed")  # of which nothing but the page is kept
 _FOLDER, _PAGE = "outputs/results", "docs/reference/results.md"
 
 
@@ -71,7 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
         help="training seeds to make; the others stay as they were measured before, which lies beside the page",
     )
     parser.add_argument("--fresh", action="store_true", help="begin anew: remove all that is in the folder")
+    parser.add_argument("--kept", action="store_true", help="run nothing: write the page again from what was measured")
     options = parser.parse_args(arguments)
+    if options.kept:
+        return _write_again(REPOSITORY / _FOLDER, REPOSITORY / (options.page or _PAGE), options.only)
     if options.short and 0 not in (options.seeds or [0]):
         parser.error("--short makes training seed 0 only. Leave --seeds out.")
     jobs = (2 if options.short else 1) if options.jobs is None else options.jobs
@@ -93,6 +98,23 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     finally:
         os.close(descriptor)
+
+
+def _write_again(folder: Path, page: Path, only: Sequence[str]) -> int:
+    """Write the sections of a page whose measurements are kept; return what `main` does."""
+    sections = []
+    try:
+        for name, title, measure in MEASURES:
+            if name in only and name not in _BENCHMARKS:
+                run, section = Kept(folder, page), Section(name, title)
+                measure(run, section)
+                section.commands = run.commands
+                sections.append(section)
+    except (FailedError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    write_page(page, sections, [title for _, title, _ in MEASURES], is_short=False)
+    return 0
 
 
 def _make(options: argparse.Namespace, folder: Path, page: Path, jobs: int, descriptor: int) -> int:

@@ -24,7 +24,7 @@ from benchmarks.results.learning import (
 )
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
-from benchmarks.results.seeing import SENSES, blanked, perception_folder, record_tables, train_perception
+from benchmarks.results.seeing import REFUSALS, SENSES, blanked, perception_folder, record_tables, train_perception
 from benchmarks.results.trainings import SEEDS, each
 
 GOAL = 0.5
@@ -128,10 +128,7 @@ def move_camera(run: Runner, section: Section) -> None:
         "perception was chosen."
     )
     if without:
-        section.remarks.append(
-            "A deaf brain, with the tuned perception where the camera is now, gets an empty instruction, a blind one "
-            "black images."
-        )
+        section.remarks.append(f"{REFUSALS} Here with the tuned perception, where the camera is now.")
 
 
 def _successes(results: Any, names: Iterable[str]) -> dict[str, dict[str, list[bool]]]:

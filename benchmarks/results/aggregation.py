@@ -32,14 +32,10 @@ _RULE = "gap_follower"
 def aggregate(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
 
-    def learn(seed: int) -> dict[str, Any]:
-        policy, seconds, rounds = aggregated(run, seed)
-        return {**_evaluate(run, f"seed_{seed}", policy, _RULE), "seconds": seconds, "rounds": rounds}
-
     def clone(seed: int) -> dict[str, Any]:
         return _evaluate(run, "clone", f"{_folder(seed)}/round_0/policy", where=f"clone/seed_{seed}")
 
-    made = each(run, section, "aggregate", SEEDS, learn)
+    made = _learned(run, section)
     clones = each(run, section, "aggregate_clone", SEEDS, clone)
     first, *_ = made.values()
     section.rows.append(success_row(first, _RULE))
@@ -65,6 +61,22 @@ def aggregate(run: Runner, section: Section) -> None:
         "far the rule keeps away were chosen after policies had failed in some of these episodes, which favours the "
         "numbers (docs/how_to/dagger.md)."
     )
+
+
+def beside_rule(run: Runner) -> Any:
+    """Return what the section measures of the rule; its commands are shown there."""
+    commands = list(run.commands)
+    first, *_ = _learned(run, Section("aggregate", "")).values()
+    run.commands = commands
+    return first
+
+
+def _learned(run: Runner, section: Section) -> dict[int, Any]:
+    def learn(seed: int) -> dict[str, Any]:
+        policy, seconds, rounds = aggregated(run, seed)
+        return {**_evaluate(run, f"seed_{seed}", policy, _RULE), "seconds": seconds, "rounds": rounds}
+
+    return each(run, section, "aggregate", SEEDS, learn)
 
 
 def aggregated(run: Runner, seed: int) -> Aggregated:

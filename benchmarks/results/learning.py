@@ -411,6 +411,7 @@ def seeds_rows(made: Mapping[int, Any], what: str = "all seeds", name: str = "")
         what: what they have in common, in words.
         name: of the brain in each; ``seed_N`` if nothing.
     """
-    rates = [float(results["brains"][name or f"seed_{seed}"]["success"]["value"]) for seed, results in made.items()]
-    what = f"{what}: mean success, its interval over {len(rates)} trainings"
-    return [Row(what, over_seeds(rates))] if len(rates) > 1 else []
+    brains = [results["brains"][name or f"seed_{seed}"] for seed, results in made.items()]
+    rates, episodes = [float(one["success"]["value"]) for one in brains], {int(one["episodes"]) for one in brains}
+    what = f"{what}: mean success over {len(rates)} trainings"
+    return [Row(what, over_seeds(rates, *episodes))] if len(rates) > 1 else []

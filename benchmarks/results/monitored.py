@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results.aggregation import EPISODES, aggregated
+from benchmarks.results.aggregation import EPISODES, aggregated, beside_rule
 from benchmarks.results.learning import evaluate, roaming, scores, seeds_rows, success_row, summary, train
 from benchmarks.results.runner import REPOSITORY, Runner
 from benchmarks.results.section import Row, Section, mean
@@ -24,8 +24,7 @@ _SHORT = (
 
 def monitored(run: Runner, section: Section) -> None:
     """Train drivers that learned by aggregation further, with PPO and the collision monitor."""
-    rule = evaluate(run, "monitored_eval/rule", _TASK, {}, rules=(_TEACHER,), options=roaming(run), episodes=EPISODES)
-    teacher = summary(rule, _TEACHER)
+    teacher = beside_rule(run)
 
     def learn(seed: int) -> dict[str, Any]:
         clone = aggregated(run, seed).policy
@@ -72,16 +71,16 @@ def monitored(run: Runner, section: Section) -> None:
     ]
     section.rows += [Row(f"ppo_{seed}: time of PPO", f"{one['seconds']:.0f} s") for seed, one in made.items()]
     section.remarks.append(
-        "`clone_N` learned from `gap_follower` by aggregation, `ppo_N` from there by PPO with the monitor in the loop "
-        "(`robot.collision_monitor`); `gap_follower`, and `avoidance`, the simple rule, have no monitor. All drive the "
-        "same arenas. What ground they have visited is told to `clone_N` and `ppo_N` from the robot's true pose "
-        "(`task.trail`, privileged). The start is a candidate like any other: where it fails least in the 512 "
-        "episodes that decide, `ppo_N` is it, with inputs added whose weights are 0: sums round differently, and some "
-        "episodes go another way. Its ratios tell what the monitor does, then, and nothing of PPO. While PPO learns, "
-        "being stuck ends an episode after 2 s and 0.05 m, not 10 s and 0.1 m, and with a collision it costs 5, not "
-        "10; episodes here are scored as everywhere. There is no image and no instruction: deaf and blind by "
-        "construction. The goal of 1.2 times `gap_follower` is about what driving could reach at most "
-        "(docs/how_to/reinforcement_learning.md)."
+        "`clone_N` learned from `gap_follower` by aggregation, `ppo_N` from there by PPO with the monitor in the loop"
+        " (`robot.collision_monitor`); `gap_follower`, and `avoidance`, the simple rule, have no monitor. All drive "
+        "the same arenas; the episodes of `gap_follower` are those of the section before. What ground they have "
+        "visited is told to `clone_N` and `ppo_N` from the robot's true pose (`task.trail`, privileged). The start is"
+        " a candidate like any other: where it fails least in the 512 episodes that decide, `ppo_N` is it, with "
+        "inputs added whose weights are 0: sums round differently, and some episodes go another way. Its ratios tell "
+        "what the monitor does, then, and nothing of PPO. While PPO learns, being stuck ends an episode after 2 s and"
+        " 0.05 m, not 10 s and 0.1 m, and with a collision it costs 5, not 10; episodes here are scored as "
+        "everywhere. There is no image and no instruction: deaf and blind by construction. The goal of 1.2 times "
+        "`gap_follower` is about what driving could reach at most (docs/how_to/reinforcement_learning.md)."
     )
 
 

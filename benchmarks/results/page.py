@@ -11,14 +11,18 @@ from bhd_lerobot.datasets.storage.disk import Disk
 _HEAD = (
     "# Results",
     "",
-    "Written by `make results`, which runs the commands below each table; no number was typed by hand. Rates are",
-    "with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness (bootstrap",
-    "intervals where a section says so), over the same held-out episodes for all brains of a table; that of a mean",
-    "score also holds what the mean would be if 3 / n of the episodes had scored 0, or 1. Intervals over trainings are",
-    "plain Student's. Times of training include the start of the program; those of aggregation are its rounds'. A goal",
-    "is for the estimate, unless it names an end of the interval. Where several training seeds are shown, each has to",
-    "meet the goal by itself, so intervals are not corrected for their number. Privileged state is what the simulator",
-    "tells and no robot measures. Each section says when and where it was made, and with which commit, if known.",
+    "Written by `make results`, which runs the commands below each table, whose numbers nobody typed. Rates are",
+    "with their Wilson 95 % intervals, means and differences with Student's, corrected for skewness, ratios with",
+    "Fieller's (bootstrap intervals where a section says so), over the same held-out episodes for all brains of a",
+    "table. Those of scores, of their differences and of their ratios also hold what these would be if 3 / n of the",
+    "episodes had scored 0, or 1; before 2026-11-28 those of differences and ratios did not, and were too narrow where",
+    "failures are rare. All trainings of a recipe meet the same episodes: the interval of their mean success is over",
+    "both, Student's over the trainings and Wilson's over the episodes put together (Zou and Donner, 2008); of",
+    "trainings that fail now and then three say little. Times of training include the start of the program; those of",
+    "aggregation are its rounds'. A goal is for the estimate, unless it names an end of the interval. Where several",
+    "training seeds are shown, each has to meet the goal by itself, so intervals are not corrected for their number.",
+    "Privileged state is what the simulator tells and no robot measures. Each section says when and where it was made,",
+    "and with which commit, if known; `make results RESULTS=--kept` writes the page again from what was measured.",
 )
 _SHORT = "**A short run, to try the commands: these numbers are not to be quoted.**"
 

@@ -190,6 +190,35 @@ class Runner:
         return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
 
 
+class Kept(Runner):
+    """Runs nothing: what was measured of the training seeds lies beside the page, and the page says what else was run.
+
+    Args:
+        folder: the one that the commands on the page name.
+        page: the page.
+    """
+
+    def __init__(self, folder: Path, page: Path) -> None:
+        super().__init__(folder, is_short=False, chosen=(), kept=page.with_suffix(""))
+        ran = re.finditer(
+            r"^(.*)   # (\d+) s, (\d+) s of processor time$", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
+        self._page, self._ran = page, {one[1]: (float(one[2]), float(one[3])) for one in ran}
+
+    def run(self, name: str, arguments: Sequence[str], *_: Any, **__: Any) -> Ran:
+        """Return what the page says of a command.
+
+        Raises:
+            FailedError: nothing.
+        """
+        command = shlex.join(arguments)
+        if command not in self._ran:
+            raise FailedError(f"{command}\n({name}) is not on {self._page}. Run it: leave --kept out.")
+        seconds, cpu_seconds = self._ran[command]
+        self.commands.append(Ran(command, seconds, 0, cpu_seconds))
+        return self.commands[-1]
+
+
 def lock(folder: Path) -> int:
     """Take a folder, which is made if it is not there; return the descriptor whose end gives it back.
 

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from scipy.stats import sem
 from scipy.stats import t as student
 
 from benchmarks.results.runner import Ran
+from bhd_lerobot.evaluation.statistics import Estimate, wilson
 
 
 @dataclass(frozen=True)
@@ -82,17 +83,29 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
     return f"{text}; {causes}" if causes else text
 
 
-def over_seeds(rates: Sequence[float]) -> str:
-    """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds.
+def over_seeds(rates: Sequence[float], episodes: int) -> str:
+    """Return the mean success of policies from several training seeds, with its interval, and each of their rates."""
+    found = over_trainings(rates, episodes)
+    return f"{rate(asdict(found), {})}; {', '.join(f'{one:.1%}' for one in rates)}"
 
-    It is not corrected for skewness, which three values do not tell, and takes trainings that fail now and then for
-    improbable, if none of these did. Where all are the same, or there is one, there is no interval.
+
+def over_trainings(rates: Sequence[float], episodes: int) -> Estimate:
+    """Return the mean success of several trainings that meet the same episodes, with a 95 % interval over both.
+
+    Other trainings would have other rates, and other episodes would shift them all alike. The widths of Student's
+    interval over the trainings and of Wilson's over the episodes, of which no training sees others, are added as
+    independent errors are: the method of G. Y. Zou and A. Donner, Statistics in Medicine 27 (2008). Student's is not
+    corrected for skewness, which three values do not tell, and takes trainings that fail now and then for improbable,
+    if none of these did.
+
+    Args:
+        rates: one of each training, at least two.
+        episodes: how many there are.
     """
-    value, interval = sum(rates) / len(rates), ""
-    if max(rates) > min(rates):
-        low, high = student.interval(0.95, len(rates) - 1, value, sem(rates))
-        interval = f" ({max(0.0, low):.1%} to {min(1.0, high):.1%})"
-    return f"{value:.1%}{interval}; {', '.join(f'{rate:.1%}' for rate in rates)}"
+    value = sum(rates) / len(rates)
+    own, half = wilson(round(value * episodes), episodes), student.ppf(0.975, len(rates) - 1) * sem(rates)
+    low, high = (math.hypot(half, own.value - end) for end in (own.low, own.high))
+    return Estimate(value, max(0.0, value - low), min(1.0, value + high))
 
 
 def mean(estimate: Mapping[str, float | None], sign: str = "") -> str:

@@ -54,7 +54,8 @@ def each(
 ) -> dict[int, Any]:
     """Measure something for each training seed that is asked for; take the others from earlier runs.
 
-    Of a short run only the first seed is made. A seed that was made by another recipe, or never, is left out.
+    Of a short run only the first seed is made. A seed that was made by another recipe than the others, or never, is
+    left out; where one is made now, the recipe is that of the configurations as they are.
 
     Args:
         run: runs the commands, and knows which seeds are asked for.
@@ -82,8 +83,8 @@ def each(
         kept = _read(run.kept / f"{name}_{seed}.json")
         if kept is None:
             continue
-        now = digests([one.command for one in kept.commands], REPOSITORY)
-        if kept.configs != now or any(not kept.is_like(trainings[one], seed, one) for one in asked):
+        is_old = asked and kept.configs != digests([one.command for one in kept.commands], REPOSITORY)
+        if is_old or any(not kept.is_like(other, seed, one) for one, other in trainings.items()):
             print(f"-- {name}: seed {seed} was made by another recipe and is left out; make it with --seeds {seed}")
             continue
         trainings[seed] = kept

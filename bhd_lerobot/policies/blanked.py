@@ -1,19 +1,24 @@
-"""The brain `blanked`: another brain that is deaf or blind, to see what it uses its instruction and its cameras for."""
+"""The brain `blanked`: another brain without its instruction or images, or with those of another episode.
 
-from collections.abc import Sequence
+It shows what a brain uses them for. One that refuses an empty instruction or a black image shows that with those of
+another episode only.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Command
+from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import (
     ANY_ROBOT,
     Brain,
     BrainConfig,
     DriverConfig,
+    Looking,
     Observation,
     RobotFeatures,
     uses_privileged_state,
@@ -29,6 +34,8 @@ class BlankedConfig(BrainConfig):
         brain: the brain.
         instruction: whether it gets an empty instruction in place of the episode's.
         images: whether all its images are black.
+        exchange: whether it gets, instead, the instruction or the images of the episode in the next simulation; needs
+            two or more. What it does then depends on which episodes run side by side (`n_envs`).
     """
 
     is_composed: ClassVar[bool] = True
@@ -36,6 +43,7 @@ class BlankedConfig(BrainConfig):
     brain: DriverConfig
     instruction: bool = False
     images: bool = False
+    exchange: bool = False
 
     def __post_init__(self) -> None:
         if not (self.instruction or self.images):
@@ -62,8 +70,9 @@ class BlankedBrain:
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         self.config, self._brain = config, brain
         self.has_plan = brain.has_plan
+        self._instructions: list[str] = []
         if hasattr(brain, "looks"):
-            self.looks = brain.looks
+            self.looks = self._looks if config.images and config.exchange else brain.looks
 
     @property
     def uses_images(self) -> bool:
@@ -80,8 +89,32 @@ class BlankedBrain:
         self._brain.bind(robot)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
-        """Start episodes."""
-        self._brain.reset(ids, seeds, n, [""] * len(instructions) if self.config.instruction else instructions)
+        """Start episodes.
+
+        Raises:
+            ConfigError: there is one simulation only, and what is exchanged is that of the next.
+        """
+        if self.config.exchange and n == 1:
+            raise ConfigError(
+                "brain.exchange is true and there is one simulation: no other episode runs beside it. "
+                "Set n_envs to 2 or more, or brain.exchange to false."
+            )
+        if self.config.instruction:
+            instructions = self._other_instructions(ids, n, instructions)
+        self._brain.reset(ids, seeds, n, instructions)
+
+    def _other_instructions(self, ids: NDArray[np.intp], n: int, instructions: Sequence[str]) -> list[str]:
+        if not self.config.exchange:
+            return [""] * len(instructions)
+        self._instructions = self._instructions or [""] * n
+        for sim, instruction in zip(ids, instructions, strict=True):
+            self._instructions[sim] = instruction
+        return [self._instructions[(sim + 1) % n] for sim in ids]
+
+    def _looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return in which simulations images are needed, shape (n,): in all if the brain looks at those of any."""
+        looks = cast(Looking, self._brain).looks(results)
+        return np.full_like(looks, looks.any())
 
     def subtasks(self) -> Sequence[str]:
         """Return what the brain is doing."""
@@ -94,11 +127,22 @@ class BlankedBrain:
     def act(self, observation: Observation) -> Command:
         """Return what the brain commands."""
         if self.config.images:
-            black = {name: np.zeros_like(images) for name, images in observation.images.items()}
-            observation = replace(observation, images=black)
+            seen = {
+                name: self._other_images(images, observation.running) for name, images in observation.images.items()
+            }
+            observation = replace(observation, images=seen)
         return self._brain.act(observation)
+
+    def _other_images(self, images: NDArray[np.uint8], running: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+        """Return black images, or those of the next simulation that is in an episode; black where there is none."""
+        other = np.zeros_like(images)
+        if self.config.exchange:
+            sims = np.arange(len(images)) if running is None else np.flatnonzero(running)
+            if len(sims) > 1:
+                other[sims] = images[np.roll(sims, -1)]
+        return other
 
     def parameters(self) -> dict[str, Any]:
         """Return what is blanked, and the brain's parameters."""
-        blanked = {"instruction": self.config.instruction, "images": self.config.images}
+        blanked = {name: getattr(self.config, name) for name in ("instruction", "images", "exchange")}
         return {"type": self.name, **blanked, "brain": self._brain.parameters()}

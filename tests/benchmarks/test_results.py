@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,12 +31,17 @@ from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
 from benchmarks.results.provenance import digests, provenance
 from benchmarks.results.runner import REPOSITORY, FailedError, Ran, Runner, lock
-from benchmarks.results.section import Row, Section, mean, over_seeds
+from benchmarks.results.section import Row, Section, mean, over_seeds, over_trainings
+from benchmarks.results.seeing import chance
 from benchmarks.results.speed import envs_rows, evaluate_rows, images_rows, loader_rows, navigate_rows
 from bhd_lerobot import plugin  # noqa: F401 - registers our policies
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.registry import make_task
 from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
 from tests.waiting import until
@@ -127,19 +133,53 @@ def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
     assert rows[0].value == "99.0% (98.0% to 99.5%); 5 collision"
 
 
-def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
-    assert over_seeds([0.9, 0.9, 0.9]) == "90.0%; 90.0%, 90.0%, 90.0%"
-    assert over_seeds([0.9]) == "90.0%; 90.0%"
-    # Student's: 4.3027 / sqrt(3) deviations to either side, within what a rate can be.
-    assert over_seeds([0.1, 0.2, 0.3]) == "20.0% (0.0% to 44.8%); 10.0%, 20.0%, 30.0%"
-    assert over_seeds([0.97, 0.99, 1.0]) == "98.7% (94.9% to 100.0%); 97.0%, 99.0%, 100.0%"
+def test_the_interval_over_trainings_is_over_the_episodes_that_they_share_too() -> None:
+    # Of equal trainings it is what one of them would have, Wilson's; of many episodes Student's: 4.3027 / sqrt(3)
+    # deviations to either side, within what a rate can be.
+    assert over_seeds([0.9, 0.9, 0.9], 500) == "90.0% (87.1% to 92.3%); 90.0%, 90.0%, 90.0%"
+    assert over_seeds([0.1, 0.2, 0.3], 10**9) == "20.0% (0.0% to 44.8%); 10.0%, 20.0%, 30.0%"
+    assert over_seeds([0.97, 0.99, 1.0], 10**9) == "98.7% (94.9% to 100.0%); 97.0%, 99.0%, 100.0%"
+    for rates, episodes in (([0.1, 0.2, 0.3], 20), ([0.974, 0.974, 0.976], 500), ([1.0, 0.0, 0.0], 100)):
+        found, value, rounding = over_trainings(rates, episodes), sum(rates) / 3, 0.5 / episodes + 1e-4
+        own, half = wilson(round(value * episodes), episodes), 4.3027 * np.std(rates, ddof=1) / math.sqrt(3)
+        assert found.low <= max(0.0, min(own.low, value - half) + rounding)
+        assert found.high >= min(1.0, max(own.high, value + half) - rounding)
     for nothing in (math.nan, None):
         assert "1.000 (no interval" in mean({"value": 1.0, "low": nothing, "high": nothing})
     assert mean({"value": None, "low": None, "high": None}) == "–"
-    low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98]))[1:3])
+    low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98], 10**9))[1:3])
     # 94 % plus or minus 4.30 times the standard error, 2.31 %; and not what three episodes would say, 35 to 98 %.
     assert low == pytest.approx(84.1, abs=0.1)
     assert high == 100
+
+
+@each_case(
+    ("rate", "episodes", "alike", "spread"),
+    [(0.9, 500, 1.0, 0.0), (0.97, 100, 1.0, 0.0), (0.5, 100, 0.5, 0.0), (0.9, 500, 0.0, 0.0), (0.8, 200, 0.5, 0.05)],
+)
+def test_the_interval_over_trainings_covers_the_rate_of_the_recipe(
+    rate: float, episodes: int, alike: float, spread: float
+) -> None:
+    """In a share of the episodes all trainings end alike; their own rates differ by a standard deviation."""
+    rng, tables = np.random.default_rng(0), 400
+    covered = 0
+    for _ in range(tables):
+        shared, own = rng.random(episodes), rng.random((3, episodes))
+        drawn = np.where(rng.random(episodes) < alike, shared, own)
+        rates = (drawn < rate + spread * rng.standard_normal((3, 1))).mean(axis=1)
+        found = over_trainings(rates.tolist(), episodes)
+        covered += found.low <= rate <= found.high
+    assert covered / tables > 0.92
+
+
+@pytest.mark.parametrize("least", [1, 2])
+def test_chance_is_how_often_a_drawn_object_is_the_one_that_is_meant(least: int) -> None:
+    config = parse(EvalConfig, ["--config_path=configs/eval/ur5_pick_pixels.yaml", f"--task.min_objects={least}"])
+    task, rng, hits, draws = make_task(config.task, 1, config.robot.fps, ur5()), np.random.default_rng(0), 0, 20_000
+    scenes = [task.sample(episode_seed(config.seed, index, config.split)) for index in range(100)]
+    for scene in (scenes[index % 100] for index in range(draws)):
+        hits += rng.integers(len(scene.objects)) == scene.target_object
+    assert chance(100, least) == pytest.approx(hits / draws, abs=0.015)
 
 
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
@@ -203,7 +243,7 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_both_rules(
     def results(scores: dict[str, float], failed: int = 0) -> dict[str, Any]:
         rate = {"value": 0.9, "low": 0.8, "high": 1.0}
         brain = {"episodes": 10, "successes": 10 - failed, "success": rate, "outcomes": {"success": 10 - failed}}
-        around = {name: [value + 0.01 * (-1) ** i for i in range(10)] for name, value in scores.items()}
+        around = {name: [value + 0.01 * (-1) ** i for i in range(1000)] for name, value in scores.items()}
         return {"brains": {name: {**brain, "scores": values} for name, values in around.items()}}
 
     alone = results({"avoidance": 0.126, "clone": 0.2})
@@ -395,6 +435,43 @@ def test_a_section_of_earlier_trainings_says_nothing_of_this_checkout(tmp_path: 
     before = Section("one", "One", commands=[Ran("train", 1.0, 0)], made_before={"on 2020-01-01, with version 1": {0}})
     write_page(tmp_path / "page.md", [before], ["One"], is_short=False)
     assert "\nMade on 2020-01-01, with version 1.\n" in (tmp_path / "page.md").read_text(encoding="utf-8")
+
+
+def test_the_page_says_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page, kept = REPOSITORY / "docs/reference/results.md", tmp_path / "results.md"
+    shutil.copy(page, kept)
+    shutil.copytree(page.with_suffix(""), kept.with_suffix(""))
+    assert program.main(["--kept", f"--page={kept}"]) == 0
+    written = kept.read_text(encoding="utf-8")
+    assert written == page.read_text(encoding="utf-8"), "run: make results RESULTS=--kept"
+    # Nothing is run, and nothing is lost, where a command is not on the page.
+    kept.write_text(written.replace("--dataset.num_episodes=200 --n_envs=32", "--n_envs=32"), encoding="utf-8")
+    before = kept.read_bytes()
+    assert program.main(["--kept", f"--page={kept}", "--only", "avoid"]) == 2
+    assert "(avoid_record) is not on" in capsys.readouterr().err
+    assert kept.read_bytes() == before
+
+
+def test_every_rate_of_picks_from_pixels_has_chance_beside_it_and_scores_come_before_success() -> None:
+    page = (REPOSITORY / "docs/reference/results.md").read_text(encoding="utf-8")
+    rows = {
+        title: re.findall(r"^\| (.*?) \| (.*?) \|", _section(page, title), re.MULTILINE)
+        for title in ("from pix", "front cam")
+    }
+    rates = [(what, value) for what, value in rows["from pix"] if re.match(r"[\d.]+% \(", value)]
+    assert rates
+    for what, value in rates:
+        assert re.search(r"; chance (45\.4|42\.2|31\.8|54\.6|57\.8)%$", value), what
+    names = [what for what, _ in rows["front cam"]]
+    for name in ("avoidance", "clone_0", "blind_0", "seed_0"):
+        assert names.index(f"{name}: mean score") < min(
+            i for i, one in enumerate(names) if one.startswith(f"{name}: success")
+        )
+
+
+def _section(page: str, words: str) -> str:
+    (text,) = (one for one in page.split("\n## ")[1:] if words in one.partition("\n")[0])
+    return text
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------

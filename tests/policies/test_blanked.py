@@ -17,6 +17,9 @@ class Spy(SimpleNamespace):
 
     has_plan, uses_images, uses_privileged_state = True, True, False
 
+    def parameters(self) -> dict[str, Any]:
+        return {}
+
     def reset(self, ids: Any, seeds: Any, n: int, instructions: Any = ()) -> None:
         self.instructions = list(instructions)
 
@@ -41,6 +44,29 @@ def test_what_is_blanked_does_not_arrive_and_all_else_does(deaf: bool, blind: bo
     assert spy.seen.state is state
     assert (brain.has_plan, brain.uses_images, brain.uses_privileged_state) == (True, True, False)
     assert images["scene"].min() == 200, "nobody else's images are changed"
+
+
+def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> None:
+    spy: Any = Spy(looks=lambda _: np.array([False, True, False]))
+    brain = BlankedBrain(BlankedConfig(brain=None, instruction=True, images=True, exchange=True), spy)  # type: ignore[arg-type]
+    brain.reset(np.arange(3), [1, 2, 3], 3, ["a", "b", "c"])
+    assert spy.instructions == ["b", "c", "a"]
+    brain.reset(np.array([0, 2]), [4, 5], 3, ["d", "e"])
+    assert spy.instructions == ["b", "d"]
+    # Where it looks in one simulation, the images of the others are needed.
+    assert brain.looks({}).tolist() == [True, True, True]
+    spy.looks = lambda _: np.zeros(3, np.bool_)
+    assert not brain.looks({}).any()
+    images = np.arange(1, 4, dtype=np.uint8)[:, None, None, None] * np.ones((3, 4, 6, 3), np.uint8)
+    state = np.zeros((3, 1))
+    # Of those that run each gets another's; one that is alone gets none.
+    for running, seen in (([1, 1, 1], [2, 3, 1]), ([1, 0, 1], [3, 0, 1]), ([0, 1, 0], [0, 0, 0])):
+        brain.act(Observation(("a",), state, {"scene": images}, running=np.array(running, np.bool_)))
+        assert spy.seen.images["scene"][:, 0, 0, 0].tolist() == seen
+    assert images[:, 0, 0, 0].tolist() == [1, 2, 3]
+    assert brain.parameters()["exchange"]
+    with pytest.raises(ConfigError, match=r"there is one simulation.*Set n_envs to 2 or more"):
+        brain.reset(np.arange(1), [1], 1, ["a"])
 
 
 def test_of_a_brain_that_does_not_say_it_is_taken_for_granted_that_it_is_told_the_truth() -> None:
