@@ -359,6 +359,7 @@ class Arm(Body):
         load: mass that the gripper is declared to carry, at the tool centre point [kg]: motions are planned with it.
         latency_s: time until a command acts [s]; the reference is led by it, as by the servos' own lag.
         blocked_rad: a joint that is farther than this from its reference does not follow it [rad]; goals end then.
+            What the latency accounts for is added to it.
         blocked_s: an arm with such a joint, whose servo gives all it has, is stopped after so long [s].
     """
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
+from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
@@ -83,6 +84,8 @@ class UR5Simulation(ArmHost, Simulation):
         self.table.place(scenes, ids)
         self._noise[ids] = [scene.variation.sensor_noise for scene in scenes]
         self.plant.set_latency(ids, [round(late * self.rates.control_hz) for late in latency])
+        if isinstance(self.controller, ArmController):
+            self.controller.set_latency(ids, latency)
         for flags in self.touches:
             flags[ids] = False
 

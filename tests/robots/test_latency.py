@@ -1,14 +1,23 @@
 """A plant that gets its commands late: by exactly so many ticks, each simulation by its own."""
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import Arm, Shape
+from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import BrainCommand, Goals, ResultCode
+from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY, LatePlant
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 
 ARM = ur5()
 
@@ -103,3 +112,72 @@ def test_invalid_latencies_are_refused(ticks: int) -> None:
         line.late.set_latency(np.array([0, 1]), [1, ticks])
     line.write(20)
     assert line.arrived(0) == line.arrived(1) == [float(max(0, tick - 3)) for tick in range(20)]
+
+
+# --- what is late is not blocked -------------------------------------------------------------------------------------
+
+SIMS = 4
+SPREAD = np.array([2.5, 0.2, 0.5, 1.5, 1.5, 2.5])  # [rad] of targets beside home, clear of the table
+
+
+class Declared(UR5Config):
+    """A UR5 whose body says how late its servos are; the others' is the disturbance of a scene."""
+
+    latency_s = 0.0
+
+    def body(self) -> Arm:
+        return dataclasses.replace(super().body(), latency_s=self.latency_s)
+
+
+def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> UR5Simulation:
+    config = Declared(max_force=float("inf"))
+    config.latency_s = latency if declared else 0.0
+    arms = UR5Simulation(config, n, threads=1, **options)
+    scene = TableScene("empty", (), arms.body.home, variation=Variation(latency_s=latency))
+    arms.reset(np.arange(n), [scene] * n, range(n))
+    return arms
+
+
+@pytest.mark.parametrize("declared", [False, True])
+def test_late_servos_follow_far_setpoints_and_goals_without_a_protective_stop(declared: bool) -> None:
+    arms, random = late_arms(0.05, declared), np.random.default_rng(0)
+    home = np.array(arms.body.home)
+    target = np.tile(home, (SIMS, 1))
+    for frame in range(80):
+        if frame % 10 == 0:
+            target[:, :6] = home[:6] + random.uniform(-1, 1, (SIMS, 6)) * SPREAD
+        report = arms.step(target)
+        assert not report.watchdog.any(), [Watchdog(int(flags)) for flags in report.watchdog]
+    codes = []
+    for number in range(3):
+        postures = home[:6] + random.uniform(-1, 1, (SIMS, 6)) * SPREAD
+        goals = {sim: [BrainCommand(f"{number}", joint_target=tuple(postures[sim]))] for sim in range(SIMS)}
+        command: Goals | None = Goals(goals)
+        for _ in range(80):
+            report = arms.step(command)
+            command = None
+            codes += [result.code for results in report.results.values() for result in results]
+    assert len(codes) == 3 * SIMS
+    assert set(codes) <= {ResultCode.SUCCEEDED, ResultCode.SELF_COLLISION}
+    assert codes.count(ResultCode.SUCCEEDED) > SIMS
+    arms.close()
+
+
+@pytest.mark.parametrize("by_goal", [False, True])
+@pytest.mark.parametrize("latency", [0.0, 0.05])
+def test_a_late_arm_that_something_is_in_the_way_of_is_stopped(latency: float, by_goal: bool) -> None:
+    arms = late_arms(latency, False, 1, fixtures=(Shape("box", 0.25, 0.45, 0.0, 0.2, 0.1, 0.8),))
+    action = arms.cerebellum.command.copy()
+    turned = (*(action[0, :1] + 1.6), *action[0, 1:6])
+    command: Any = Goals({0: [BrainCommand("a", joint_target=turned, max_velocity=0.3)]}) if by_goal else None
+    seen, codes = 0, []
+    for _ in range(150):
+        action[0, 0] += 0.3 / arms.rates.fps
+        report = arms.step(command if by_goal else action)
+        command = None
+        seen |= int(report.watchdog[0])
+        codes += [result.code for results in report.results.values() for result in results]
+        if arms.cerebellum.mode[0] == Mode.FAULT:
+            break
+    assert codes == [ResultCode.PATH_TOLERANCE] if by_goal else seen == Watchdog.BLOCKED
+    arms.close()

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.clearance import SetpointClearance
@@ -108,6 +108,13 @@ class ArmController(Controller):
     def limit_force(self, force: ForceLimit) -> None:
         """Stop an arm that presses too hard, from now on."""
         self.force, self.contact_wrench = force, force.wrench
+
+    def set_latency(self, ids: NDArray[np.intp], latency_s: ArrayLike) -> None:
+        """Set by how much the servos of some arms are late, beyond the body's latency [s].
+
+        An arm that is behind by so much is not blocked. Commands are not led by it.
+        """
+        self.goals.limit.set_latency(ids, latency_s)
 
     # --- motion ------------------------------------------------------------------------------------------------------
 
@@ -250,7 +257,8 @@ class ArmController(Controller):
         where the arm is: what it pressed against is let go of.
         """
         dof = self.width - 1
-        off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > self.arm.blocked_rad).any(axis=1)
+        away = np.abs(self.command[:, :dof] - reading.position[:, :dof])
+        off = (away > self.goals.limit.of(self.velocity[:, :dof])).any(axis=1)
         self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
         self._protect(self._off_ticks >= self._most_off_ticks, reading, Watchdog.BLOCKED, self._blocked)
 

@@ -38,6 +38,7 @@ class GoalManager:
         phase: a `GoalPhase` for each arm, shape (n,).
         busy: whether a goal is followed or waits, or a brake is played, shape (n,).
         following: whether `tick` writes the reference, shape (n,).
+        limit: how far joints may be from their references.
 
     Args:
         arm: the arm.
@@ -66,6 +67,7 @@ class GoalManager:
         self._player = TrajectoryPlayer(n, self._dof + 1)
         self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
         self._supervisor = Supervisor(arm, n, control_hz)
+        self.limit = self._supervisor.limit
         self._capacity = queue
         self._books = [GoalBook(queue) for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
@@ -35,8 +35,39 @@ class Verdict:
     message: str
 
 
+class FollowingLimit:
+    """How far joints that follow their references may be from them, with servos that get their commands late.
+
+    A joint with a latency is where its reference was so long ago: behind by what the present speed, and a change of it
+    at the largest acceleration, make of that time.
+
+    Args:
+        arm: the arm.
+        n: number of simulations.
+    """
+
+    def __init__(self, arm: Arm, n: int) -> None:
+        self._arm, self._n = arm, n
+        self._acceleration = np.asarray(arm.limits.acceleration[: len(arm.chain.joints)])
+        self._latency_s = np.zeros(n)
+        self.set_latency(np.arange(n), 0.0)
+
+    def set_latency(self, ids: NDArray[np.intp], latency_s: ArrayLike) -> None:
+        """Set by how much the servos of some simulations are late, beyond the body's latency [s]."""
+        self._latency_s[ids] = np.asarray(latency_s) + self._arm.latency_s
+        self._late = bool(self._latency_s.any())
+        self._at_rest = self._arm.blocked_rad + self._acceleration * self._latency_s[:, None] ** 2 / 2
+
+    def of(self, velocity: Array) -> Array:
+        """Return the largest distances [rad], shape (n, dof), from references of these speeds, shape (n, dof)."""
+        return self._at_rest + np.abs(velocity) * self._latency_s[:, None] if self._late else self._at_rest
+
+
 class Supervisor:
     """Judges goals of n simulations by what is measured, once a tick.
+
+    Attributes:
+        limit: how far joints may be from their references.
 
     Args:
         arm: the arm.
@@ -45,7 +76,9 @@ class Supervisor:
     """
 
     def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
-        self._joints, self._dof, self._most_off = arm.chain.joints, len(arm.chain.joints), arm.blocked_rad
+        self._joints, self._dof = arm.chain.joints, len(arm.chain.joints)
+        self.limit = FollowingLimit(arm, n)
+        self._most_off = self.limit.of(np.zeros((n, self._dof)))
         self._stall_ticks = round(GRIPPER_STALL_S * control_hz)
         self._settling_ticks = round(SETTLING_S * control_hz)
         self._gripping_ticks = round(GRIPPING_S * control_hz)
@@ -94,6 +127,7 @@ class Supervisor:
         # All rows, also of those that follow nothing, and nothing but comparisons: this runs every tick.
         np.subtract(measured[0], reference[0], out=self._away)
         np.abs(self._away, out=self._away)
+        self._most_off = self.limit.of(reference[1][:, : self._dof])
         np.greater(self._arm_away, self._most_off, out=self._off)
         self._tick += 1
         if np.count_nonzero(self._moves_gripper):
@@ -116,13 +150,13 @@ class Supervisor:
 
     def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]
-        error = self.error(sim)
-        if error > self._most_off:
-            joint = int(self._arm_away[sim].argmax())
+        if self._off[sim].any():
+            away, most = self._arm_away[sim], self._most_off[sim]
+            joint = int((away - most).argmax())
             return Verdict(
                 sim,
                 ResultCode.PATH_TOLERANCE,
-                f"{self._joints[joint]} is {error:.3f} rad from its reference; {self._most_off} rad is the "
+                f"{self._joints[joint]} is {away[joint]:.3f} rad from its reference; {most[joint]:.3g} rad is the "
                 "most: something is in its way, or it carries too much.",
             )
         verdict = None if playing else self._judge_end(sim, position, velocity)
