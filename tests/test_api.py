@@ -142,10 +142,10 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch) -> None:
     assert len(first.strip().splitlines()) <= 20
     shorter = first
     for long, short in (
-        ("steps=200", "steps=20"),
-        ("n_episodes=8", "n_episodes=2"),
-        ('"num_episodes": 4}', '"num_episodes": 2, "episode_time_s": 3}'),
-        ('task="avoid",\n', 'task={"type": "avoid", "duration_s": 2},\n'),
+        ("steps=1000", "steps=20"),
+        ("n_episodes=16", "n_episodes=2"),
+        ('"num_episodes": 16}', '"num_episodes": 2, "episode_time_s": 3}'),
+        ('task="avoid", brains', 'task={"type": "avoid", "duration_s": 2}, brains'),
     ):
         assert long in shorter
         shorter = shorter.replace(long, short)

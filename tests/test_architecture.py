@@ -88,7 +88,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
-        *("registry", "rollout", "hub"),
+        *("plugins", "registry", "rollout", "hub"),
     ),
     "training.rl": (
         *("registry", "plugin", "control", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),

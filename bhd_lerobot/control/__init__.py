@@ -17,6 +17,7 @@ __all__ = [
     "messages",
     "motion",
     "plant",
+    "reading_check",
     "timing",
     "tolerance",
 ]
