@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
-from bhd_lerobot.datasets.format.state import Row, read_tasks, slot_columns
+from bhd_lerobot.datasets.format.state import Row, numbered_tasks, slot_columns
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.videos import FoundEpisode
 from bhd_lerobot.datasets.storage import layout
@@ -28,17 +28,17 @@ def tasks_of(
     """Return the instructions that are used, and the new number of each old one."""
     used = sorted({int(index) for episode in recovered for index in pc.unique(episode.table["task_index"]).to_pylist()})
     try:
-        sentences = dict(enumerate(read_tasks(root / layout.TASKS)))
+        sentences, reason = numbered_tasks(root / layout.TASKS), "it does not have their numbers"
     except DatasetCorruptError as error:
-        sentences = {}
-        for episode in recovered:
-            # Of an episode with one instruction both the number and the words are stored.
-            words = stored.rows.get(episode.number, {}).get("tasks") or []
-            numbers = pc.unique(episode.table["task_index"]).to_pylist()
-            if len(words) == len(numbers) == 1:
-                sentences[int(numbers[0])] = words[0]
-        if set(used) - sentences.keys():
-            findings.error("counts", layout.TASKS, f"the words of some instructions ({getattr(error, 'wrong', error)})")
+        sentences, reason = {}, str(getattr(error, "wrong", error))
+    for episode in recovered:
+        # Of an episode with one instruction both the number and the words are stored.
+        words = stored.rows.get(episode.number, {}).get("tasks") or []
+        numbers = pc.unique(episode.table["task_index"]).to_pylist()
+        if len(words) == len(numbers) == 1:
+            sentences.setdefault(int(numbers[0]), words[0])
+    if set(used) - sentences.keys():
+        findings.error("counts", layout.TASKS, f"the words of some instructions ({reason})")
     texts: dict[str, int] = {}
     known: dict[int, int] = {}
     for index in used:

@@ -68,12 +68,16 @@ def slot_in(path: Path) -> Slot:
     return slot
 
 
+CHUNKS = "chunk-*/file-*"
+"""Pattern of the names of data, video and episode-metadata files, without suffix."""
+
+
 def recorded_files(root: Path) -> set[str]:
     """Return every data, video and episode-metadata file below `root`, as relative POSIX paths.
 
     Only names that fit the layout are returned, so other files beside them are never touched.
     """
-    patterns = ("data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet", "videos/*/chunk-*/file-*.mp4")
+    patterns = (f"data/{CHUNKS}.parquet", f"meta/episodes/{CHUNKS}.parquet", f"videos/*/{CHUNKS}.mp4")
     return {path.relative_to(root).as_posix() for pattern in patterns for path in root.glob(pattern)}
 
 

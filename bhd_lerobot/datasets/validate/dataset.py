@@ -114,11 +114,14 @@ def _check_videos(files: Files, findings: Findings) -> None:
                 findings.error("video", name, what, RESTORE)
             begin = np.array([files.episodes[f"videos/{key}/from_timestamp"][i] for i in positions])
             end = np.array([files.episodes[f"videos/{key}/to_timestamp"][i] for i in positions])
+            order = np.argsort(begin, kind="stable")  # whichever it is: they are found by their times
+            numbers = np.array([files.episodes["episode_index"][i] for i in positions])[order]
+            begin, end, lengths = begin[order], end[order], lengths[order]
             expected = (np.cumsum(lengths) - lengths) / fps
             off = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
             for position in np.flatnonzero(off)[:3]:
                 what = (
-                    f"episode {files.episodes['episode_index'][positions[position]]} has the place from "
+                    f"episode {numbers[position]} has the place from "
                     f"{begin[position]:.3f} to {end[position]:.3f} s, and its {lengths[position]} frames begin at "
                     f"{expected[position]:.3f} s"
                 )

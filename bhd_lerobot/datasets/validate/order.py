@@ -13,6 +13,7 @@ from bhd_lerobot.datasets.format.state import UNREADABLE, Row
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.findings import FIX, Findings, few
 
+_MOVE = "Move it out of the dataset."
 SORTS = f"{FIX} puts them in order."
 
 
@@ -93,9 +94,17 @@ def check_order(root: Path, slots: Sequence[layout.Slot], described: Sequence[in
     last = max(wanted, default="")
     for path in sorted((root / "data").glob("*/*.parquet")):
         name = path.relative_to(root).as_posix()
-        if name not in wanted and name < last and _rows_in(path):
-            what = "no described episode is in it, and LeRobot counts its rows: all frames behind it are others"
-            findings.error("order", name, what, "Move it out of data/, or let bhd-data repair recover what is whole.")
+        if name not in wanted and _rows_in(path):
+            is_ordinary = path.match(f"{layout.CHUNKS}.parquet")
+            if name < last:
+                what = "no described episode is in it, and LeRobot counts its rows: all frames behind it are others"
+                findings.error("order", name, what, f"{_MOVE[:-1]}, or run bhd-data repair." if is_ordinary else _MOVE)
+            elif not is_ordinary:  # the others are reported as unused
+                findings.warning("order", name, "LeRobot reads it, too, where some episodes are selected", _MOVE)
+    for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
+        if not path.match(f"{layout.CHUNKS}.parquet"):
+            what = "LeRobot reads it, too, and takes row i of all these files for that of episode i"
+            findings.error("order", path.relative_to(root).as_posix(), what, _MOVE)
 
 
 def _rows_in(path: Path) -> int:

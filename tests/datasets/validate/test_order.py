@@ -9,10 +9,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 
 from bhd_lerobot.datasets.edit.edits import edits_of, keep
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.columns import read_columns, read_episode
+from bhd_lerobot.datasets.format.video_splice import splice
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.datasets.loader.table_dataset import TableDataset
 from bhd_lerobot.datasets.recovery.fix import fix
@@ -77,10 +79,23 @@ def left_over(root: Path) -> None:
     shutil.copy(root / "data/chunk-000/file-001.parquet", root / DATA)
 
 
-def backup(root: Path) -> None:
-    """Leave a copy under a name of its own, which LeRobot reads, too."""
+def copied(name: str, stem: str) -> Damage:
+    """Leave a copy of a file under a name of its own, which LeRobot reads, too."""
+
+    def damage(root: Path) -> None:
+        foreign.write(root)
+        shutil.copy(root / name, (root / name).with_name(f"{stem}.parquet"))
+
+    return damage
+
+
+def apart(root: Path) -> None:
+    """Number the episodes 5, 15 and 25, in their rows and in the frames."""
     foreign.write(root)
-    shutil.copy(root / DATA, root / "data/chunk-000/backup.parquet")
+    for name in (ROWS, DATA):
+        foreign.edit(
+            root / name, lambda values: values.update(episode_index=[10 * n + 5 for n in values["episode_index"]])
+        )
 
 
 SHUFFLED = np.random.default_rng(0).permutation(sum(foreign.LENGTHS)).tolist()
@@ -107,7 +122,9 @@ CASES: dict[str, tuple[Damage, str, str, bool, bool]] = {
         "counts", DATA, False, True,
     ),
     "a data file before the others": (left_over, "order", DATA, False, True),
-    "a copy of a data file": (backup, "order", "data/chunk-000/backup.parquet", False, False),
+    "a copy of a data file": (copied(DATA, "backup"), "order", "data/chunk-000/backup.parquet", False, False),
+    "a copy of the episodes": (copied(ROWS, "old"), "order", "meta/episodes/chunk-000/old.parquet", False, False),
+    "numbers of episodes": (apart, "counts", "meta/episodes", False, True),
 }  # fmt: skip
 
 
@@ -165,6 +182,25 @@ def test_edits_put_the_episodes_in_order(tmp_path: Path, case: str) -> None:
     for name in ("d", "kept"):
         assert foreign.errors(tmp_path / name) == []
         assert served(tmp_path / name) == truth(foreign.LENGTHS)
+
+
+def test_instructions_numbered_with_gaps_keep_their_words(tmp_path: Path) -> None:
+    """Also where no row of an episode tells which number has which words."""
+    numbers = (5, 15, 25)
+
+    def change(episode: int, columns: foreign.Columns) -> None:
+        columns["task_index"][:] = numbers[episode]
+        columns["task_index"][:3] = numbers[0]
+
+    root = foreign.write(tmp_path / "d", (5, 4, 7), change=change)
+    foreign.write_tasks(root, dict(zip(numbers, foreign.TASKS, strict=True)))
+    first, *others = foreign.TASKS
+    foreign.edit(root / ROWS, put("tasks", [[first], *([first, other] for other in others)]))
+    report = repair(root)
+    assert (report.episodes, report.lost) == (3, ())
+    assert foreign.errors(root) == []
+    wanted = [first if frame < 3 else foreign.TASKS[episode] for episode, frame, *_ in truth((5, 4, 7))]
+    assert [task for *_, task in served(root)] == wanted
 
 
 @each_case("case", ["numbers of instructions", "episodes in each other's file"])
@@ -262,3 +298,23 @@ def test_a_recording_whose_files_are_in_another_order_is_not_continued(tmp_path:
     assert repair(root)
     assert content(root) == before
     assert_valid(root)
+
+
+def test_episodes_may_lie_in_a_video_in_any_order(tmp_path: Path) -> None:
+    """Videos are found by their times; LeRobot reads them as they are."""
+    root = record(tmp_path / "d", [0, 1, 2], video=True)
+    before, video = content(root), next(root.glob("videos/*/*/*.mp4"))
+    spans = [(0, 5), (5, 6), (11, 7)]
+    assert [span[1] for span in spans] == [support.length(episode) for episode in range(3)]
+    splice([(video, [spans[2], spans[0], spans[1]])], tmp_path / "other.mp4", support.FPS)
+    shutil.copy(tmp_path / "other.mp4", video)
+    for one, starts in (("from", [7, 12, 0]), ("to", [12, 18, 7])):
+        foreign.edit(root / ROWS, put(f"videos/{support.CAMERA}/{one}_timestamp", [n / support.FPS for n in starts]))
+    assert foreign.errors(root) == []
+    assert not repair(root)
+    assert content(root) == before
+    keep(root, [2, 0], tmp_path / "kept")
+    assert [episode.videos for episode in content(tmp_path / "kept")] == [before[2].videos, before[0].videos]
+    ours, theirs = TableDataset("t/t", root, return_uint8=True), stock(root, return_uint8=True)
+    for frame in range(18):
+        assert torch.equal(ours[frame][support.CAMERA], theirs[frame][support.CAMERA])
