@@ -1,7 +1,9 @@
 """Bags as they are found: any storage, any compression, several files, and every kind of damage."""
 
+import os
 import shutil
 import sqlite3
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -205,6 +207,57 @@ def test_a_damaged_database_gives_what_is_before_or_is_refused(tmp_path, bags, m
         path.write_bytes(whole[:size])
         with pytest.raises(DatasetError, match=r"cut\.db3"):
             find_bags(path)[0].read(TOPICS)
+
+
+@pytest.fixture
+def logged(bags):
+    """Return a folder that everybody may read, with a bag whose second half is in its write-ahead log."""
+    with tempfile.TemporaryDirectory() as name:
+        work, folder = Path(name, "work.db3"), Path(name, "b")
+        shutil.copy(bags["sqlite3"] / "sqlite3.db3", work)
+        folder.mkdir()
+        connection = sqlite3.connect(work, isolation_level=None)
+        rows = connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+        connection.execute("DELETE FROM messages WHERE id > 20")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA wal_autocheckpoint = 0")
+        connection.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[20:])
+        for ending in ("", "-wal"):
+            shutil.copy(f"{work}{ending}", f"{folder / 'b.db3'}{ending}")
+        connection.close()
+        Path(name).chmod(0o755)
+        yield folder
+
+
+@pytest.mark.parametrize("by_link", [False, True])
+def test_the_write_ahead_log_of_a_killed_recorder_is_read_and_nothing_is_left_behind(
+    tmp_path, logged, messages, by_link, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    bag = logged / "b.db3"
+    before = {path.name: path.read_bytes() for path in logged.iterdir()}
+    if by_link:
+        bag = tmp_path / "link.db3"
+        bag.symlink_to(logged / "b.db3")
+    assert check(bag, messages) == len(messages)
+    assert {path.name: path.read_bytes() for path in logged.iterdir()} == before
+    assert not list(tmp_path.glob("bhd-bag-*"))
+
+
+def test_a_write_ahead_log_is_read_where_nothing_can_be_written(logged, messages):
+    logged.chmod(0o555)
+    user = os.geteuid()
+    try:
+        if user == 0:  # who may write everywhere
+            os.seteuid(65534)
+    except OSError:
+        pytest.skip("no other user in this namespace")
+    try:
+        assert not os.access(logged, os.W_OK, effective_ids=True)
+        assert check(logged / "b.db3", messages) == len(messages)
+    finally:
+        os.seteuid(user)
+        logged.chmod(0o755)
 
 
 def test_messages_that_the_file_lacks_are_reported(tmp_path, bags):
