@@ -69,7 +69,7 @@ def add_to(commands: Commands) -> None:
     real.add_argument("--odom_frame", metavar="FRAME", help="name of the base's frame, if it is not base_footprint")
     real.add_argument(
         "--command_timeout", type=float, metavar="S",
-        help="silence after which the robot stands; inf: it goes on (default: that of our robot)",
+        help="silence after which the robot stands; inf (default): it goes on with the last command, as a TurtleBot3",
     )  # fmt: skip
 
 
@@ -178,7 +178,7 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
     times = _times(options, fps, least=1.0)
     body = turtlebot3_burger()
     assert body.lidar is not None
-    timeout = body.limits.command_timeout_s if options.command_timeout is None else options.command_timeout
+    timeout = math.inf if options.command_timeout is None else options.command_timeout
     if not timeout > 0:
         raise ConfigError(f"--command_timeout is {timeout}; it must be positive.")
     if options.scan_yaw is not None and not math.isfinite(options.scan_yaw):
@@ -209,6 +209,7 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
         pose=pose,
         max_speed=body.limits.velocity,
         command_timeout_s=timeout,
+        timeouts=(math.inf, body.limits.command_timeout_s) if options.command_timeout is None else (),
         **times,
     )
 

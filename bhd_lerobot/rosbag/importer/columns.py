@@ -1,6 +1,7 @@
 """What is in the frames of an episode that is made of a robot's bag: every column but the images."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from bhd_lerobot.rosbag.importer.tracks import Array, Track
 from bhd_lerobot.rosbag.messages.base import ODOMETRY, TWIST
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
+MOST_UNEXPLAINED = 0.1
+"""Share of the frames in which a robot may move without a command: beyond it, what drove it is another one."""
 _MOVES = 0.01
 """[m/s, rad/s] A robot that is slower stands."""
 
@@ -65,21 +68,52 @@ def frame_columns(
 
 
 def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
-    """Return how many frames have no command, and whether the robot drove in them; None if all have one."""
-    silent = columns[keys.MODE] == int(Mode.HOLD)
-    if not silent.any():
-        return None
-    names = list(options.observation_names)
-    speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
-    moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
+    """Return how many frames have no command, or one that the robot does not obey; None if all is well."""
+    n, silent = len(columns[keys.MODE]), columns[keys.MODE] == int(Mode.HOLD)
     for_ever = np.isinf(options.command_timeout_s)
+    if not silent.any():
+        return _standing_note(options, columns) if for_ever and options.timeouts else None
     lacking = "come before the first command" if for_ever else (
         f"have no command that is younger than {options.command_timeout_s:g} s"
     )  # fmt: skip
+    moving = int((silent & _moves(options, columns[keys.OBSERVATION_STATE])).sum())
     drove = f", though the robot moved in {moving} of them" if moving else ""
     if moving and not for_ever:
         drove += ": --command_timeout=inf is for robots that go on with the last command"
-    return f"{int(silent.sum())} of {len(silent)} frames of the episode {lacking}; their action is 0{drove}"
+    return f"{int(silent.sum())} of {n} frames of the episode {lacking}; their action is 0{drove}"
+
+
+def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
+    driven = (np.abs(columns[keys.ACTION]) > _MOVES).any(axis=1)
+    against = int((driven & ~_moves(options, columns[keys.OBSERVATION_STATE])).sum())
+    if against <= MOST_UNEXPLAINED * len(driven):
+        return None
+    return (
+        f"in {against} of {len(driven)} frames of the episode the robot stands though its last command is to drive. "
+        "If it stops by itself when no command comes, say after which time: --command_timeout=S"
+    )
+
+
+def unexplained_frames(
+    options: ImportOptions, tracks: Mapping[str, Track], times: Times, timeout_s: float
+) -> tuple[int, int]:
+    """Return in how many frames the robot moves without a command, and in how many it stands against one.
+
+    Args:
+        options: what becomes of the bag.
+        tracks: by role, each sorted by time.
+        times: of the frames [ns], shape (n,).
+        timeout_s: silence after which a command is no longer in force.
+    """
+    commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
+    moves = _moves(options, _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times))
+    driven = (np.abs(commands) > _MOVES).any(axis=1)
+    return int((moves & (age < 0)).sum()), int((~moves & driven).sum())
+
+
+def _moves(options: ImportOptions, state: NDArray[Any]) -> NDArray[np.bool_]:
+    names = list(options.observation_names)
+    return (np.abs(state[:, [names.index(name) for name in TWIST if name in names]]) > _MOVES).any(axis=1)
 
 
 def _commands(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,12 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError, DatasetWriteError
-from bhd_lerobot.rosbag.importer.columns import command_note, frame_columns
+from bhd_lerobot.rosbag.importer.columns import (
+    MOST_UNEXPLAINED,
+    command_note,
+    frame_columns,
+    unexplained_frames,
+)
 from bhd_lerobot.rosbag.importer.exported import ExportedEpisode
 from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
@@ -76,7 +82,9 @@ def import_bags(
     ):
         for place, bag in enumerate(bags):
             robot_bag = _RobotBag(bag, options, recording, exported[place] if exported else ())
-            for episode in robot_bag.episodes():
+            episodes = list(robot_bag.episodes())
+            robot_bag.check_commands(episodes)
+            for episode in episodes:
                 report.frames += robot_bag.save(episode)
                 report.episodes += 1
             report.problems += bag.problems
@@ -256,6 +264,38 @@ class _RobotBag:
                         f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
                         "was left out"
                     )
+
+    def check_commands(self, episodes: Sequence[_Episode]) -> None:
+        """Check that commands explain how the robot moves, unless the user said how long they are in force.
+
+        Raises:
+            DatasetError: they do not; says what the user may choose, and what each choice gives.
+        """
+        options, n = self._options, sum(len(episode.grid.times) for episode in episodes)
+        if "cmd" not in self._tracks:
+            return
+        counts = {
+            timeout: np.sum(
+                [unexplained_frames(options, one.tracks, one.grid.times, timeout) for one in episodes], axis=0
+            )
+            for timeout in options.timeouts
+            if n
+        }
+        if not counts or (moving := counts[options.command_timeout_s][0]) <= MOST_UNEXPLAINED * n:
+            return
+        what = {
+            timeout: "the last command" if math.isinf(timeout) else "none, after so many seconds" for timeout in counts
+        }
+        choices = "; ".join(
+            f"--command_timeout={timeout:g}, {what[timeout]}: the robot moves in {blind} frames with the action 0, and "
+            f"stands in {against} although the action says to drive"
+            for timeout, (blind, against) in counts.items()
+        )
+        raise DatasetError(
+            f"{self._bag.path}: the robot moves in {moving} of {n} frames ({moving / n:.0%}) without a command of "
+            f"{self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove it "
+            f"with --cmd, or say what is in force while no command comes. {choices}."
+        )
 
     def save(self, episode: _Episode) -> int:
         """Save an episode and return its number of frames.

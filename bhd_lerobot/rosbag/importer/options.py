@@ -32,6 +32,7 @@ class ImportOptions:
         max_age_s: age of the oldest reading beyond which a frame is late.
         max_gap_s: silence of a sensor that ends an episode.
         command_timeout_s: silence after which a command is no longer in force and the robot stands.
+        timeouts: those that the user chooses from where the robot moves without a command; none if one was given.
         min_episode_s: shorter episodes are left out.
         outcome: what the episodes ended with; None if it is not known.
     """
@@ -58,6 +59,7 @@ class ImportOptions:
     scan_yaw: float | None = None
     pose: bool = False
     outcome: str | None = None
+    timeouts: tuple[float, ...] = ()
 
     @property
     def topic_of(self) -> dict[str, str]:

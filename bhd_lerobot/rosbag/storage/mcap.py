@@ -19,6 +19,16 @@ _CHUNK = b"\x06"  # what a chunk's record begins with; its length follows
 _HEAD_BYTES = 9
 
 
+class _Mapped(mmap.mmap):
+    """A file of which a read of more bytes than there are gives those that there are, and reserves no memory for more.
+
+    Of a chunk that its writer has not closed yet, all lengths may be the largest number of 64 bits.
+    """
+
+    def read(self, n: int | None = None) -> bytes:
+        return super().read(len(self) if n is None else min(n, len(self)))
+
+
 class McapFile:
     """One file.
 
@@ -46,8 +56,7 @@ class McapFile:
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise DatasetError(f"{path} is no MCAP file: it does not begin as one, or is empty.")
-            # A read of more bytes than there are gives those that there are, without reserving memory for more.
-            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self._data = _Mapped(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def close(self) -> None:
         """Close the file."""

@@ -1,13 +1,14 @@
 """SQLite files of rosbag2, read in the order in which messages were written, also damaged ones."""
 
 import contextlib
+import shutil
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.storage.unpack import Budget, temporary_copy
+from bhd_lerobot.rosbag.storage.unpack import Budget, room, temporary_copy
 
 _STEPS = 10_000  # of SQLite's own machine, between two checks of their number
 _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20
@@ -44,11 +45,15 @@ class SqliteFile:
     def _open(self) -> None:
         whole = self._whole_pages()
         # With a write-ahead log beside it, which a killed recorder leaves, the log is read, too.
-        log = self.path.with_name(f"{self.path.name}-wal")
-        self._bytes = whole.stat().st_size + (log.stat().st_size if log.exists() else 0)
-        options = "mode=ro" if log.exists() else "mode=ro&immutable=1"
+        log = Path(f"{self.path.resolve()}-wal")
+        has_log = log.exists() and log.stat().st_size > 0
+        if has_log:
+            whole = self._beside_log(whole, log)
+        self._bytes = whole.stat().st_size + (log.stat().st_size if has_log else 0)
         try:
-            connection = sqlite3.connect(f"{whole.resolve().as_uri()}?{options}", uri=True)
+            connection = sqlite3.connect(
+                f"{whole.resolve().as_uri()}?mode=ro{'' if has_log else '&immutable=1'}", uri=True
+            )
             self._connection = self._stack.enter_context(contextlib.closing(connection))
             self._bound()
             # Without it SQLite does not open a file that has fewer pages than its header counts. Nothing is written.
@@ -126,6 +131,16 @@ class SqliteFile:
         if size < page or not size % page:
             return path
         return self._stack.enter_context(temporary_copy(path, path.name, _beginning(path, size - size % page)))
+
+    def _beside_log(self, whole: Path, log: Path) -> Path:
+        """Return a copy of the file with its log beside it: where SQLite reads a log, it writes an index of it."""
+        if whole == self.path:
+            whole = self._stack.enter_context(
+                temporary_copy(whole, whole.name, _beginning(whole, whole.stat().st_size))
+            )
+        with room(self.path):
+            shutil.copyfile(log, f"{whole}-wal")
+        return whole
 
     def summary(self) -> dict[int, int] | None:
         """Return how many messages each topic has; None if that cannot be counted."""

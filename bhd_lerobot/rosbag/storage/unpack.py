@@ -113,11 +113,11 @@ def temporary_copy(path: Path, name: str, blocks: Iterable[bytes]) -> Iterator[P
         DatasetError: there is no room for it.
     """
     with contextlib.ExitStack() as stack:
-        with _room(path):
+        with room(path):
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="bhd-bag-"))
             file = stack.enter_context(Path(folder, name).open("wb"))
         for block in blocks:
-            with _room(path):
+            with room(path):
                 file.write(block)
                 file.flush()  # here, where its error is caught
         file.close()
@@ -125,7 +125,8 @@ def temporary_copy(path: Path, name: str, blocks: Iterable[bytes]) -> Iterator[P
 
 
 @contextlib.contextmanager
-def _room(path: Path) -> Iterator[None]:
+def room(path: Path) -> Iterator[None]:
+    """Say, where a copy of a bag does not fit into the folder for temporary files, what helps."""
     try:
         yield
     except OSError as error:

@@ -165,7 +165,7 @@ def test_clock_jumps_split_the_episode(tmp_path, capsys, jump, note, storage):
 def test_silence_of_the_commands_is_a_standstill(tmp_path, capsys):
     messages = [one for one in drive(stamped=True) if one[0] != "/cmd_vel" or not 2 < (one[1] - START) / NANO < 4]
     source = write(tmp_path / "bag", messages)
-    imported(source, tmp_path / "d")
+    imported(source, tmp_path / "d", "--command_timeout=0.5")
     columns = read_episode(tmp_path / "d", 0)
     silent = columns["control.watchdog"] == 1
     assert 13 <= silent.sum() <= 16
@@ -173,7 +173,7 @@ def test_silence_of_the_commands_is_a_standstill(tmp_path, capsys):
     assert (columns["action"][~silent] != 0).all()
     assert (columns["control.mode"] == np.where(silent, 2, 3)).all()
     assert columns["control.command_age"].max() <= 0.5
-    imported(source, tmp_path / "held", "--command_timeout=inf")
+    imported(source, tmp_path / "held")  # a TurtleBot3 goes on with its last command
     held = read_episode(tmp_path / "held", 0)
     assert (held["action"] != 0).all()
     assert held["control.command_age"].max() > 1.5
@@ -308,15 +308,60 @@ def test_an_action_is_the_answer_to_its_observation(tmp_path):
 
 def test_frames_without_a_command_are_counted(tmp_path, capsys):
     messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] < START + NANO]
-    info = imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    info = imported(write(tmp_path / "bag", messages), tmp_path / "d", "--command_timeout=0.5")
     error = capsys.readouterr().err
     columns = read_episode(tmp_path / "d", 0)
     silent = int((columns["control.mode"] == 2).sum())
     assert 30 < silent < info.frames
     assert f"{silent} of {info.frames} frames" in error
     assert "--command_timeout=inf" in error  # it drives on
-    imported(tmp_path / "bag", tmp_path / "e", "--command_timeout=inf")
+    imported(tmp_path / "bag", tmp_path / "e")
     assert "no command" not in capsys.readouterr().err
+
+
+def test_a_key_press_is_in_force_until_the_next(tmp_path, capsys):
+    """Teleoperation by keys publishes once, and a TurtleBot3 goes on: its node has no time-out of its own."""
+    presses = {0.02: (0.1, 0.0), 2.5: (0.0, 0.6), 4.0: (0.2, -0.6)}
+    base = [message for message in drive() if message[0] != "/cmd_vel"]
+    keys = [("/cmd_vel", START + int(at * NANO), bags.twist(*values)) for at, values in presses.items()]
+    imported(write(tmp_path / "bag", sorted([*base, *keys], key=lambda message: message[1])), tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    ends = columns["control.time"] + (source_of(tmp_path / "d")["start_ns"] - START) / NANO + 0.1
+    newest = [max(at for at in presses if at < end) for end in ends]
+    assert (columns["action"] == np.float32([presses[at] for at in newest])).all()
+    assert (columns["control.mode"] == 3).all()
+
+
+def test_a_robot_that_moves_without_a_command_needs_a_choice(tmp_path, capsys):
+    messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] > START + 2 * NANO]
+    source = write(tmp_path / "bag", messages)
+    error = refused(source, tmp_path / "d", capsys)
+    assert "--cmd" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    for timeout, first in (("inf", "the last command"), ("0.5", "none, after so many seconds")):
+        says = rf"={timeout}, {first}: the robot moves in (\d+) frames with the action 0, and stands in (\d+) although"
+        found = re.search(f"--command_timeout{says}", error)
+        assert found
+        root = tmp_path / f"d{timeout}"
+        imported(source, root, f"--command_timeout={timeout}")
+        columns = read_episode(root, 0)
+        moves = (np.abs(columns["observation.state"][:, :2]) > 0.01).any(axis=1)
+        silent = columns["control.mode"] == 2
+        assert int(found[1]) == (moves & silent).sum() > 0.1 * len(moves)
+        assert int(found[2]) == (~moves & ~silent).sum()
+    few = [one for one in drive() if one[0] != "/cmd_vel" or one[1] > START + NANO // 2]
+    imported(write(tmp_path / "few", few), tmp_path / "few_d")
+    assert "come before the first command" in capsys.readouterr().err
+
+
+def test_a_robot_that_stands_against_its_last_command_is_reported(tmp_path, capsys):
+    still = bags.T["geometry_msgs/msg/TwistWithCovariance"](twist=bags.twist(0, 0), covariance=np.zeros(36))
+    messages = drive()
+    for topic, at, message in messages:
+        if topic == "/odom" and at > START + 3 * NANO:
+            message.twist = still
+    imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    assert re.search(r"in (29|3[01]) of 60 frames .* stands though its last command", capsys.readouterr().err)
 
 
 def test_commands_of_another_clock_are_refused(tmp_path, capsys):

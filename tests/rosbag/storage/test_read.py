@@ -1,7 +1,9 @@
 """Bags as they are found: any storage, any compression, several files, and every kind of damage."""
 
+import os
 import shutil
 import sqlite3
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -85,12 +87,10 @@ def test_compressed_bags(tmp_path, messages, mode, storage):
         assert "its messages are compressed one by one (compression_mode: MESSAGE)" in bag.problems[1]
 
 
-@pytest.mark.parametrize("compression", list(CompressionType))
-@pytest.mark.parametrize("use_chunking", [True, False])
-def test_files_of_another_writer(tmp_path, messages, compression, use_chunking):
-    path = tmp_path / "other.mcap"
+def write_mcap(path: Path, messages, compression, *, use_chunking: bool = True, chunk_size: int = 20_000) -> Path:
+    """Write a file as another writer does."""
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=20_000, compression=compression)
+        writer = McapWriter(file, chunk_size=chunk_size, compression=compression)
         writer._writer._Writer__use_chunking = use_chunking
         schemas = {}
         for topic, received, message in messages:
@@ -104,7 +104,39 @@ def test_files_of_another_writer(tmp_path, messages, compression, use_chunking):
                 channel = writer._channel_ids[topic] = writer._writer.register_channel(topic, "cdr", schemas[kind].id)
             writer._writer.add_message(channel, received, bytes(fields), received)
         writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_files_of_another_writer(tmp_path, messages, compression, use_chunking):
+    path = write_mcap(tmp_path / "other.mcap", messages, compression, use_chunking=use_chunking)
     assert check(path, messages) == len(messages)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_the_chunk_of_a_writer_that_was_killed_is_read_as_one_that_was_cut(tmp_path, messages, compression):
+    """Until it closes a chunk, foxglove-sdk's writer has all ones in place of lengths, size and checksum."""
+    whole = bytearray(write_mcap(tmp_path / "other.mcap", messages, compression, chunk_size=60_000).read_bytes())
+    place, chunks = 8, []
+    while whole[place] != 0x0F:  # to the end of the data
+        chunks += [place] if whole[place] == 0x06 else []
+        place += 9 + int.from_bytes(whole[place + 1 : place + 9], "little")
+    assert len(chunks) > 1
+    last, ones = chunks[-1], b"\xff" * 8
+    end = last + 9 + int.from_bytes(whole[last + 1 : last + 9], "little")
+    name = int.from_bytes(whole[last + 37 : last + 41], "little")
+    counts = []
+    for size in (last + 60, (last + end) // 2, end - 1):
+        cut = bytearray(whole[:size])
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(cut)
+        counts.append(check(path, messages, problems=1, whole=False))
+        for at, length in ((last + 1, 8), (last + 25, 8), (last + 33, 4), (last + 41 + name, 8)):
+            cut[at : at + length] = ones[:length]
+        path.write_bytes(cut)
+        assert check(path, messages, problems=1, whole=False) == counts[-1]
+    assert counts[0] < counts[-1] or compression is CompressionType.ZSTD  # whose blocks are larger than this chunk
 
 
 def test_a_bag_that_is_cut_off_anywhere_gives_what_is_before_or_is_refused(tmp_path, bags, messages):
@@ -175,6 +207,57 @@ def test_a_damaged_database_gives_what_is_before_or_is_refused(tmp_path, bags, m
         path.write_bytes(whole[:size])
         with pytest.raises(DatasetError, match=r"cut\.db3"):
             find_bags(path)[0].read(TOPICS)
+
+
+@pytest.fixture
+def logged(bags):
+    """Return a folder that everybody may read, with a bag whose second half is in its write-ahead log."""
+    with tempfile.TemporaryDirectory() as name:
+        work, folder = Path(name, "work.db3"), Path(name, "b")
+        shutil.copy(bags["sqlite3"] / "sqlite3.db3", work)
+        folder.mkdir()
+        connection = sqlite3.connect(work, isolation_level=None)
+        rows = connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+        connection.execute("DELETE FROM messages WHERE id > 20")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA wal_autocheckpoint = 0")
+        connection.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[20:])
+        for ending in ("", "-wal"):
+            shutil.copy(f"{work}{ending}", f"{folder / 'b.db3'}{ending}")
+        connection.close()
+        Path(name).chmod(0o755)
+        yield folder
+
+
+@pytest.mark.parametrize("by_link", [False, True])
+def test_the_write_ahead_log_of_a_killed_recorder_is_read_and_nothing_is_left_behind(
+    tmp_path, logged, messages, by_link, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    bag = logged / "b.db3"
+    before = {path.name: path.read_bytes() for path in logged.iterdir()}
+    if by_link:
+        bag = tmp_path / "link.db3"
+        bag.symlink_to(logged / "b.db3")
+    assert check(bag, messages) == len(messages)
+    assert {path.name: path.read_bytes() for path in logged.iterdir()} == before
+    assert not list(tmp_path.glob("bhd-bag-*"))
+
+
+def test_a_write_ahead_log_is_read_where_nothing_can_be_written(logged, messages):
+    logged.chmod(0o555)
+    user = os.geteuid()
+    try:
+        if user == 0:  # who may write everywhere
+            os.seteuid(65534)
+    except OSError:
+        pytest.skip("no other user in this namespace")
+    try:
+        assert not os.access(logged, os.W_OK, effective_ids=True)
+        assert check(logged / "b.db3", messages) == len(messages)
+    finally:
+        os.seteuid(user)
+        logged.chmod(0o755)
 
 
 def test_messages_that_the_file_lacks_are_reported(tmp_path, bags):
