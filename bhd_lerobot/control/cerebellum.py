@@ -150,7 +150,8 @@ class Cerebellum:
             old = (self.mode == Mode.TRACKING) & ~self._by_goal & (now_ns - self._last_due > self._timeout_ns)
             if old.any():
                 self._watchdog[old] |= Watchdog.COMMAND_AGE
-                self.fifo.drop(np.flatnonzero(old))  # what a brain left behind that fell silent moves nothing later
+                ids = np.flatnonzero(old)  # what a brain left behind that fell silent moves nothing later
+                self.refusals[Reason.STALE, ids] += self.fifo.drop(ids)
                 self._set_mode(old, Mode.STOPPING)
             self._update_deadline()
         if self._stopping:
@@ -299,7 +300,8 @@ class Cerebellum:
             hit = self.mode == Mode.TRACKING
             held = hit | (self.mode == Mode.STOPPING) | (self.mode == Mode.HOLD)
         if len(self.fifo) and np.count_nonzero(held):
-            self.fifo.drop(np.flatnonzero(held))  # what still waits would start motion again
+            ids = np.flatnonzero(held)  # what still waits would start motion again
+            self.refusals[Reason.STALE, ids] += self.fifo.drop(ids)
         if not np.count_nonzero(hit):
             return
         self._watchdog[hit] |= cause
@@ -419,7 +421,10 @@ class Cerebellum:
 
     def _read_anew(self, mask: NDArray[np.bool_]) -> None:
         """Take where robots are now, wherever they were before; `mask` has shape (n,)."""
-        self.plant.read(self.reading)
+        reading, others = self.reading, ~mask
+        values, safety = reading.values[:, others], reading.safety[others]
+        self.plant.read(reading)
+        reading.values[:, others], reading.safety[others] = values, safety  # theirs are of the last tick
         self.readings.forget(np.flatnonzero(mask))
         self._judge_reading()
 

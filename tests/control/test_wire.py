@@ -333,6 +333,7 @@ def test_what_a_silent_brain_left_in_the_queue_moves_nothing_later() -> None:
     rig.send(0.2, due=rig.now + 2 * support.NANOSECONDS)  # after the time-out
     rig.tick(support.HZ)
     assert rig.mode == Mode.HOLD
+    assert rig.refused(Reason.STALE) == 1  # it is counted
     for _ in range(4 * support.HZ):
         rig.tick()
         assert not rig.plant.last.any()
