@@ -26,7 +26,7 @@ _ROUNDING = 2.0**-24  # relative, of one operation in single precision
 _MORE = 4  # operations beside the sum
 _TINY = 1e-6
 _TOLERATED = 0.1  # relative, of a standard deviation: what is learned hardly depends on it
-_BLOCK = 1 << 14  # rows
+_BLOCK = 1 << 17  # numbers
 _STEPS = 8  # of single precision: a number that changes by less is at rest
 
 
@@ -44,9 +44,11 @@ class Moments:
     def of(cls, values: NDArray[Any]) -> Self:
         """Return those of finite values, shape (n, d)."""
         found: Self | None = None
-        for start in range(0, len(values), _BLOCK):  # in double precision all of them would take twice the memory
-            block = values[start : start + _BLOCK].astype(np.float64)
-            low, high, mean = block.min(axis=0), block.max(axis=0), block.mean(axis=0)
+        low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
+        step = max(1, _BLOCK // values.shape[1])
+        for start in range(0, len(values), step):  # blocks that fit the cache, and not all in double precision at once
+            block = values[start : start + step].astype(np.float64)
+            mean = block.mean(axis=0)
             block -= mean
             part = cls(low, high, mean, np.einsum("ij,ij->j", block, block), len(block))
             if found is None:
