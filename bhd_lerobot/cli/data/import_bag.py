@@ -21,6 +21,7 @@ from bhd_lerobot.rosbag.importer.exported import (
     names_of,
 )
 from bhd_lerobot.rosbag.importer.options import ImportOptions
+from bhd_lerobot.rosbag.messages.base import TWIST
 from bhd_lerobot.rosbag.messages.types import require_rosbags
 from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
 from bhd_lerobot.rosbag.storage.place import refuse_existing
@@ -31,7 +32,18 @@ ROBOTS = ("turtlebot3",)
 _STAMPS = ("auto", "header", "receive")
 _TOPICS = {"scan": "/scan", "odom": "/odom", "cmd": "/cmd_vel"}
 _REAL = (
-    *(*_TOPICS, "imu", "camera", "odometry", "beams", "scan_frame", "scan_yaw", "odom_frame", "command_timeout"),
+    *(
+        *_TOPICS,
+        "no_odom",
+        "imu",
+        "camera",
+        "odometry",
+        "beams",
+        "scan_frame",
+        "scan_yaw",
+        "odom_frame",
+        "command_timeout",
+    ),
 )  # options for bags of a real robot
 
 
@@ -59,6 +71,9 @@ def add_to(commands: Commands) -> None:
     )
     real.add_argument("--scan", help=f"topic of the scans (default: {_TOPICS['scan']})")
     real.add_argument("--odom", help=f"topic of the odometry (default: {_TOPICS['odom']})")
+    real.add_argument(
+        "--no_odom", action="store_true", default=None, help="read no odometry: the state has the scan, and no speeds"
+    )
     real.add_argument("--cmd", help=f"topic of the commands (default: {_TOPICS['cmd']})")
     real.add_argument("--imu", help="topic of the IMU, to observe the gyroscope; not observed if left out")
     real.add_argument("--camera", action="append", metavar="NAME=TOPIC", help="a camera to record: front=/image")
@@ -191,13 +206,19 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
         fps=10, beams=beams, odometry=pose, imu=options.imu is not None
     )  # refuses numbers of beams that do not divide a turn
     topics = {role: getattr(options, role) or topic for role, topic in _TOPICS.items()}
+    names = observation_names(config)
+    if options.no_odom:
+        if given := [name for name in ("odom", "odometry", "odom_frame") if getattr(options, name) is not None]:
+            raise ConfigError(f"--no_odom and --{given[0]} are both given; with --no_odom no odometry is read.")
+        del topics["odom"]
+        names = tuple(name for name in names if name not in TWIST)
     if options.imu is not None:
         topics["imu"] = options.imu
     return ImportOptions(
         robot_type=robot,
         task=options.task,
         fps=fps,
-        observation_names=observation_names(config),
+        observation_names=names,
         action_names=body.limits.names,
         topics=topics,
         cameras=_cameras(options.camera or []),

@@ -72,7 +72,8 @@ def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) ->
     n, silent = len(columns[keys.MODE]), columns[keys.MODE] == int(Mode.HOLD)
     for_ever = np.isinf(options.command_timeout_s)
     if not silent.any():
-        return _standing_note(options, columns) if for_ever and options.timeouts else None
+        judged = for_ever and options.timeouts and TWIST[0] in options.observation_names
+        return _standing_note(options, columns) if judged else None
     lacking = "come before the first command" if for_ever else (
         f"have no command that is younger than {options.command_timeout_s:g} s"
     )  # fmt: skip

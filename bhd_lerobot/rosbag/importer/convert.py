@@ -28,6 +28,7 @@ from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.rosbag.importer.segments import segments, silence_notes
 from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.rosbag.importer.video import CAMERA, CameraImages
+from bhd_lerobot.rosbag.messages.base import TWIST
 from bhd_lerobot.rosbag.storage.place import complete_or_not
 from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import Event
@@ -75,6 +76,12 @@ def import_bags(
         DatasetWriteError: the dataset cannot be written.
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
+    if "scan" in options.topics and "odom" not in options.topics:
+        names = options.observation_names
+        report.notes.append(
+            f"no odometry is read: the state is {names[0]} to {names[-1]}, without {' and '.join(TWIST)}. Whether the "
+            "robot obeyed is not known, and a policy that learns from it needs a robot that observes the same"
+        )
     # A dataset with some of the episodes would look like a recording that was interrupted.
     with (
         complete_or_not(report.root, "--root", "import bags", "No dataset was made.") as folder,

@@ -61,36 +61,62 @@ _MEANING = {
 }
 
 
-def wanted_topic(bag: Bag, role: str, name: str) -> Topic:
-    """Return the topic that a role, a key of `TYPES`, is read from.
+def wanted_topics(bag: Bag, names: Mapping[str, str]) -> dict[str, Topic]:
+    """Return the topics that roles are read from.
+
+    Args:
+        bag: the bag.
+        names: role, a key of `TYPES`, of a camera with its name behind a slash -> topic; ``scan`` is ``/scan``, too.
 
     Raises:
-        DatasetError: the bag is of another robot, or the topic is missing, empty, of another type, of two types, or
-            not in ROS 2's serialisation.
+        DatasetError: the bag is of another robot; topics are missing or empty, all of which are named; or one is of
+            another type, of two types, or not in ROS 2's serialisation.
     """
-    option, types, topics = f"--{role}", TYPES[role], bag.topics
-    if name not in topics or not topics[name].count:
+    found = {role: bag.topics.get(name) or bag.topics.get(other_form(name)) for role, name in names.items()}
+    lacking = [_lacking(bag, role, names[role], topic) for role, topic in found.items() if not topic or not topic.count]
+    if lacking:
         _refuse_arm(bag)
-        there = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in topics.values()) or "none"
-        fitting = [topic.name for topic in topics.values() if topic.msgtype in types and topic.count]
-        hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""
-        what = "no message of" if name in topics else "no topic"
+        there = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in bag.topics.values()) or "none"
+        raise DatasetError(f"{bag.path} has {' It has '.join(lacking)} The bag has: {there}.{_damage(bag)}")
+    return {role: _checked(bag, role, topic) for role, topic in found.items() if topic}
+
+
+def other_form(name: str) -> str:
+    """Return a topic's name with the slash in front that it lacks, or without it: some writers leave it out."""
+    return name[1:] if name.startswith("/") else f"/{name}"
+
+
+def _lacking(bag: Bag, role: str, name: str, topic: Topic | None) -> str:
+    """Return the end of a sentence: which topic there is not, and what may be read in its place."""
+    kind = role.partition("/")[0]
+    types = TYPES[kind]
+    fitting = [one.name for one in bag.topics.values() if one.msgtype in types and one.count]
+    remedy = (
+        f"Name another one with --{kind}. Of the right type: {', '.join(fitting)}."
+        if fitting
+        else f"--{kind} can name no other one: none is of type {' or '.join(types)}."
+    )
+    if kind == "odom":
+        remedy += " --no_odom does without: the state is the scan alone."
+    return f"{'no topic' if topic is None else 'no message of'} {name}, which {_MEANING[kind]} is read from. {remedy}"
+
+
+def _checked(bag: Bag, role: str, topic: Topic) -> Topic:
+    kind = role.partition("/")[0]
+    if topic.msgtype not in TYPES[kind]:
         raise DatasetError(
-            f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
-            f"{hint} The bag has: {there}.{_damage(bag)}"
+            f"{topic.name} in {bag.path} is of type {topic.msgtype}; valid for --{kind}: {', '.join(TYPES[kind])}."
         )
-    if topics[name].msgtype not in types:
+    if topic.others:
         raise DatasetError(
-            f"{name} in {bag.path} is of type {topics[name].msgtype}; valid for {option}: {', '.join(types)}."
+            f"{topic.name} in {bag.path} has messages of several types, {', '.join((topic.msgtype, *topic.others))}, "
+            f"and it is not known which of them is {_MEANING[kind]}. Make a bag with one of them: ros2 bag convert."
         )
-    if others := topics[name].others:
+    if topic.serialisation != "cdr":
         raise DatasetError(
-            f"{name} in {bag.path} has messages of several types, {', '.join((topics[name].msgtype, *others))}, and "
-            f"it is not known which of them is {_MEANING[role]}. Make a bag with one of them: ros2 bag convert."
+            f"{topic.name} in {bag.path} is serialised as {topic.serialisation!r}; only cdr can be read."
         )
-    if (serialisation := topics[name].serialisation) != "cdr":
-        raise DatasetError(f"{name} in {bag.path} is serialised as {serialisation!r}; only cdr can be read.")
-    return topics[name]
+    return topic
 
 
 def exported_topic(bag: Bag, role: str, part: Part) -> Topic:
@@ -119,7 +145,8 @@ def _damage(bag: Bag) -> str:
 
 def static_topics(scan: str) -> set[str]:
     """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
-    return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
+    names = {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
+    return names | {other_form(name) for name in names}
 
 
 def publisher_notes(bag: Bag, wanted: Mapping[str, Topic]) -> list[str]:

@@ -13,9 +13,9 @@ from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_w
 from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.rosbag.importer.scan import GEOMETRY, resampled_scans
-from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topic
+from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topics
 from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
-from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
+from bhd_lerobot.rosbag.messages.parts import NANO, WXYZ, head_stamps, header_stamps, numbers
 from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 
@@ -25,6 +25,7 @@ MOST_LOST = 0.1
 """Share of a topic's messages that may be unreadable. Beyond it is no accident, and what is left is no record."""
 
 _HEADER_BYTES = 12  # of a message: what it is serialised as, and the stamp
+_UNSET = "the orientation 0, 0, 0, 0, which is no rotation"
 _APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
 
 
@@ -73,9 +74,9 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str,
     Raises:
         DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
     """
-    wanted = {role: wanted_topic(bag, role, name) for role, name in options.topics.items()}
+    wanted = wanted_topics(bag, {role: topic for role, topic in options.topic_of.items() if role not in options.parts})
+    cameras = {role: wanted.pop(role) for role in list(wanted) if role.startswith("camera/")}
     wanted |= {role: exported_topic(bag, role, part) for role, part in options.parts.items()}
-    cameras = {f"camera/{name}": wanted_topic(bag, "camera", topic) for name, topic in options.cameras.items()}
     notes += publisher_notes(bag, {**wanted, **cameras})
     latched = sorted(static_topics(options.topics["scan"]) & bag.topics.keys()) if "scan" in options.topics else []
     names = {topic.name for topic in wanted.values()} | {*latched}
@@ -102,17 +103,33 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str,
         values = _values(role, topic, found, decoded, _Reading(options, static, lost > 0, notes))
         fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
         finite = np.logical_and.reduce(fits, axis=1)
-        if not finite.all():
-            what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
-            notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
+        unset = _unset(role, decoded, options) & fits[:, :-1].all(axis=1) & ~finite
+        for lost, what in (
+            (~finite & ~unset, "are no scan of a whole turn" if role == "scan" else "with values that are not finite"),
+            (unset, f"have {_UNSET}"),
+        ):
+            if lost.any():
+                notes.append(f"{topic.name}: {int(lost.sum())} of {len(finite)} messages {what}, left out")
         track = Track(topic.name, topic.msgtype, times, found.order, values, stamps, _names(role, options))
         track = track.rows(np.flatnonzero(finite))
+        if unset.all():
+            raise DatasetError(
+                f"{bag.path}: all messages of {topic.name} have {_UNSET}: its driver fills in no pose. Leave out "
+                "--odometry, or name another topic with --odom."
+            )
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
     notes += pace_warnings(paces)
     _check_one_time(bag, wanted["odom" if "odom" in wanted else next(iter(wanted))].name, clocks)
     return tracks
+
+
+def _unset(role: str, decoded: Sequence[Any], options: ImportOptions) -> NDArray[np.bool_]:
+    """Return which messages have an orientation that was never set, shape (n,), or, of other topics, (1,)."""
+    if role != "odom" or not options.pose:
+        return np.zeros(1, np.bool_)
+    return ~np.any(numbers([message.pose.pose.orientation for message in decoded], WXYZ), axis=1)
 
 
 def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:

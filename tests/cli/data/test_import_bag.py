@@ -200,6 +200,45 @@ def test_a_bag_without_a_topic_is_refused_with_those_it_has(tmp_path, capsys):
         assert all(part in error for part in parts), error
 
 
+def test_all_topics_that_are_missing_are_named_at_once(tmp_path, capsys):
+    left = [(f"/r{topic}", at, message) for topic, at, message in drive() if topic in ("/odom", "/cmd_vel")]
+    error = refused(write(tmp_path / "bag", left), tmp_path / "d", capsys)
+    for part in ("no topic /scan", "no topic /odom", "no topic /cmd_vel", "Of the right type: /r/odom", "--no_odom"):
+        assert part in error
+    assert "Name another one with --scan" not in error
+    assert "none is of type sensor_msgs/msg/LaserScan" in error
+    error = refused(tmp_path / "bag", tmp_path / "d", capsys, "--odom=/r/odom", "--camera=front=/image")
+    assert "no topic /image, which the image is read from" in error
+    assert "/odom, which" not in error
+
+
+@pytest.mark.parametrize("options", [(), ("--scan=scan", "--cmd=/cmd_vel")])
+def test_a_topic_has_its_name_with_and_without_the_slash(tmp_path, plain, dataset, options):
+    plains = [(topic.removeprefix("/"), at, message) for topic, at, message in drive()]
+    imported(write(tmp_path / "bag", plains), tmp_path / "d", *options)
+    imported(plain, tmp_path / "e", *options)
+    for key, values in read_episode(dataset, 0).items():
+        for root in (tmp_path / "d", tmp_path / "e"):
+            assert np.array_equal(values, read_episode(root, 0)[key]), key
+
+
+def test_without_odometry_the_state_is_the_scan_if_that_is_asked_for(tmp_path, capsys, dataset):
+    source = write(tmp_path / "bag", list(filter(without("/odom"), drive())))
+    assert "--no_odom" in refused(source, tmp_path / "d", capsys)
+    imported(source, tmp_path / "d", "--no_odom", "--beams=36")
+    assert "no odometry is read: the state is scan_000.pos to scan_035.pos, without x.vel" in capsys.readouterr().err
+    names = dataset_info(tmp_path / "d").features["observation.state"]["names"]
+    assert list(names) == [f"scan_{beam:03d}.pos" for beam in range(36)]
+    assert main.main(["check", str(tmp_path / "d")]) == 0
+    imported(source, tmp_path / "e", "--no_odom")
+    states = [read_episode(root, 0)["observation.state"] for root in (tmp_path / "e", dataset)]
+    assert (
+        np.isin(states[0][:, 0], states[1][:, 2]).mean() > 0.95
+    )  # frames begin with the first scan, not with odometry
+    for option in ("--odom=/odom", "--odometry", "--odom_frame=base"):
+        assert "--no_odom and --odom" in refused(source, tmp_path / "f", capsys, "--no_odom", option)
+
+
 def joint_states(*names):
     state = bags.T["sensor_msgs/msg/JointState"](
         header=bags.header(START, ""), name=list(names), position=np.zeros(len(names)),
@@ -428,6 +467,26 @@ def test_values_that_are_not_finite_count_as_lost(tmp_path, capsys):
     imported(write(tmp_path / "bag", messages), tmp_path / "d")
     assert "with values that are not finite, left out" in capsys.readouterr().err
     assert np.isfinite(read_episode(tmp_path / "d", 0)["action"]).all()
+
+
+def test_orientations_that_were_never_set_are_no_rotations(tmp_path, capsys):
+    def unset(every: int) -> list:
+        messages = drive()
+        odometry = [message for topic, _, message in messages if topic == "/odom"]
+        for message in odometry[::every]:
+            message.pose.pose.orientation = bags.Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
+        return messages
+
+    source = write(tmp_path / "all", unset(1))
+    error = refused(source, tmp_path / "d", capsys, "--odometry")
+    assert "all messages of /odom have the orientation 0, 0, 0, 0, which is no rotation" in error
+    assert "Leave out --odometry" in error
+    imported(source, tmp_path / "d")
+    assert "orientation" not in capsys.readouterr().err
+    imported(write(tmp_path / "some", unset(30)), tmp_path / "e", "--odometry")
+    error = capsys.readouterr().err
+    assert "/odom: 4 of 120 messages have the orientation 0, 0, 0, 0, which is no rotation, left out" in error
+    assert "not finite" not in error
 
 
 def test_images_and_gyroscope(tmp_path):
