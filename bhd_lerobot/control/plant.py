@@ -32,8 +32,8 @@ class PlantReading:
     Attributes:
         position: joint angles [rad], a gripper's opening [m], shape (n, joints).
         velocity: joint speeds [rad/s], a gripper's [m/s], shape (n, joints).
-        effort: torques that the motors give, also to carry the robot's weight [N m], a gripper's force [N], shape
-            (n, joints); all 0 if the plant does not measure them.
+        effort: torques that the motors gave on average since the reading of the tick before, also to carry the robot's
+            weight [N m], a gripper's force [N], shape (n, joints); all 0 if the plant does not measure them.
         has_effort: whether it does.
         stamp_ns: when the hardware measured this, on the monotonic clock of this machine [ns], shape (n,); None for a
             plant whose readings are never old, such as a simulation in lockstep.

@@ -1,5 +1,6 @@
 """n UR5s under one cerebellum, whatever is below it: what they observe, and how their actions become setpoints."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
@@ -62,6 +63,11 @@ _JUMP = (
     "{} would have to turn by {:.2f} rad at once; {} rad is the most. Come nearer to the pose in smaller steps, or "
     "send it as a goal, which is planned"
 )
+_LARGEST_STEP = 0.1  # [m] of the tool to the first pose that is taken after refusals; at 1 m/s 0.1 s
+_FAR = (
+    "The poses before were refused, and this one is {:.3f} m from where the tool waits; {} m is the most. Come back to "
+    "the tool, or send the pose as a goal, which is planned"
+)
 
 
 class ArmHost(Host):
@@ -103,6 +109,8 @@ class ArmHost(Host):
                     f"robot.wrench is true, and the body {body.name!r} says nothing of its inertias (Body.mjcf): what "
                     "its surroundings put on it cannot be told from its motors' efforts. Leave robot.wrench false."
                 )
+        self._taken = np.zeros((plant.n, 3))  # where the tool was to be by the last action that was not refused [m]
+        self._refused = np.zeros(plant.n, np.bool_)  # the last action
         super().__init__(
             config,
             Cerebellum(body, plant, config.control_hz, controller=self.controller),
@@ -139,6 +147,11 @@ class ArmHost(Host):
             fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
         )
 
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+        """Start episodes."""
+        super().reset(ids, scenes, seeds)
+        self._refused[ids] = False
+
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the tool in recorded observations, shape (frames, 7)."""
         return pose_vectors(self.kinematics.tool(np.asarray(states, np.float64)[:, : len(JOINTS)]))
@@ -168,31 +181,45 @@ class ArmHost(Host):
 
         The posture of a tool pose is the one nearest to that before it. Near a singular posture, at the end of a
         joint's range and where the workspace folds, the nearest one may be far away, and the tool would leave its
-        path on the way there: that is refused.
+        path on the way there: that is refused. A stream may have moved on while its poses were refused, and what it
+        comes back with would be a jump: it is taken again near to where the tool waits.
         """
         if self.config.action_space == "joint":
             return action, {}
         command = self.cerebellum.command if before is None else before
         setpoints, refused = command.copy(), {}
-        impedance = self.config.control == "impedance"
         for sim in np.flatnonzero(mask).tolist():
-            matrix, problem = pose_matrices(action[sim, :7])
-            if problem is not None:
+            posture, problem = self._posture(sim, action[sim, :7], command[sim, :-1])
+            if problem is None:
+                setpoints[sim, :-1], setpoints[sim, -1] = posture, action[sim, -1]
+                self._taken[sim] = action[sim, :3]
+            else:
                 refused[sim] = (Reason.NO_POSTURE, problem)
-                continue
-            if impedance:  # where the spring pulls to; whether the arm gets there is for the spring to find out
-                setpoints[sim] = action[sim]
-                continue
-            result = self.kinematics.solve(matrix, command[sim, :-1])
-            if result.code != ResultCode.SUCCEEDED:
-                refused[sim] = (Reason.NO_POSTURE, result.message)
-                continue
-            turn = np.abs(result.postures[0] - command[sim, :-1])
-            if turn.max() > _LARGEST_TURN:
-                refused[sim] = (Reason.NO_POSTURE, _JUMP.format(JOINTS[int(turn.argmax())], turn.max(), _LARGEST_TURN))
-                continue
-            setpoints[sim, :-1], setpoints[sim, -1] = result.postures[0], action[sim, -1]
+            self._refused[sim] = problem is not None
         return setpoints, refused
+
+    def _posture(
+        self, sim: int, pose: NDArray[np.float64], before: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], str | None]:
+        """Return what takes an arm to a tool pose, shape (7,), from the posture before; or why it is refused."""
+        matrix, problem = pose_matrices(pose)
+        if problem is not None or self.config.control == "impedance":
+            return pose, problem  # where the spring pulls to; whether the arm gets there is for the spring to find out
+        result = self.kinematics.solve(matrix, before)
+        if result.code != ResultCode.SUCCEEDED:
+            return before, result.message
+        posture = result.postures[0]
+        turn = np.abs(posture - before)
+        if turn.max() > _LARGEST_TURN:
+            return before, _JUMP.format(JOINTS[int(turn.argmax())], turn.max(), _LARGEST_TURN)
+        if self._refused[sim]:
+            # In a fast stream the arm is far behind: a single refusal must not end it.
+            follows = self.cerebellum.mode[sim] == Mode.TRACKING
+            places = [self.kinematics.tool(before)[:3, 3], *self._taken[sim : sim + follows]]
+            step = min(float(np.linalg.norm(pose[:3] - place)) for place in places)
+            if step > _LARGEST_STEP:
+                return before, _FAR.format(step, _LARGEST_STEP)
+        return posture, None
 
 
 def observation_names(config: "UR5Config") -> tuple[str, ...]:

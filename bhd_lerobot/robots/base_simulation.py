@@ -117,11 +117,8 @@ class BaseSimulation(BaseHost, Simulation):
         """Touches of the scene, shape (n,)."""
         return (self._touched,)
 
-    def _step(self) -> None:
-        for _ in range(self.rates.steps_per_tick):
-            # Step by step: a touch may last a single step, and the sensor reports only the last step.
-            self.world.step(1, self._active)
-            np.logical_or(self._touched, self._touch, out=self._touched)
+    def _after_step(self) -> None:
+        np.logical_or(self._touched, self._touch, out=self._touched)
 
     def _after_tick(self) -> None:
         if self.config.imu:

@@ -127,8 +127,7 @@ class UR5Simulation(ArmHost, Simulation):
         """Touches of the table, of objects with a link of the arm, and of the arm with itself, each of shape (n,)."""
         return self._arm_on_table, self._arm_on_object, self._self_contact
 
-    def _after_tick(self) -> None:
-        # Contacts of an arm last longer than a physics step: once a tick is often enough.
+    def _after_step(self) -> None:
         table = self.table
         if not table.is_touching_more:
             return

@@ -37,7 +37,7 @@ class SimulatedPlant:
 
     def __init__(self, world: World) -> None:
         self.n = world.n
-        body, efforts = world.body, world.derived("qfrc_actuator")
+        body, efforts = world.body, world.efforts
         self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         if isinstance(body, Arm):
             joints, names = body.chain.joints, body.actuators
@@ -61,7 +61,7 @@ class SimulatedPlant:
     def read(self, out: JointReading) -> None:
         """Write the joints' positions, velocities and efforts, each of shape (n, joints), into `out`.
 
-        The efforts are those of the last physics step.
+        The efforts are means over the physics steps of the last `World.step`: see `World.efforts`.
         """
         entry = self._views.get(id(out))
         if entry is None:

@@ -1,6 +1,6 @@
 """n simulations of one model, stepped together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
+from bhd_lerobot.sim.efforts import MeanEfforts
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
 from bhd_lerobot.sim.scene import PARKED_GROUP, PARKED_Z, POOL_SIZE, build_model, shape_fields
 
@@ -151,6 +152,7 @@ class World:
             (self.model.geom("obstacle_000").id if pool_size else 0) + pool_size,
         )
         self._fields: dict[str, NDArray] = {}
+        self._efforts: MeanEfforts | None = None
         self._constants = False
         if pool_size:
             for name in _POOL_FIELDS:
@@ -187,7 +189,7 @@ class World:
             self.qpos[ids, 0:2] = poses[:, 0:2]
             self.qpos[ids, 3] = np.cos(poses[:, 2] / 2)
             self.qpos[ids, 6] = np.sin(poses[:, 2] / 2)
-        self._batch.forward(ids)
+        self.forward(ids)
 
     def _reset_arm(self, ids: NDArray[np.intp]) -> None:
         if "body_gravcomp" in self._fields:  # what is taken off the table is without weight, or it would fall for ever
@@ -212,24 +214,39 @@ class World:
         self.ctrl[ids, joints] = self.qpos[ids, fingers.start] + self.qpos[ids, fingers.start + 1]
         if self.body.actuation == "torque":
             bias = self.derived("qfrc_bias")
-            self._batch.forward(ids)
+            self.forward(ids)
             self.ctrl[ids, :joints] = bias[ids, :joints]
-        self._batch.forward(ids)
+        self.forward(ids)
 
-    def step(self, k: int = 1, ids: Ids = None) -> None:
+    def step(self, k: int = 1, ids: Ids = None, *, each: Callable[[], None] | None = None) -> None:
         """Advance simulations by k physics steps.
+
+        Args:
+            k: number of steps.
+            ids: the simulations, all if None.
+            each: called after each step.
 
         Raises:
             SimulationError: MuJoCo could not step a simulation. That the physics diverged is reported by `check`.
         """
+        ids = None if ids is None else self.selected(ids)
+        calls = 1 if self._efforts is None and each is None else k
         try:
-            self._batch.step(None if ids is None else self.selected(ids), nstep=k)
+            for call in range(calls):
+                self._batch.step(ids, nstep=k // calls)
+                if self._efforts is not None:
+                    self._efforts.note(slice(None) if ids is None else ids, call, calls)
+                if each is not None:
+                    each()
         except mujoco_batch.SimulationError as error:
             raise SimulationError(f"{error}. The simulations named kept the state they had before the step.") from error
 
     def forward(self, ids: Ids = None) -> None:
         """Compute everything that derives from the state, without advancing time: sensors for example."""
-        self._batch.forward(None if ids is None else self.selected(ids))
+        ids = None if ids is None else self.selected(ids)
+        self._batch.forward(ids)
+        if self._efforts is not None:
+            self._efforts.forward(slice(None) if ids is None else ids)
 
     def check(self) -> None:
         """Raise if the physics of any simulation diverged since its last reset.
@@ -275,7 +292,7 @@ class World:
         if snapshot.constants or self._constants:
             self.update_constants(ids)
         self._batch.state[ids] = snapshot.state
-        self._batch.forward(ids)
+        self.forward(ids)
 
     @property
     def base_pose(self) -> NDArray[np.float64]:
@@ -327,6 +344,18 @@ class World:
         if name not in mujoco_batch.DATA_FIELDS:
             raise SimulationError(unknown_name("field", name, mujoco_batch.DATA_FIELDS))
         return self._batch.bind(name)
+
+    @property
+    def efforts(self) -> NDArray[np.float64]:
+        """What actuators put on the joints, averaged over the last `step`, shape (n, nv), live [N m; N for a slide].
+
+        Computed from now on. After a single step, at the body's own physics rate or a higher one, it is what MuJoCo
+        reports, `qfrc_actuator`; otherwise it is what acted: see `MeanEfforts`.
+        """
+        if self._efforts is None:
+            slow = self.physics_hz < self.body.physics_hz
+            self._efforts = MeanEfforts(self.model, self._batch.bind, exact=slow)
+        return self._efforts.mean
 
     def site(self, name: str) -> "Site":
         """Return a named site, whose pose is valid like a `derived` field.

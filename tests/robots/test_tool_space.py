@@ -216,3 +216,68 @@ def test_the_poses_of_a_chunk_follow_each_other() -> None:
     for _ in range(70):
         simulation.step(None)
     assert abs(abs(simulation.cerebellum.command[0, 5] - before[5]) - 0.04 * 59) < 0.02  # a brake at its end
+
+
+def test_a_stream_whose_poses_were_refused_is_taken_again_only_near_to_the_tool() -> None:
+    """Streams of 0.2 m/s that leave the workspace and come back to it elsewhere, and then to where they left it."""
+    corners = ([(0.60, -0.79, 0.73), (-0.60, -0.22, 0.22)], [(0.89, 0.51, 0.39), (-0.14, 0.68, 0.05)])
+    simulation = UR5Simulation(UR5Config(action_space="tool"), len(corners), threads=1)
+    action, step = start(simulation), 0.2 / simulation.rates.fps
+    paths, frames = [], 0
+    for place, ends in zip(action[:, :3], corners, strict=True):
+        legs, begin = [], place.copy()
+        for end in ends:
+            count = int(np.linalg.norm(np.subtract(end, begin)) / step)
+            legs.append(begin + np.arange(1, count + 1)[:, None] / count * (end - begin))
+            begin = np.array(end)
+        there = np.concatenate(legs)
+        paths.append(np.concatenate((there, there[::-1])))
+        frames = max(frames, len(paths[-1]))
+    tool, taken, was_refused = simulation.truth().tool_pose[:, :3], [False] * len(paths), np.zeros(len(paths), np.bool_)
+    for frame in range(frames):
+        for sim, path in enumerate(paths):
+            action[sim, :3] = path[min(frame, len(path) - 1)]
+        before = tool
+        report = simulation.step(action)
+        tool = simulation.truth().tool_pose[:, :3].copy()
+        refused = report.sent.reasons == Reason.NO_POSTURE
+        assert np.linalg.norm(tool - before, axis=1).max() < 0.8 / simulation.rates.fps
+        for sim in np.flatnonzero(was_refused & ~refused):
+            assert np.linalg.norm(action[sim, :3] - before[sim]) < 0.11
+            taken[sim] = True
+        for sim, path in enumerate(paths):
+            assert np.linalg.norm(path - tool[sim], axis=1).min() < 0.06
+        was_refused = refused
+    assert all(taken)
+    assert not refused.any()
+    np.testing.assert_allclose(tool, [path[-1] for path in paths], atol=2e-3)
+
+
+def test_after_refusals_the_first_pose_has_to_be_near_to_the_tool() -> None:
+    """Without a refusal a pose may be further away, and in a fast stream a single refusal does not end it."""
+    simulation = UR5Simulation(UR5Config(action_space="tool"), 1, threads=1)
+
+    def answer(y: float, x: float = 0.0) -> tuple[int, str]:
+        report = simulation.step(home + np.array([[x, y, 0, 0, 0, 0, 0, 0]]))
+        return int(report.sent.reasons[0]), report.refusals.get(0, "")
+
+    home, ahead = start(simulation), 0.0
+    for _ in range(20):
+        assert answer(0.15) == (Reason.ACCEPTED, "")
+    for _ in range(20):
+        assert answer(0.15, x=3.0)[0] == Reason.NO_POSTURE
+    for far in (0.12, -0.12, 0.25):
+        reason, message = answer(0.15 + far)
+        assert reason == Reason.NO_POSTURE
+        assert message.startswith(
+            f"The poses before were refused, and this one is {abs(far):.3f} m from where the tool"
+        )
+    assert answer(0.15 - 0.09) == (Reason.ACCEPTED, "")
+    assert answer(0.15 + 0.09) == (Reason.ACCEPTED, "")
+    assert answer(0.15, x=3.0)[0] == Reason.NO_POSTURE
+    start(simulation)  # another episode
+    for frame in range(1, 8):  # 1 m/s, from rest
+        ahead = max(ahead, home[0, 1] + 0.04 * frame - simulation.truth().tool_pose[0, 1])
+        reason, _ = answer(0.04 * frame, x=3.0 * (frame == 6))
+        assert reason == (Reason.NO_POSTURE if frame == 6 else Reason.ACCEPTED)
+    assert ahead > 0.12

@@ -65,9 +65,9 @@ class Simulation(Host):
         """Take first readings of what is not read every frame, at the start of episodes."""
         return
 
-    def _step(self) -> None:
-        """Let one control tick of physics go by."""
-        self.world.step(self.rates.steps_per_tick, self._active)
+    def _after_step(self) -> None:
+        """Do what a physics step brings with it: a touch may last a single one."""
+        return
 
     def _after_tick(self) -> None:
         """Do what a tick brings with it: sensors with a rhythm of their own."""
@@ -179,6 +179,6 @@ class Simulation(Host):
 
     def advance(self) -> None:
         """Let one control tick go by, of the world and of the sensors that have a rhythm of their own."""
-        self._step()
+        self.world.step(self.rates.steps_per_tick, self._active, each=self._after_step)
         self.tick += 1
         self._after_tick()
