@@ -224,6 +224,8 @@ class PositionLimits(CommandLimits):
 
 OBSTACLE = "obstacle_"
 """What the names of capsules begin with that are no part of the arm."""
+HELD = "held"
+"""The name of the capsule that stands for what the gripper holds."""
 
 
 @dataclass(frozen=True)
@@ -273,6 +275,15 @@ class ArmChain:
     disjoint: tuple[tuple[str, str], ...]
     min_distance: float
     min_manipulability: float
+
+    def holding(self, held: Capsule | None) -> "ArmChain":
+        """Return the geometry with something in the gripper, whose distances are checked like those of the gripper."""
+        if held is None:
+            return self
+        tooling = {capsule.name for capsule in self.capsules if capsule.frame == held.frame}
+        partners = {one: None for pair in self.disjoint for one in pair if tooling & set(pair) and one not in tooling}
+        pairs = tuple((one, held.name) for one in partners)
+        return replace(self, capsules=(*self.capsules, held), disjoint=(*self.disjoint, *pairs))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.bodies.body import HELD, Capsule
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.motion.goal_codec import (
     MESSAGE_BYTES,
@@ -38,6 +39,7 @@ def _header_dtype(dof: int) -> np.dtype:
             ("state", np.float64, (3, dof + 1)),
             ("has_opening", np.bool_),
             ("opening", np.float64),
+            ("held", np.float64, (7,)),  # both ends and the radius of what is in the gripper [m]; 0 without it
             ("goal", goal_dtype(dof)),
         ],
         align=True,
@@ -125,7 +127,15 @@ class PlanLink:
         """Return the size of the memory block [bytes]."""
         return _header_dtype(dof).itemsize + 2 * _Memory.capacity(control_hz, duration_s) * 3 * (dof + 1) * 8
 
-    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+    def request(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        state: State,
+        opening: float | None,
+        start_tick: int,
+        held: Capsule | None = None,
+    ) -> None:
         """Ask for a plan.
 
         Raises:
@@ -141,6 +151,7 @@ class PlanLink:
         rows = request["state"]
         rows[0], rows[1], rows[2] = state.position, state.velocity, state.acceleration
         request["has_opening"], request["opening"] = opening is not None, 0.0 if opening is None else opening
+        request["held"] = 0.0 if held is None else (*held.start, *held.end, held.radius)
         write_goal(request["goal"], command)
         self._guard[0] += 1
         self._out = True
@@ -230,10 +241,12 @@ class PlanServer:
     def _plan(self, request: Any, capacity: int) -> Plan | PlanFailure:
         opening = float(request["opening"]) if request["has_opening"] else None
         position, velocity, acceleration = request["state"]
+        *ends, radius = request["held"].tolist()
+        held = Capsule(HELD, self._planner.dof, tuple(ends[:3]), tuple(ends[3:]), radius) if radius else None
         try:
             # The name is the cerebellum's business, and may be longer than a record's.
             command = replace(decode_goal(request["goal"]), task_id=f"request {request['number']}")
-            plan = self._planner.plan(command, position, velocity, acceleration, opening=opening)
+            plan = self._planner.plan(command, position, velocity, acceleration, opening=opening, held=held)
         except Exception as error:
             # The arm waits for an answer, and the next goals for a planner.
             _LOG.exception("The planner failed.")

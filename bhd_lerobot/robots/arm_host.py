@@ -100,6 +100,8 @@ class ArmHost(Host):
             self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks)
         else:
             self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
+            if not config.held_clearance:
+                self.controller.held = None
             if body.mjcf:  # without inertias it is not known what torques a motion needs
                 self.controller.limit_force(
                     ForceLimit(body, plant.n, config.control_hz, config.max_force, wrench=config.wrench)

@@ -31,6 +31,9 @@ class UR5Config(SimulatedRobotConfig):
             Used with ``control = "servo"``. A force on another part of the arm counts with what the joints feel of it.
         payload: mass of what the gripper is going to carry [kg]. Accelerations are planned so that the motors can move
             it; what it weighs beyond that, by 20 N, stops the arm when it is at rest.
+        held_clearance: keep what the gripper holds away from table, arm and obstacles as well. It is taken to reach as
+            far down as the table was below the tool when the gripper closed, at most 0.2 m; false where things are
+            taken from something that stands on the table, and put lower. Used with ``control = "servo"``.
         obstacles: what is known to be in its way besides the table and itself: capsules, each with x, y, z of one end,
             x, y, z of the other, and the radius, in the base frame [m]. Goals and setpoints keep away from them.
         wrench: record what the surroundings put on the tool as well, force and moment as estimated from the motors'
@@ -47,6 +50,7 @@ class UR5Config(SimulatedRobotConfig):
     scene: str = "empty"
     max_force: float = 150.0
     payload: float = 0.0
+    held_clearance: bool = True
     obstacles: list[list[float]] = field(default_factory=list)
     wrench: bool = False
     stale_after_s: float = 0.1

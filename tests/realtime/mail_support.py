@@ -43,7 +43,14 @@ class RampPlanner:
         self.planned: list[BrainCommand] = []
 
     def plan(
-        self, command: BrainCommand, position: Any, velocity: Any, acceleration: Any, *, opening: float | None = None
+        self,
+        command: BrainCommand,
+        position: Any,
+        velocity: Any,
+        acceleration: Any,
+        *,
+        opening: float | None = None,
+        held: Any = None,
     ) -> Plan | PlanFailure:
         self.planned.append(command)
         if command.max_velocity is not None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import HELD, Capsule
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.motion.planning import MIN_LEAD
@@ -82,6 +83,22 @@ def test_the_state_and_the_opening_arrive(opening: float | None) -> None:
         expected = getattr(STATE, name) + 0.5 * np.arange(1, 4)[:, None]
         assert np.array_equal(getattr(plan.trajectory, name), expected)
     assert plan.target.tolist() == [-1.0 if opening is None else opening] * 7
+
+
+def test_what_the_gripper_holds_arrives() -> None:
+    """A line that is free for the arm, and not for what hangs in the gripper."""
+    link, server, _, _ = linked(PLANNER)
+    state = State.of(*np.stack((HOME, 0 * HOME, 0 * HOME)))
+    command = BrainCommand("down", target_pose=moved(dz=-0.1), motion="line")
+    for held in (None, Capsule(HELD, 6, ARM.chain.tool, (0.0, 0.01, 0.32), 0.01), None):
+        expected = PLANNER.plan(command, *np.array((state.position, state.velocity, state.acceleration)), held=held)
+        link.request(0, command, state, None, 0, held)
+        server.serve_once()
+        plan = link.poll(0)
+        assert isinstance(plan, PlanFailure) == isinstance(expected, PlanFailure) == (held is not None)
+        if held is not None:
+            assert plan == expected
+            assert plan.message.startswith("On the way what the gripper holds comes within")
 
 
 def test_a_failure_arrives_with_its_words() -> None:

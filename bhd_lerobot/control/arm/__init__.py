@@ -6,6 +6,7 @@ __all__ = [
     "controller",
     "equilibrium",
     "force_limit",
+    "held",
     "impedance",
     "rotations",
     "setpoints",

@@ -1,9 +1,11 @@
 """Setpoints that would bring an arm too near to itself or to the table: it slows down, and stops before contact."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.geometry.collision import CollisionModel
 
 Array = NDArray[np.float64]
@@ -17,6 +19,7 @@ _WIDER = 0.015
 _ROUNDING = 1e-9  # [m] a distance that shrinks by less does not shrink
 _TRIED = np.array([1.0, 0.5, 0.25])[:, None]  # of the speed from which there should be room enough to stop
 _TINY = 1e-12
+_FIRST = np.zeros(1, np.intp)
 
 
 class SetpointClearance:
@@ -41,6 +44,8 @@ class SetpointClearance:
     """
 
     def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
+        self._options = arm, control_hz, frame_ticks
+        self._holding: dict[int, SetpointClearance] = {}  # what checks an arm that holds something
         chain, limits = arm.chain, arm.limits
         self._model, self._least = CollisionModel(chain), chain.min_distance
         self.dof = dof = len(chain.joints)
@@ -60,6 +65,14 @@ class SetpointClearance:
         self._next = 0
         # Where distances were computed last, and these; below 0 where none is known.
         self._known, self._distances = np.zeros((n, dof)), np.full((n, len(self._slopes)), -1.0)
+
+    def hold(self, sim: int, held: Capsule | None) -> None:
+        """Keep what an arm holds away from things as well; nothing any more if None."""
+        arm, control_hz, frame_ticks = self._options
+        self._holding.pop(sim, None)
+        if held is not None:
+            arm = replace(arm, chain=arm.chain.holding(held))
+            self._holding[sim] = SetpointClearance(arm, 1, control_hz, frame_ticks)
 
     def check_soon(self, mask: NDArray[np.bool_]) -> None:
         """Check arms in the next tick, because they have new setpoints; `mask` has shape (n,)."""
@@ -89,6 +102,10 @@ class SetpointClearance:
         if len(ids):
             dof = self.dof
             self.share[ids] = self._shares(ids, position[ids, :dof], velocity[ids, :dof], speed[ids, :dof])
+            for sim, check in self._holding.items():
+                if sim in ids:
+                    rows = (array[sim : sim + 1, :dof] for array in (position, velocity, speed))
+                    self.share[sim] = check._shares(_FIRST, *rows)[0]
             self.slows = bool((self.share < 1.0).any())
 
     def _shares(self, ids: NDArray[np.intp], q: Array, velocity: Array, speed: Array) -> Array:
@@ -182,4 +199,6 @@ class SetpointClearance:
         """Forget arms that were put somewhere else."""
         self.share[ids], self._distances[ids] = 1.0, -1.0
         self._due[ids] = self._next = 0
+        for sim in np.asarray(ids).tolist():
+            self._holding.pop(sim, None)
         self.slows = bool((self.share < 1.0).any())

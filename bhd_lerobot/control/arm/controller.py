@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.arm.force_limit import ForceLimit
+from bhd_lerobot.control.arm.held import HeldObjects
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
@@ -42,6 +43,7 @@ class ArmController(Controller):
 
     Attributes:
         force: what stops an arm that presses too hard, if the plant measures efforts; nothing does if None.
+        held: finds out what the grippers hold, which is then kept away from things like the arm; nothing does if None.
 
     Args:
         arm: the arm.
@@ -60,6 +62,7 @@ class ArmController(Controller):
         calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
         clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)
         self.setpoints = SetpointFilter(calm, n, control_hz, frame_ticks, clearance)
+        self.held: HeldObjects | None = HeldObjects(arm, n, control_hz)
         self.command = np.tile(np.asarray(arm.home), (n, 1))
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
@@ -177,6 +180,10 @@ class ArmController(Controller):
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
+        for sim, held in self.held.update(reading, self.command) if self.held is not None else ():
+            self.goals.hold(sim, held)
+            if self.setpoints.clearance is not None:
+                self.setpoints.clearance.hold(sim, held)
         if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
             if np.count_nonzero(self.busy):
@@ -358,6 +365,8 @@ class ArmController(Controller):
         self.protective_stop[ids] = 0
         if self.force is not None:
             self.force.restart(ids)
+        if self.held is not None:
+            self.held.restart(ids)
         for flags in (self._limited_finite, self._limited_effort):
             flags[ids] = False
 

@@ -5,7 +5,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
@@ -71,6 +71,7 @@ class GoalManager:
         self._capacity = queue
         self._books = [GoalBook(queue) for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is
+        self._held: list[Capsule | None] = [None] * n
         self._planned = np.ones(n, np.int64)  # ticks of the trajectory of the goal that is followed
         self._motion = np.full(n, _Motion.NONE, np.int8)
         self._waiting: set[int] = set()  # simulations in which something is to be started or to be stopped
@@ -131,6 +132,10 @@ class GoalManager:
         return Feedback(book.followed.task_id, phase, progress, left / self._hz, error)
 
     # --- requests of the controller ----------------------------------------------------------------------------------
+
+    def hold(self, sim: int, held: Capsule | None) -> None:
+        """Plan with something in an arm's gripper from now on; with nothing if None."""
+        self._held[sim] = held
 
     def stop(  # noqa: PLR0917  the reference is three arrays
         self,
@@ -206,6 +211,7 @@ class GoalManager:
         """Forget everything about arms that were put somewhere else, results included."""
         for sim in np.asarray(ids).tolist():
             self._books[sim] = GoalBook(self._capacity)
+            self._held[sim] = None
             self._rest(sim)
             self.phase[sim] = GoalPhase.IDLE
             self._changed(sim)
@@ -247,7 +253,9 @@ class GoalManager:
     def convert(self, sim: int, command: BrainCommand, reference: Reference) -> Plan | PlanFailure:
         """Turn a goal into a trajectory that starts in the reference; changes nothing."""
         position, velocity, acceleration = (array[sim] for array in reference)
-        return self.planner.plan(command, position, velocity, acceleration, opening=self._opening[sim])
+        return self.planner.plan(
+            command, position, velocity, acceleration, opening=self._opening[sim], held=self._held[sim]
+        )
 
     # --- the state machine -------------------------------------------------------------------------------------------
 
@@ -284,7 +292,7 @@ class GoalManager:
             return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*(array[sim] for array in reference))
 
         command = book.waiting[0]
-        plan = self._orders.ask(sim, command, now, ahead, self._opening[sim])
+        plan = self._orders.ask(sim, command, now, ahead, self._opening[sim], self._held[sim])
         if plan is None:
             return False
         book.follow()

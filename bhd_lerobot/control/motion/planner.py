@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import OBSTACLE, Arm
+from bhd_lerobot.bodies.body import HELD, OBSTACLE, Arm, Capsule
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.dynamics import SWING, ArmDynamics, acceleration_share
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
@@ -71,6 +72,7 @@ class GoalPlanner:
         self._arm, self._gripper = slice(0, dof), slice(dof, dof + 1)
         # Without a load the limits leave the motors room enough.
         self._dynamics = ArmDynamics(arm) if arm.load and arm.mjcf else None
+        self._collision = self.kinematics.collision  # of the arm and what it holds, for the plan that is made
         self._calm = self.limits.scaled(1.0, acceleration_share(arm))
 
     def check(self, command: BrainCommand) -> PlanFailure | None:
@@ -85,6 +87,7 @@ class GoalPlanner:
         acceleration: ArrayLike,
         *,
         opening: float | None = None,
+        held: Capsule | None = None,
     ) -> Plan | PlanFailure:
         """Return how a goal is reached from a commanded state.
 
@@ -95,10 +98,14 @@ class GoalPlanner:
             acceleration: shape (dof + 1,).
             opening: where the gripper was last commanded to [m], for goals that leave it as it is; where it is if
                 None.
+            held: what is in the gripper.
         """
         failure = self.check(command)
         if failure is not None:
             return failure
+        self._collision = self.kinematics.collision
+        if held is not None:
+            self._collision = CollisionModel(self.arm.chain.holding(held))
         state = State.of(position, velocity, acceleration)
         arm = self._plan_arm(command, state[self._arm])
         if isinstance(arm, PlanFailure):
@@ -228,7 +235,7 @@ class GoalPlanner:
         marks = np.linspace(0.0, way[-1], int(np.ceil(way[-1] / _CHECK_STEP)) + 1)
         postures = np.stack([np.interp(marks, way, joint) for joint in path.T], axis=1)
         least = self.arm.chain.min_distance
-        collision = self.kinematics.collision
+        collision = self._collision
         for distances, code in zip(
             collision.distances(postures), (ResultCode.SELF_COLLISION, ResultCode.TABLE_COLLISION), strict=True
         ):
@@ -239,12 +246,17 @@ class GoalPlanner:
             escapes = leaves > 0 and not inside[leaves:].any()
             if escapes and (np.diff(distances[: leaves + 1]) >= -_ROUNDING).all():
                 continue
-            where = "The arm starts" if inside[0] else "On the way the arm comes"
-            what = "the table"
+            closest, what = postures[int(distances.argmin())], "the table"
             if code == ResultCode.SELF_COLLISION:
-                other, _ = collision.closest_pair(postures[int(distances.argmin())])
-                what = other if other.startswith(OBSTACLE) else "itself"
+                other, own = collision.closest_pair(closest)
+                what = other if other.startswith(OBSTACLE) else "the arm" if own == HELD else "itself"
+            else:
+                own = collision.lowest(closest)
+            who = "what the gripper holds" if own == HELD else "the arm"
+            where = f"{who.capitalize()} starts" if inside[0] else f"On the way {who} comes"
             advice = "; it may only move straight away" if inside[0] else ""
+            if own == HELD:
+                advice += "; it is taken to reach as far down as the table was when the gripper closed"
             return PlanFailure(
                 code, f"{where} within {distances.min():.4f} m of {what}; {least} m is the least{advice}."
             )

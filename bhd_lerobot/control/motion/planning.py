@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from bhd_lerobot.bodies.body import Capsule
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
@@ -31,7 +32,15 @@ class Planning(Protocol):
     lead: int
     timeout: int
 
-    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+    def request(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        state: State,
+        opening: float | None,
+        start_tick: int,
+        held: Capsule | None = None,
+    ) -> None:
         """Request a plan; an earlier request is dropped.
 
         Args:
@@ -40,6 +49,7 @@ class Planning(Protocol):
             state: where the plan is to start [rad, and m for the gripper], each of shape (dof + 1,).
             opening: where the gripper is commanded to [m], for goals that leave it as it is; None: where it is.
             start_tick: the tick that the plan is to start at.
+            held: what is in the gripper.
         """
 
     def poll(self, sim: int) -> Plan | PlanFailure | None:
@@ -64,10 +74,18 @@ class InlinePlanning:
         self._planner = planner
         self._answers: dict[int, Plan | PlanFailure] = {}
 
-    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+    def request(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        state: State,
+        opening: float | None,
+        start_tick: int,
+        held: Capsule | None = None,
+    ) -> None:
         """Plan."""
-        position, velocity, acceleration = state.position, state.velocity, state.acceleration
-        self._answers[sim] = self._planner.plan(command, position, velocity, acceleration, opening=opening)
+        reference = state.position, state.velocity, state.acceleration
+        self._answers[sim] = self._planner.plan(command, *reference, opening=opening, held=held)
 
     def poll(self, sim: int) -> Plan | PlanFailure | None:
         """Return the plan."""
@@ -138,8 +156,14 @@ class PlanOrders:
             self._orders[sim] = None
             self._planning.drop(sim)
 
-    def ask(
-        self, sim: int, command: BrainCommand, now: State, ahead: Callable[[int], State], opening: float | None
+    def ask(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        now: State,
+        ahead: Callable[[int], State],
+        opening: float | None,
+        held: Capsule | None = None,
     ) -> Plan | PlanFailure | None:
         """Return the plan of a goal when it is to start, or why there is none; None as long as it is too early.
 
@@ -151,10 +175,11 @@ class PlanOrders:
             now: the reference.
             ahead: returns what the reference is going to be after so many ticks.
             opening: where the gripper is commanded to [m]; None: where it is.
+            held: what is in it.
         """
         order = self._orders[sim]
         if order is None:
-            order = self._order(sim, command, self._planning.lead, ahead, opening)
+            order = self._order(sim, command, self._planning.lead, ahead, opening, held)
         if order.answer is None:
             order.answer = self._planning.poll(sim)
             order.arrived_tick = self.tick
@@ -173,14 +198,20 @@ class PlanOrders:
             return answer
         if order.lead >= MOST_LEADS * self._planning.lead:
             return self._give_up(sim, self._slowness(order))
-        self._order(sim, command, 2 * order.lead, ahead, opening)
+        self._order(sim, command, 2 * order.lead, ahead, opening, held)
         return None
 
-    def _order(
-        self, sim: int, command: BrainCommand, lead: int, ahead: Callable[[int], State], opening: float | None
+    def _order(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        lead: int,
+        ahead: Callable[[int], State],
+        opening: float | None,
+        held: Capsule | None,
     ) -> _Order:
         self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
-        self._planning.request(sim, command, order.state, opening, self.tick + lead)
+        self._planning.request(sim, command, order.state, opening, self.tick + lead, held)
         return order
 
     def _give_up(self, sim: int, message: str) -> PlanFailure:

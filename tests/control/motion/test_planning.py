@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import Capsule
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, GoalPhase, ResultCode
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
@@ -38,10 +39,18 @@ class LatePlanning:
         self.starts: list[int] = []
         self.dropped = self.begun = 0
 
-    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+    def request(  # noqa: PLR0917
+        self,
+        sim: int,
+        command: BrainCommand,
+        state: State,
+        opening: float | None,
+        start_tick: int,
+        held: Capsule | None = None,
+    ) -> None:
         self.states.append(state)
         self.starts.append(start_tick)
-        plan = PLANNER.plan(command, state.position, state.velocity, state.acceleration, opening=opening)
+        plan = PLANNER.plan(command, state.position, state.velocity, state.acceleration, opening=opening, held=held)
         self.out[sim] = [max(1, next(self.latencies)), plan]
 
     def poll(self, sim: int) -> Plan | PlanFailure | None:

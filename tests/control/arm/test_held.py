@@ -1,0 +1,84 @@
+"""When a gripper counts as holding something, and what it is taken to hold."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.bodies.body import HELD, Capsule
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.arm.held import HeldObjects
+from bhd_lerobot.control.geometry.collision import CollisionModel
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.plant import PlantReading
+
+ARM, HZ, STALL = ur5(), 500, 50
+KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
+LEAST = ARM.chain.min_distance
+
+
+def posture(height: float, tilt: float = 0.0) -> np.ndarray:
+    """Return a posture with the tool at a height [m], and tilted from pointing down [rad]."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("yx", (tilt, np.pi)).as_matrix()
+    pose[:3, 3] = 0.5, 0.1, height
+    return KINEMATICS.solve(pose, np.array(ARM.home[:6])).postures[0]
+
+
+class Hand:
+    """n grippers, as they are commanded and measured."""
+
+    def __init__(self, *postures: np.ndarray) -> None:
+        n = len(postures)
+        self.held, self.reading = HeldObjects(ARM, n, HZ), PlantReading(n, 7)
+        self.command = np.concatenate((postures, np.full((n, 1), 0.085)), axis=1)
+        self.reading.position[:] = self.command
+
+    def run(self, opening: float, command: float, ticks: int = STALL + 1, speed: float = 0.0) -> dict:
+        """Measure and command openings [m] for some ticks; return what changed, by arm."""
+        self.reading.position[:, -1], self.command[:, -1], self.reading.velocity[:, -1] = opening, command, speed
+        return {arm: held for _ in range(ticks) for arm, held in self.held.update(self.reading, self.command)}
+
+
+def test_what_a_stalled_gripper_holds_reaches_down_to_the_table() -> None:
+    """At any height and tilt of the tool; it may come back to there, and no lower."""
+    cases = [(height, tilt) for height in (0.02, 0.07, 0.15) for tilt in (-0.5, 0.0, 0.7) if height > 0.02 or not tilt]
+    postures = [posture(height, tilt) for height, tilt in cases]
+    held = Hand(*postures).run(0.05, 0.02)
+    assert sorted(held) == list(range(len(cases)))
+    for arm, (height, tilt) in enumerate(cases):
+        capsule = held[arm]
+        assert isinstance(capsule, Capsule)
+        assert (capsule.name, capsule.start) == (HELD, ARM.chain.tool)
+        assert capsule.radius <= 0.025
+        model = CollisionModel(ARM.chain.holding(capsule))
+        rows = np.stack([posture(height + up, tilt) for up in (0.0, 0.01, -0.001)])
+        heights = model.each(rows)[-1]
+        assert LEAST < heights[0] < LEAST + 3e-4
+        np.testing.assert_allclose(heights - heights[0], (0.0, 0.01, -0.001), atol=1e-9)
+        without = CollisionModel(ARM.chain).each(rows)
+        assert (model.each(rows)[: len(ARM.chain.disjoint)] == without[: len(ARM.chain.disjoint)]).all()
+
+
+def test_a_gripper_that_moves_is_empty_or_that_nothing_stood_under_holds_nothing() -> None:
+    low, high = posture(0.07), posture(0.28)
+    for opening, command, speed in ((0.05, 0.02, -0.05), (0.05, 0.048, 0.0), (0.0, 0.0, 0.0), (0.05, 0.085, 0.0)):
+        assert Hand(low).run(opening, command, 10 * STALL, speed) == {}
+    assert Hand(low).run(0.05, 0.02, STALL - 1) == {}
+    assert Hand(low, high).run(0.05, 0.02)[1] is None
+
+
+@pytest.mark.parametrize(("opening", "command"), [(0.05, 0.085), (0.02, 0.02), (0.05, 0.05)])
+def test_it_is_forgotten_when_the_gripper_opens_or_closes_without_it(opening: float, command: float) -> None:
+    hand = Hand(posture(0.07))
+    first = hand.run(0.05, 0.02)[0]
+    assert first is not None
+    assert hand.run(0.045, 0.02, speed=-0.01) == {}  # it gives way a little: it is still there
+    hand.command[:, :6] = posture(0.2)
+    hand.reading.position[:, :6] = posture(0.2)
+    assert hand.run(0.05, 0.02) == {}
+    assert hand.run(opening, command) == {0: None}
+    again = hand.run(0.05, 0.02)[0]
+    assert again is not None
+    assert again.end[2] > first.end[2]  # taken from where the tool is now
+    hand.held.restart(np.zeros(1, np.intp))
+    assert hand.run(0.085, 0.085) == {}
