@@ -119,7 +119,9 @@ def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
 def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     values.pop("checkpoint_path", None)
     dataset = values.get("dataset") or {}
-    if isinstance(dataset, dict) and not (dataset.get("root") or dataset.get("repo_id")):
+    known = {name for name, _, _ in configuration.options_of(BhdTrainConfig)}
+    is_missing = isinstance(dataset, dict) and not (dataset.get("root") or dataset.get("repo_id"))
+    if is_missing and known.issuperset(values):  # a misspelt option is named first
         raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
     if isinstance(dataset, dict) and dataset.get("root") and not dataset.get("repo_id"):
         values["dataset"] = {**dataset, "repo_id": local_name(dataset["root"])}

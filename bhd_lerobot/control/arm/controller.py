@@ -178,7 +178,7 @@ class ArmController(Controller):
         if self.force is not None:
             self.force.restart(np.flatnonzero(mask))
 
-    def run(self, reading: PlantReading) -> None:
+    def run(self, reading: PlantReading) -> None:  # noqa: PLR0912  what a tick does, in its order
         """Advance by one tick."""
         for sim, held in self.held.update(reading, self.command) if self.held is not None else ():
             self.goals.hold(sim, held)
