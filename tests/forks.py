@@ -14,6 +14,8 @@ from typing import Any
 
 from tests import quick
 
+# The server finds this package by the path of this process, wherever it is started; a dependency has one of the same name.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 _CONTEXT = multiprocessing.get_context("forkserver")
 
 
