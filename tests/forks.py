@@ -14,8 +14,6 @@ from typing import Any
 
 from tests import quick
 
-# The server finds this package by the path of this process, wherever it is started; a dependency has one of the same name.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 _CONTEXT = multiprocessing.get_context("forkserver")
 
 
@@ -37,7 +35,16 @@ class Fork:
             output.write_bytes(b"")  # here, where it is read
         device = None if terminal is None else os.ttyname(terminal)
         self._process = _CONTEXT.Process(target=_run, args=(function, arguments, dict(os.environ), output, device))
-        self._process.start()
+        # The server finds this package wherever it is started: a dependency has one of the same name.
+        before = os.environ.get("PYTHONPATH")
+        root = str(Path(__file__).resolve().parents[1])
+        os.environ["PYTHONPATH"] = root if before is None else f"{root}{os.pathsep}{before}"
+        try:
+            self._process.start()
+        finally:
+            os.environ.pop("PYTHONPATH")
+            if before is not None:
+                os.environ["PYTHONPATH"] = before
         assert self._process.pid is not None
         self.pid = self._process.pid
 
