@@ -38,7 +38,9 @@ class MeanEfforts:
         self._damping = -model.actuator_biasprm[self._servos, 2]
         limited, largest = model.actuator_forcelimited[self._servos], model.actuator_forcerange[self._servos, 1]
         self._most_force = np.where(limited, largest, np.inf)
-        self._most_torque = np.where(model.jnt_actfrclimited[joints], model.jnt_actfrcrange[joints, 1], np.inf)
+        # Before version 4 MuJoCo damps also where the joint's own limit, and not the servo's, cuts the torque off.
+        counts = model.jnt_actfrclimited[joints] & (mujoco.mj_version() >= 4_000_000)
+        self._most_torque = np.where(counts, model.jnt_actfrcrange[joints, 1], np.inf)
 
     def note(self, rows: Rows, step: int, steps: int) -> None:
         """Take one of the steps of a tick into account, of the simulations in `rows`."""
