@@ -34,10 +34,10 @@ def write_down(task: str, actions: np.ndarray, frames: int) -> tuple[list[Entry]
     log: list[Entry] = []
 
     def noted(what: int, call: Callable[..., Any], *, has_speeds: bool = False) -> Callable[..., Any]:
-        def noting(*args: Any) -> Any:
+        def noting(*args: Any, **hooks: Any) -> Any:  # what is called between steps is no physics
             given = tuple(arg.copy() if isinstance(arg, np.ndarray) else arg for arg in args)
             log.append((what, world.ctrl.copy(), *given) if has_speeds else (what, *given))
-            return call(*args)
+            return call(*args, **hooks)
 
         return noting
 

@@ -1,5 +1,6 @@
 """What the tests of robots on the wall clock share. They wait as long as it takes; what they state does not."""
 
+import itertools
 import json
 import os
 import time
@@ -41,9 +42,12 @@ def turtlebot(name: str, *, require_realtime: bool = False, **options: Any) -> T
     )
 
 
+_NUMBERS = itertools.count()
+
+
 def unique(name: str) -> str:
-    """Return a robot's id that no test of another process uses."""
-    return f"test-{name}-{os.getpid()}"
+    """Return a robot's id that no other test uses, in this process or in another."""
+    return f"test-{name}-{os.getpid()}-{next(_NUMBERS)}"
 
 
 def is_alive(pid: int) -> bool:
