@@ -240,7 +240,8 @@ class ArmController(Controller):
             np.copyto(self._centre, self.command[:, :dof], where=first[:, None])
             np.copyto(self._room, self._reach + np.abs(self.command[:, :dof] - self._aim), where=first[:, None])
         for sim in np.flatnonzero(ready & (self._back_rad > 0.0)).tolist():
-            where[sim, :dof] = self._trail.back(sim, reading.position[sim, :dof], self._back_rad[sim], where[sim, :dof])
+            positions = reading.position[sim, :dof], self.command[sim, :dof]
+            where[sim, :dof] = self._trail.back(sim, *positions, self._back_rad[sim], where[sim, :dof])
             # Whatever it slid along on the way here holds it until it is back at where that began.
             presses = self.force is not None and self.force.force[sim] > LIGHT_N
             self._back_rad[sim] = 2 * self._back_rad[sim] if presses else 0.0
@@ -302,6 +303,7 @@ class ArmController(Controller):
         np.copyto(self.velocity, 0.0, where=mask[:, None])
         np.copyto(self.acceleration, 0.0, where=mask[:, None])
         there = (np.abs(off) <= self._largest_error[:dof]) & (np.abs(reading.velocity[:, :dof]) < _SLOW)
+        there &= np.abs(step) <= self._bend  # then it may stand still in the next tick
         # One that never comes to rest, by what it reads, is not waited for.
         self._yields &= ~there.all(axis=1) & ((self._gives_way > 0) | (np.abs(off) > _GIVES_WAY_RAD).any(axis=1))
         self._any_yields = bool(self._yields.any())
@@ -453,15 +455,22 @@ class _Trail:
         self._gone_back[ids] = 0
 
     def back(
-        self, sim: int, position: NDArray[np.float64], least: float, otherwise: NDArray[np.float64]
+        self,
+        sim: int,
+        position: NDArray[np.float64],
+        command: NDArray[np.float64],
+        least: float,
+        otherwise: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`.
 
-        One that has gone back already goes on from there.
+        What it hit may have thrown it back: it was then also away from its reference. One that has gone back already
+        goes on from there.
         """
         ages = np.arange(self._gone_back[sim], len(self._rows))
         rows = self._rows[(self._count[sim] - 1 - ages) % len(self._rows), sim]
         away = np.abs(rows - position).max(axis=1) >= least  # never so where there is no row yet
+        away &= np.abs(rows - command).max(axis=1) >= _BACK_RAD
         if not away.any():
             return otherwise
         self._gone_back[sim] += int(away.argmax())
