@@ -106,11 +106,11 @@ def main() -> int:
     for column in ("into", "speed", *WAYS):
         table.add_column(column)
     missed = False
-    for into in INTO:
+    for into, (direction, fixtures) in INTO.items():
         for speed in arguments.speeds:
             row = []
             for way in WAYS:
-                outcome = run(*INTO[into], speed, min(arguments.frames, round(60 / speed) + 60), way)
+                outcome = run(direction, fixtures, speed, min(arguments.frames, round(60 / speed) + 60), way)
                 row.append(f"{outcome.peak:.0f} N, {outcome.over_s:.2f} s, {outcome.ended}")
                 # The check knows the table and the arm, not the box.
                 missed |= way == WAYS[0] and into != "box" and outcome.peak > 0.0
@@ -119,10 +119,10 @@ def main() -> int:
     links = Table(title="A link that meets a pillar, with the limit of force: peak force, and time above 20 N")
     for column in ("link", "lever", *(f"{strike} m/s" for strike in STRIKES)):
         links.add_column(column)
-    for link, (direction, lever, (x, y, height)) in PILLARS.items():
+    for link, (turn, lever, (x, y, height)) in PILLARS.items():
         pillar, row = Shape("cylinder", x, y, 0.0, 0.03, 0.03, height), []
         for strike in STRIKES:
-            outcome = run(direction, (pillar,), strike / lever, min(arguments.frames, round(25 * lever / strike) + 60))
+            outcome = run(turn, (pillar,), strike / lever, min(arguments.frames, round(25 * lever / strike) + 60))
             row.append(f"{outcome.peak:.0f} N, {outcome.over_s:.2f} s, {outcome.ended}")
             missed |= outcome.over_s == np.inf  # slow ones press for long before they press hard
         links.add_row(link, f"{lever} m", *row)
