@@ -1,5 +1,6 @@
 """Configuration of `bhd-train`: LeRobot's, and a few fields of ours."""
 
+import copy
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -219,3 +220,18 @@ def plain(config: Any) -> dict[str, Any]:
     """Return a configuration as JSON values, with every default filled in: what `parse_train` would read back."""
     encoded: Mapping[str, Any] = draccus.encode(config)
     return json.loads(json.dumps(encoded))
+
+
+def without_places(value: Any) -> Any:
+    """Return a copy of a configuration that can be published: of absolute paths only their names are left."""
+    if isinstance(value, Path | str):
+        path = Path(value).expanduser()
+        return type(value)(path.name) if path.is_absolute() else value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        one = copy.copy(value)
+        for name, part in vars(value).items():
+            object.__setattr__(one, name, without_places(part))
+        return one
+    if isinstance(value, dict):
+        return {key: without_places(part) for key, part in value.items()}
+    return type(value)(map(without_places, value)) if type(value) in (list, tuple) else value

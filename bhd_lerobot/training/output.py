@@ -1,5 +1,6 @@
 """What a training run leaves: its folder, and what of it goes to the Hub and to wandb."""
 
+import copy
 import shlex
 import sys
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.checkpoint import TrainingParts
-from bhd_lerobot.training.config import BhdTrainConfig, plain
+from bhd_lerobot.training.config import BhdTrainConfig, plain, without_places
 from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, draw_loss, read_metrics
 
 
@@ -124,7 +125,9 @@ class RunOutput:
             folder = str(self.checkpoint / PRETRAINED_MODEL_DIR)
             again = f"When that is repaired:\n  {shlex.join(['hf', 'upload', policy.repo_id, folder, '.', *private])}"
         with self._uploading(policy.repo_id, "The policy", again):
-            parts.policy.push_model_to_hub(self._config)
+            published: Any = copy.copy(parts.policy)
+            published.config = without_places(published.config)
+            published.push_model_to_hub(without_places(self._config))
             parts.preprocessor.push_to_hub(policy.repo_id)
             parts.postprocessor.push_to_hub(policy.repo_id)
             if self.checkpoint is not None:

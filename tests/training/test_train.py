@@ -18,8 +18,11 @@ from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.log import MetricsFile
 from bhd_lerobot.training.train import main
 from tests.forks import Fork
+from tests.hub_server.server import HubServer
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
 from tests.waiting import until
+
+pytest_plugins = ["tests.hub_server.fixtures"]
 
 
 @pytest.fixture(scope="module")
@@ -260,3 +263,20 @@ def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path, m
     root = make_dataset(tmp_path / "one", episodes=1, frames=200)
     _, printed = run_train(options(root, tmp_path / "other", policy, steps=1))
     assert "warning: action is normalised by" not in printed
+
+
+@pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
+def test_a_policy_that_is_pushed_holds_no_path_of_this_machine(
+    data: Path, tmp_path: Path, hub: HubServer, policy: dict
+) -> None:
+    run = tmp_path / "run"
+    pushed = {"policy.repo_id": "me/p", "policy.push_to_hub": True}
+    run_train(options(data, run, policy | pushed, steps=5))
+    files = {path: blob.content for path, blob in hub.repositories["models/me/p"].files().items()}
+    assert {"config.json", "train_config.json", "README.md", "model.safetensors"} <= set(files)
+    assert json.loads(files["train_config.json"])["dataset"]["root"] == data.name
+    for path, content in files.items():
+        assert str(tmp_path.parent).encode() not in content, path
+        assert str(data.parent).encode() not in content, path
+    # What stays on this machine can be resumed.
+    assert json.loads((run / "train_config.json").read_text())["dataset"]["root"] == str(data)
