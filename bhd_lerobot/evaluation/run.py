@@ -195,7 +195,7 @@ def _store(
 ) -> None:
     title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
     one.trajectories[metrics.episode] = Trajectory(
-        title, episode.scene, track[:, :2].astype(np.float32), metrics.success
+        title, episode.scene, track[:, :2].astype(np.float32), metrics.success, episode.instruction
     )
     failures = sum(not other.success for other in one.episodes)
     wanted = VIDEOS if config.videos is None else config.videos

@@ -70,7 +70,7 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         title = f"{episode.index}: {about.get('outcome', '')}, score {about.get('score') or 0.0:.2f}"
         success = bool(about.get("success"))
         trajectories.append(
-            Trajectory(title, scene_from_json(about["scene"]), simulation.track(states)[:, :2], success)
+            Trajectory(title, scene_from_json(about["scene"]), simulation.track(states)[:, :2], success, episode.task)
         )
     what = f"The first {len(trajectories)} episodes from above" if len(trajectories) > 1 else "The episode from above"
     with tempfile.TemporaryDirectory() as folder:

@@ -397,7 +397,7 @@ def _trajectory(episode: Episode, simulation: Host) -> Trajectory:
     outcome = episode.outcome
     title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
     track = track_of(simulation, episode.columns)
-    return Trajectory(title, episode.scene, track[:, :2], outcome.success)
+    return Trajectory(title, episode.scene, track[:, :2], outcome.success, episode.instruction)
 
 
 def _make_preview(config: RecordConfig, simulation: Host, console: Console) -> Preview | None:

@@ -1,6 +1,7 @@
 """Images of a run: trajectories from above, divergence over time."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -30,12 +31,14 @@ class Trajectory:
         scene: the obstacles, or the objects on the table.
         xy: positions in the world frame [m], shape (frames, 2).
         success: whether the episode succeeded.
+        instruction: what the arm was asked to do; shown above a table.
     """
 
     title: str
     scene: Arena | TableScene
     xy: NDArray[np.float64]
     success: bool
+    instruction: str = ""
 
 
 class TrajectoryAlbum:
@@ -100,9 +103,13 @@ def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     color = _GOOD if trajectory.success else _BAD
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
-    marker, size = ("s", 4) if trajectory.success else ("x", 7)
-    axes.plot(*trajectory.xy[-1], color=color, markeredgewidth=2, marker=marker, markersize=size)
-    axes.set_title(trajectory.title, fontsize=7.5, color=color)
+    marker, size, width = ("s", 5, 1.2) if trajectory.success else ("x", 7, 2.0)
+    axes.plot(*trajectory.xy[-1], color=color, markerfacecolor="none", markeredgewidth=width, marker=marker, ms=size)
+    title = trajectory.title
+    # The font has no Chinese characters.
+    if isinstance(trajectory.scene, TableScene) and trajectory.instruction.isascii():
+        title = f"{title}\n{textwrap.shorten(trajectory.instruction, 44, placeholder=' …')}".rstrip()
+    axes.set_title(title, fontsize=7.5, color=color)
     _draw_scale(axes)
 
 
@@ -198,26 +205,28 @@ def draw_divergence(
         recorded: recorded positions [m], shape (frames, 2).
         replayed: replayed positions [m], shape (frames, 2).
         time: time of the frames [s], shape (frames,).
-        curves: divergence over time by label, each of shape (frames,).
+        curves: difference over time by label with its unit, each of shape (frames,).
         heading: what stands above the figure.
         path: where the image goes.
     """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    columns = figure.add_gridspec(1, 2, width_ratios=(1, 1.3))
+    left, rows = figure.add_subplot(columns[0]), columns[1].subgridspec(len(curves), 1)
     draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
     left.plot(replayed[:, 0], replayed[:, 1], color=_BAD, linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False, fontsize=9)
-    for label, values in curves.items():
-        right.plot(time, values, label=label, linewidth=1.3)
-    largest = max((float(np.max(values)) for values in curves.values()), default=0.0)
-    if largest == 0.0:
-        right.set_ylim(-0.5, 1.0)
-        right.text(0.5, 0.6, "identical, to the last bit", transform=right.transAxes, ha="center", color=_GOOD)
-    right.set_xlabel("time [s]")
-    right.set_ylabel("difference between replay and recording")
-    right.grid(alpha=0.3)
-    right.legend(frameon=False, fontsize=9)
+    figure.supylabel("largest difference between replay and recording", fontsize=9, x=0.41)
+    for row, (label, values) in enumerate(curves.items()):
+        axes = figure.add_subplot(rows[row])
+        axes.plot(time, values, color=_BAD, linewidth=1.3)
+        axes.set_title(label, fontsize=9, loc="left")
+        axes.grid(alpha=0.3)
+        axes.tick_params(labelbottom=row == len(curves) - 1)
+        if not np.any(values):
+            axes.set_yticks([0.0])
+            axes.text(0.5, 0.7, "identical, to the last bit", transform=axes.transAxes, ha="center", color=_GOOD)
+    axes.set_xlabel("time [s]")
     figure.savefig(path, dpi=110)

@@ -13,6 +13,7 @@ from bhd_lerobot.sim.camera import Camera
 WIDTH, HEIGHT = 640, 480
 FPS = 20
 STRIP = 2, 3  # rows and columns of the image
+GAP = 8  # between them [px]
 
 
 class Preview:
@@ -74,11 +75,14 @@ class Preview:
         for index in np.linspace(0, len(states) - 1, STRIP[0] * STRIP[1]).round().astype(int):
             self._show(states[index])
             image = Image.fromarray(self._camera.render(0, self._simulation.view))
-            ImageDraw.Draw(image).text((12, 8), f"{index / fps:.1f} s", fill="black", font_size=26)
+            draw, label, corner = ImageDraw.Draw(image), f"{index / fps:.1f} s", (20, 14)
+            left, top, right, bottom = draw.textbbox(corner, label, font_size=26)
+            draw.rounded_rectangle((left - 10, top - 8, right + 10, bottom + 8), 8, fill="white")
+            draw.text(corner, label, fill="black", font_size=26)
             images.append(image)
-        strip = Image.new("RGB", (WIDTH * STRIP[1], HEIGHT * STRIP[0]))
+        strip = Image.new("RGB", ((WIDTH + GAP) * STRIP[1] - GAP, (HEIGHT + GAP) * STRIP[0] - GAP), "white")
         for number, image in enumerate(images):
-            strip.paste(image, (number % STRIP[1] * WIDTH, number // STRIP[1] * HEIGHT))
+            strip.paste(image, (number % STRIP[1] * (WIDTH + GAP), number // STRIP[1] * (HEIGHT + GAP)))
         strip.save(path)
 
     def _show(self, state: NDArray[np.float64]) -> None:

@@ -252,15 +252,15 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             "gives them at the start and so differs; state shows whether the record is true to itself."
         )
     results = []
-    table = Table(title=f"Replay of episode {config.dataset.episode} of {root}", title_justify="left")
-    for heading in ("largest difference", "frames", "position [m]", "angle [rad]", "state", "observed", ""):
-        table.add_column(heading, justify="left" if heading in ("largest difference", "") else "right")
+    title = f"Replay of episode {config.dataset.episode} of {root}: largest differences"
+    table = Table(title=title, title_justify="left")
+    for heading in ("mode", "position [m]", "angle [rad]", "state", "observed", ""):
+        table.add_column(heading, justify="left" if heading in ("mode", "") else "right", no_wrap=True)
     for mode in ("open_loop", "state") if config.mode == "both" else (config.mode,):
         result = episode.open_loop() if mode == "open_loop" else episode.state_exact()
         results.append(result)
         table.add_row(
             mode,
-            str(len(result.state)),
             *(
                 f"{values.max():.3g}"
                 for values in (result.position_m, result.angle_rad, result.state, result.observation)

@@ -72,7 +72,7 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
     if root is None:
         raise ConfigError(f"The model of {body.name!r} has no body {body.root!r}.")
     root.add_camera(
-        name="follow", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[0, -1.3, 1.9], xyaxes=[1, 0, 0, 0, 0.82, 0.57],
+        name="follow", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[0, -0.7, 1.4], xyaxes=[1, 0, 0, 0, 0.894, 0.447],
         fovy=46,
     )  # fmt: skip
     spec.add_sensor(
