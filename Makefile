@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: arm help demo test sweep docs lint format bench bench-realtime results lock clean venv
+.PHONY: arm help demo test test-all sweep docs lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Three test processes by default, for two processors: a quarter of their time they wait. `make test WORKERS=0` runs
@@ -16,8 +16,11 @@ help: ## show this list
 demo: venv ## record, replay, train and evaluate both robots
 	$(PYTHON_IN_VENV) -m bhd_lerobot.apps.demo
 
-test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
-	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal $(PYTEST_ARGS)
+test: venv ## run the tests of every behaviour; PYTEST_ARGS='-k name' narrows them down
+	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal --thorough=no $(PYTEST_ARGS)
+
+test-all: test ## run them, and then those that take long
+	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal --thorough=only $(PYTEST_ARGS)
 
 sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
 	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/datasets/sweeps $(PYTEST_ARGS)

@@ -10,6 +10,7 @@ import os
 import shutil
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,6 +42,30 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 settings.register_profile("bhd", derandomize=True, deadline=None, database=None)
 settings.load_profile("bhd")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--thorough",
+        choices=("no", "only", "all"),
+        default="all",
+        help="leave out the tests marked thorough, as `make test` does; run only them; or all (the default)",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Select by `--thorough`: of a test marked `thorough(but=n)` the first n examples are not thorough."""
+    if (wanted := config.getoption("--thorough")) == "all":
+        return
+    examples: Counter[str] = Counter()
+    chosen: dict[bool, list[pytest.Item]] = {True: [], False: []}
+    for item in items:
+        name = item.nodeid.partition("[")[0]
+        examples[name] += 1
+        marker = item.get_closest_marker("thorough")
+        chosen[marker is not None and examples[name] > marker.kwargs.get("but", 0)].append(item)
+    config.hook.pytest_deselected(items=chosen[wanted == "no"])
+    items[:] = chosen[wanted == "only"]
 
 
 def pytest_unconfigure() -> None:
