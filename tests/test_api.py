@@ -1,6 +1,7 @@
 """`import bhd_lerobot`: light, complete, and what it does is what the commands do."""
 
 import importlib
+import inspect
 import os
 import re
 import signal
@@ -32,6 +33,18 @@ def test_every_name_is_there_and_documented() -> None:
     assert dir(bhd) == sorted(bhd.__all__)
     for name in set(bhd.__all__) - {"__version__"}:
         assert getattr(bhd, name).__doc__, name
+
+
+def test_functions_that_users_import_describe_every_argument() -> None:
+    """The linter does not ask that of others; options are described where `--help` finds them."""
+    for name in bhd.__all__:
+        one = getattr(bhd, name)
+        if not inspect.isfunction(one):
+            continue
+        given = inspect.signature(one).parameters.values()
+        names = [given.name for given in given if given.kind not in (given.VAR_POSITIONAL, given.VAR_KEYWORD)]
+        text = inspect.getdoc(one) or ""
+        assert "Args:" not in text or set(names) <= set(re.findall(r"^ +(\w+):", text, re.MULTILINE)), name
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error() -> None:

@@ -167,12 +167,8 @@ class CameraSpec:
     """A camera of the body.
 
     Attributes:
-        name: camera name in the model.
         width: image width [px].
         height: image height [px].
-
-    Raises:
-        ConfigError: a side of the image is not a positive whole number.
     """
 
     name: str

@@ -90,11 +90,7 @@ def _join(join: Callable[[], Any], address: str, timeout_s: float) -> None:
 
 @contextmanager
 def _errors(address: str) -> Iterator[None]:
-    """Say in our words why there is no cluster.
-
-    Raises:
-        ClusterError: there is none.
-    """
+    """Say in our words why there is no cluster."""
     try:
         yield
     except ClusterError:
@@ -126,11 +122,7 @@ def _own_handlers() -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """See that what answers at an address could be Ray's head, before Ray tries it for minutes.
-
-    Raises:
-        ClusterError: nothing answers, or something else.
-    """
+    """See that what answers at an address could be Ray's head, before Ray tries it for minutes."""
     host, _, port = address.rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S) as connection:
@@ -180,12 +172,7 @@ def free_places(config: RayConfig) -> int:
 
 
 def describe_crowding(config: RayConfig, workers: int) -> str:
-    """Return a message if a run wants more workers than there are processors; empty if not.
-
-    Args:
-        config: of the cluster.
-        workers: how many the run will want.
-    """
+    """Return a message if a run wants more workers than there are processors; empty if not."""
     places = free_places(config)
     if workers > places:
         return (

@@ -36,13 +36,8 @@ class Job:
     """Episodes of one robot, one task and one brain.
 
     Attributes:
-        robot: the robot's configuration.
-        task: the task's.
-        brain: the brain's.
         tolerance: of frames, see `EpisodeLoop`.
         fps: frames a second [Hz].
-        n: simulations side by side in a worker.
-        threads: threads that step them.
         video: how cameras are encoded; None if images are not recorded.
         is_timed: whether the duration of the brain's calls is wanted.
         checkpoints: files of the trained policies in `brain`: by the path that it names, then by file name.
@@ -81,11 +76,7 @@ class Video:
 
 
 def read_checkpoints(brain: Any) -> dict[str, dict[str, bytes]]:
-    """Return the files of the trained policies that a brain's configuration names.
-
-    Raises:
-        ConfigError: there is no policy, or it cannot be read.
-    """
+    """Return the files of the trained policies that a brain's configuration names."""
     found: dict[str, dict[str, bytes]] = {}
     for config in _learned(brain):
         folder = find_checkpoint(config.path)
@@ -136,7 +127,6 @@ class VideoSink:
     Args:
         fps: frames a second of the dataset.
         size: (height, width) of all cameras [px].
-        settings: the codec and its options.
     """
 
     def __init__(self, fps: int, size: tuple[int, int], settings: VideoSettings) -> None:

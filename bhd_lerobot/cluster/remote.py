@@ -22,11 +22,7 @@ _LINES, _WIDTH = 20, 300  # of what was printed during a call, that is passed on
 
 
 def facts_of_machine(distributions: tuple[str, ...]) -> dict[str, str]:
-    """Return what decides the bytes of an episode: versions by name; "not installed" where there is none.
-
-    Args:
-        distributions: the packages, by the names that pip knows.
-    """
+    """Return what decides the bytes of an episode: versions by name; "not installed" where there is none."""
     facts = {"Python": platform.python_version(), "processor": platform.machine()}
     for name in distributions:
         try:
@@ -54,12 +50,7 @@ class RemoteWorker:
         return {"host": socket.gethostname(), "pid": os.getpid(), "facts": facts_of_machine(distributions)}
 
     def prepare(self, job: bytes, server: str) -> dict[str, Any]:
-        """Get ready for a job; the value is the fingerprint of what this machine computes.
-
-        Args:
-            job: what the server is made of.
-            server: the module that has it.
-        """
+        """Get ready for a job; the value is the fingerprint of what this machine computes."""
 
         def start() -> str:
             self._server = None

@@ -38,8 +38,6 @@ class Worker:
     """A process of the cluster.
 
     Attributes:
-        actor: Ray's handle of it.
-        host: where it is, in words.
         is_there: whether it has been given a machine, and answered.
         job: the job that it is ready for, as Ray's reference, or None.
         tasks: what it was given and has not finished, the running one first.

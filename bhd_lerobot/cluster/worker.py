@@ -16,17 +16,7 @@ from bhd_lerobot.rollout.types import EpisodeSpec
 
 
 class EpisodeServer:
-    """Runs the episodes of one job.
-
-    Attributes:
-        fingerprint: what this machine computes, see `fingerprint`.
-
-    Args:
-        content: a `Job`, pickled.
-
-    Raises:
-        BhdError: this machine cannot do it: it cannot render, for example.
-    """
+    """Runs the episodes of one job."""
 
     def __init__(self, content: bytes) -> None:
         job: Job = pickle.loads(content)
@@ -43,9 +33,6 @@ class EpisodeServer:
 
     def run(self, specs: list[tuple[int, int]]) -> dict[str, Any]:
         """Run episodes.
-
-        Args:
-            specs: number and seed of each.
 
         Returns:
             `episodes`: those that were finished, in order, packed; `times`: durations of the brain's calls [s], if

@@ -31,8 +31,6 @@ class ReadingCheck:
         problem: why the last reading that was refused was no measurement, in words.
 
     Args:
-        body: the robot.
-        n: number of robots.
         control_hz: ticks a second [Hz].
     """
 

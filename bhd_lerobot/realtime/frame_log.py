@@ -58,12 +58,9 @@ class FrameCollector:
     """Turns the states of a ring into boundaries of frames.
 
     Attributes:
-        states: states taken in the present segment.
         drops: states of the present segment that were overwritten before they could be taken.
 
     Args:
-        ring: the states.
-        log: where the boundaries go.
         frame_ticks: ticks in a frame.
     """
 

@@ -12,7 +12,6 @@ class Mailbox:
 
     Attributes:
         dtype: the dtype of the records.
-        capacity: number of records.
 
     Args:
         dtype: the dtype of the records.

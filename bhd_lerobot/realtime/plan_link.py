@@ -85,18 +85,13 @@ class PlanLink:
 
     Attributes:
         lead: ticks from a request to the tick that its plan is to start at.
-        timeout: ticks that an answer may take.
 
     Args:
         buffer: memory of at least `nbytes(dof, control_hz, duration_s)` bytes, zeroed before its first use.
-        dof: number of joints, without the gripper.
         control_hz: ticks a second [Hz].
         lead_s: from a request to the start of its plan [s].
         timeout_s: that an answer may take [s].
         duration_s: the longest trajectory [s]; the same on both sides.
-
-    Raises:
-        ConfigError: a lead or a time-out that is not positive.
     """
 
     def __init__(
@@ -136,11 +131,7 @@ class PlanLink:
         start_tick: int,
         held: Capsule | None = None,
     ) -> None:
-        """Ask for a plan.
-
-        Raises:
-            ConfigError: for another arm than the first.
-        """
+        """Ask for a plan."""
         if sim:
             raise ConfigError(f"A plan for arm {sim} was requested; another process plans for one arm only, number 0.")
         self._number += 1
@@ -181,8 +172,6 @@ class PlanServer:
     """The planner's side, for one thread.
 
     Args:
-        buffer: the memory that the cerebellum's side was given.
-        planner: who plans.
         duration_s: the longest trajectory [s]; the same on both sides.
     """
 

@@ -55,11 +55,7 @@ class SystemCalls:
         self._call("prctl", _PR_SET_TIMERSLACK, slack, 0, 0, 0)
 
     def lock_memory(self, flags: int) -> None:
-        """Keep the pages of this process in memory.
-
-        Args:
-            flags: MCL_CURRENT, MCL_FUTURE, or both.
-        """
+        """Keep the pages of this process in memory."""
         self._call("mlockall", flags)
 
     def unlock_memory(self) -> None:

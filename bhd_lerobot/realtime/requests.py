@@ -82,7 +82,6 @@ class RequestServer:
     """The cerebellum's side. One robot: simulation 0.
 
     Args:
-        cerebellum: what carries requests out.
         requests: where requests come from, of dtype `request_dtype(dof)`.
         events: where replies and results go to, of dtype `EVENT_DTYPE`.
 
@@ -153,7 +152,6 @@ class RequestClient:
     Args:
         requests: where requests go to, of dtype `request_dtype(dof)`.
         events: where replies and results come from, of dtype `EVENT_DTYPE`.
-        wait: waits for a moment, about a tick.
         timeout_s: how long a reply may take [s].
         clock_ns: the time on the clock that the cerebellum's side uses, too [ns].
     """
@@ -175,11 +173,7 @@ class RequestClient:
         self._results: list[CommandResult] = []
 
     def request(self, request: Request) -> Reason:
-        """Ask for a change of mode, and return what became of it.
-
-        Raises:
-            RealtimeError: the cerebellum does not answer.
-        """
+        """Ask for a change of mode, and return what became of it."""
         return Reason(int(self._ask(RequestKind.MODE, mode=request)["code"]))
 
     def submit(self, command: BrainCommand) -> CommandResult | None:
@@ -190,9 +184,6 @@ class RequestClient:
         Returns:
             None if it was accepted: its one result comes later, by `take_results`. Otherwise the refusal, which is also
             among the results, except for a goal that has the name of one that is followed or waits.
-
-        Raises:
-            RealtimeError: the cerebellum does not answer.
         """
         failure = check_encodable(command, self._dof)
         if failure is not None:
@@ -205,11 +196,7 @@ class RequestClient:
         return decode_result(reply["result"]) if reply["refused"] else None
 
     def cancel(self, task_id: str) -> ResultCode:
-        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal.
-
-        Raises:
-            RealtimeError: the cerebellum does not answer.
-        """
+        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
         if not isinstance(task_id, str) or len(task_id.encode("utf-8", "surrogatepass")) > NAME_BYTES:
             return ResultCode.UNKNOWN_ID  # no goal can have this name
         return ResultCode(int(self._ask(RequestKind.CANCEL, goal=encode_name(task_id, self._dof))["code"]))

@@ -40,11 +40,7 @@ _ORDERED = ("x86_64", "amd64", "i686")
 
 
 def check_platform(machine: str | None = None, system: str | None = None) -> None:
-    """Raise if processes cannot share memory here as this package does.
-
-    Raises:
-        RealtimeError: another system than Linux, or another processor than x86.
-    """
+    """Raise if processes cannot share memory here as this package does."""
     machine, system = machine or platform.machine(), system or platform.system()
     if system != "Linux":
         raise RealtimeError(f"clock = 'realtime' needs Linux; this is {system}. Use clock = 'lockstep'.")
@@ -226,11 +222,7 @@ class SharedBlock:
 
 
 def _find(name: str) -> tuple[Path, int]:
-    """Return the file of this user's block of a name, and a descriptor of it.
-
-    Raises:
-        RealtimeError: there is none; the message lists those that there are.
-    """
+    """Return the file of this user's block of a name, and a descriptor of it."""
     # A killed run may have left another one, and one that is being made is given up if this one is held.
     found = [(free, not _is_made(path), path) for path, free in _blocks() if _name(path) == name]
     for _, _, path in sorted(found):

@@ -29,8 +29,6 @@ class BaseSimulation(BaseHost, Simulation):
     """n simulated bases.
 
     Args:
-        config: the robot.
-        n: how many.
         threads: threads that step the physics; all processors if None.
     """
 

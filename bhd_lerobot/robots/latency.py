@@ -17,8 +17,6 @@ class LatePlant(Plant):
     """Passes readings on at once, and commands some ticks later, for each simulation its own number.
 
     Args:
-        plant: the plant.
-        arm: the robot.
         max_ticks: largest latency [ticks].
     """
 
@@ -34,11 +32,7 @@ class LatePlant(Plant):
         self._waiting = np.zeros(plant.n, np.int64)  # ticks since the latency was set: before, nothing was commanded
 
     def set_latency(self, ids: NDArray[np.intp], ticks: Sequence[int]) -> None:
-        """Set by how many ticks the servos of some simulations get their commands late.
-
-        Raises:
-            ConfigError: more than `max_ticks`, or negative.
-        """
+        """Set by how many ticks the servos of some simulations get their commands late."""
         for value in ticks:
             if not 0 <= value <= self._largest:
                 raise ConfigError(f"latency_ticks is {value}; it must be between 0 and {self._largest}.")

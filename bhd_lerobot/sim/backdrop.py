@@ -6,13 +6,7 @@ Colour = tuple[float, float, float]
 
 
 def add_backdrop(spec: mujoco.MjSpec, sky: tuple[Colour, Colour], floor: tuple[Colour, Colour]) -> None:
-    """Add the sky, and the material ``"floor"``.
-
-    Args:
-        spec: the model.
-        sky: its colours above and at the horizon, red, green and blue from 0 to 1.
-        floor: the colours of its squares.
-    """
+    """Add the sky, and the material ``"floor"``."""
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

@@ -22,8 +22,6 @@ class MeanEfforts:
         mean: what acted on average over the last steps [N m; N for a slide], shape (n, nv), live.
 
     Args:
-        model: the model.
-        bind: returns a live field of all simulations by its name.
         exact: average what acted; what MuJoCo reports if False.
     """
 

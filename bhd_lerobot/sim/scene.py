@@ -25,13 +25,7 @@ def build_model(
     """Compile the model.
 
     Args:
-        body: the robot.
         physics_hz: physics steps a second [Hz].
-        pool_size: number of obstacles a simulation of a base can have at the most.
-        fixtures: what stands immovable on an arm's table.
-
-    Raises:
-        ConfigError: the body's MJCF does not compile, or there is no stage for this kind of body.
     """
     try:
         spec = mujoco.MjSpec.from_string(body.mjcf)

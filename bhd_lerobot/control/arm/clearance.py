@@ -37,8 +37,6 @@ class SetpointClearance:
         slows: whether it is below 1 for any of them.
 
     Args:
-        arm: limits and geometry.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame.
     """
@@ -88,7 +86,6 @@ class SetpointClearance:
         """Check the arms whose turn it is.
 
         Args:
-            tick: counts up.
             position: the reference, shape (n, width).
             velocity: its speed, shape (n, width).
             speed: what is wanted within its limits, shape (n, width).

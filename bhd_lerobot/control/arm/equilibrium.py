@@ -52,10 +52,8 @@ class Equilibrium:
         active: whether a setpoint is followed, shape (n,).
 
     Args:
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
-        limits: how fast the tool's equilibrium may move.
         opening_limits: largest speed [m/s] and acceleration [m/s^2] of the opening.
     """
 

@@ -21,8 +21,6 @@ class HeldObjects:
     to be as thick as they were apart. It is forgotten when the gripper opens, or closes without it.
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
     """
 
@@ -37,7 +35,6 @@ class HeldObjects:
         """Take one tick into account; return the arms that hold something from now on, or nothing any more.
 
         Args:
-            reading: what the arms measure.
             command: the reference, shape (n, dof + 1).
         """
         closes = reading.position[:, -1] - command[:, -1] > _INSIDE

@@ -29,11 +29,8 @@ class SetpointFilter:
         clearance: what slows an arm down before it comes too near to something; nothing does if None.
 
     Args:
-        limits: the limits.
-        n: number of robots.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame.
-        clearance: the attribute.
     """
 
     def __init__(

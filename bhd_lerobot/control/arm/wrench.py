@@ -27,13 +27,8 @@ class ContactObserver:
             in the base frame, shape (n, 6).
 
     Args:
-        n: number of arms.
-        dof: number of joints.
         control_hz: ticks a second [Hz].
         gain: bandwidth of the estimate [1/s].
-
-    Raises:
-        ConfigError: the gain is not positive, or too high for the ticks.
     """
 
     def __init__(self, n: int, dof: int, control_hz: int, gain: float = OBSERVER_GAIN) -> None:
@@ -49,7 +44,6 @@ class ContactObserver:
         """Take one tick into account.
 
         Args:
-            terms: the dynamics in the state that was read.
             velocity: joint speeds that were read [rad/s], shape (n, 6).
             applied: torques that the motors gave since the tick before [N m], shape (n, 6).
         """
@@ -80,7 +74,6 @@ def tool_wrench(jacobian: Array, torque: Array, damping: float = _DAMPING) -> Ar
     Args:
         jacobian: shape (n, 6, dof).
         torque: [N m], shape (n, dof).
-        damping: directions in which the Jacobian's singular value is this small are halved.
 
     Returns:
         Force [N] and moment [N m] in the base frame, shape (n, 6); near zero in directions that a singular posture can

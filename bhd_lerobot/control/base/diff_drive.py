@@ -10,10 +10,6 @@ class DiffDrive:
     """Kinematics and odometry of n bases.
 
     A twist is the forward speed [m/s] and the yaw rate [rad/s]; wheels are left, right.
-
-    Args:
-        drive: the wheels.
-        n: number of simulations.
     """
 
     def __init__(self, drive: WheelDrive, n: int) -> None:
@@ -32,9 +28,6 @@ class DiffDrive:
         Args:
             twist: shape (n, 2).
             out: wheel speeds [rad/s], shape (n, 2).
-
-        Returns:
-            `out`.
         """
         straight = twist[:, 0] * self._per_speed
         turn = twist[:, 1] * self._per_yaw
@@ -53,7 +46,6 @@ class DiffDrive:
         """Start odometry at the origin.
 
         Args:
-            ids: the simulations.
             angles: their wheel angles now [rad], shape (len(ids), 2).
         """
         self.odometry[ids] = 0.0

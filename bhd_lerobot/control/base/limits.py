@@ -34,9 +34,6 @@ def limit_change(requested: Array, previous: Array, largest: Array, out: Array, 
         largest: largest change in one tick, shape (n, width).
         out: where the result goes, shape (n, width); may be `previous`, may not be `requested`.
         changed: set to True where a value was held back and left alone elsewhere, shape (n, width).
-
-    Returns:
-        Whether every value arrived at what was requested.
     """
     step = requested - previous
     held = np.abs(step) > largest
@@ -104,9 +101,6 @@ def limit_wheel_speed(twist: Array, per_speed: float, per_yaw: float, limit: flo
         per_yaw: wheel speed of a yaw rate [rad/rad].
         limit: largest wheel speed [rad/s].
         changed: set to True for simulations that were limited and left alone elsewhere, shape (n,).
-
-    Returns:
-        Whether any simulation was limited.
     """
     room = np.abs(twist[:, 1])
     room *= -per_yaw

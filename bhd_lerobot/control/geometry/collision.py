@@ -18,13 +18,6 @@ class CollisionModel:
     """Distances between the capsules of an arm, and between them and the table, which is z = 0 in the base frame.
 
     Negative distances are depths. An end of a capsule that no joint lifts is not held against the table.
-
-    Args:
-        chain: the geometry.
-
-    Raises:
-        ConfigError: a pair names a capsule that does not exist, or the chain has another structure than the closed
-            forms.
     """
 
     def __init__(self, chain: ArmChain) -> None:

@@ -29,7 +29,6 @@ class IkResult:
     """Postures that were found, or why there are none.
 
     Attributes:
-        code: SUCCEEDED, or what was in the way.
         postures: joint positions [rad], shape (k, 6); empty unless succeeded.
         message: what was in the way, with numbers and a remedy; empty if succeeded.
         index: number of the pose of a line that cannot be reached, or None.

@@ -22,12 +22,8 @@ class GoalBook:
     """Ensures that every goal of one episode ends in exactly one result.
 
     Attributes:
-        waiting: the goals that wait, the next one first.
         followed: the goal that is followed, or None.
         cancelled: whether the goal that is followed is to end as soon as the arm is at rest.
-
-    Args:
-        capacity: how many goals may wait.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -48,7 +44,6 @@ class GoalBook:
         Args:
             command: the goal; one that preempts ends all others.
             blocked: why the arm takes no goals now; None if it does.
-            check: returns what is wrong with a goal.
         """
         name = command.task_id
         key = str(name)  # what comes from outside may be anything

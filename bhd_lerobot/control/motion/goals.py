@@ -260,11 +260,7 @@ class GoalManager:
     # --- the state machine -------------------------------------------------------------------------------------------
 
     def _serve(self, sim: int, reference: Reference) -> bool:
-        """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may.
-
-        Returns:
-            Whether anything was started or ended.
-        """
+        """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may."""
         book, motion = self._books[sim], self._motion[sim]
         if motion == _Motion.HARD_BRAKE:
             return False

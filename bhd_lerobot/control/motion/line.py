@@ -92,8 +92,6 @@ def along_line(
     Args:
         posture: the start [rad], shape (dof,).
         goal: tool pose in the base frame, shape (4, 4).
-        kinematics: the arm's.
-        limits: the joints' limits, and the tool's.
         hz: ticks a second [Hz].
     """
     line = Line(kinematics.tool(posture), goal)

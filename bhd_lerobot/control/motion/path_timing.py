@@ -54,12 +54,7 @@ class PathTiming:
 
 
 class PathTimer:
-    """Finds the law of time of one path.
-
-    Args:
-        path: the joints over shares of the way, 0 to 1.
-        limits: of the joints.
-    """
+    """Finds the law of time of one path."""
 
     def __init__(self, path: CubicSpline, limits: PathLimits) -> None:
         self._path, self._limits = path, limits
@@ -109,8 +104,6 @@ class PathTimer:
 
         Args:
             before: those of the program before; None for the first, which knows no jerks.
-            acceleration: shares of the limits on each segment that may be used.
-            jerk: the same at each inner node.
         """
         low, high = self._accelerations
         segments = np.arange(len(self._steps))

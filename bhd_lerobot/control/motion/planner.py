@@ -182,11 +182,7 @@ class GoalPlanner:
     # --- torques -----------------------------------------------------------------------------------------------------
 
     def _within_torque(self, plan: Callable[[float], Trajectory | PlanFailure]) -> Trajectory | PlanFailure:
-        """Return a motion whose torques the motors can give, with the declared load.
-
-        Args:
-            plan: returns the motion with a share of the accelerations.
-        """
+        """Return a motion whose torques the motors can give, with the declared load."""
         share = 1.0
         for _ in range(_SLOWER):
             trajectory = plan(share)

@@ -63,11 +63,7 @@ class Planning(Protocol):
 
 
 class InlinePlanning:
-    """Plans at the request: the answer is there in the same tick.
-
-    Args:
-        planner: the arms' planner.
-    """
+    """Plans at the request: the answer is there in the same tick."""
 
     def __init__(self, planner: GoalPlanner) -> None:
         self.lead = self.timeout = 0
@@ -130,8 +126,6 @@ class PlanOrders:
     stays where it is, and its plan is never too late.
 
     Args:
-        n: number of arms.
-        planning: who plans.
         control_hz: ticks a second [Hz].
     """
 
@@ -170,12 +164,8 @@ class PlanOrders:
         To be called every tick until the answer is there.
 
         Args:
-            sim: the arm.
             command: the goal; the same one as long as the arm waits for its plan.
-            now: the reference.
-            ahead: returns what the reference is going to be after so many ticks.
             opening: where the gripper is commanded to [m]; None: where it is.
-            held: what is in it.
         """
         order = self._orders[sim]
         if order is None:

@@ -13,10 +13,6 @@ class TrajectoryPlayer:
 
     Attributes:
         active: which simulations a trajectory is played for, shape (n,).
-
-    Args:
-        n: number of simulations.
-        dof: dimensions of a trajectory.
     """
 
     def __init__(self, n: int, dof: int) -> None:
@@ -50,9 +46,6 @@ class TrajectoryPlayer:
         Args:
             rows: position, velocity and acceleration at each tick, shape (T, 3, dof). They must stay as they are until
                 something else is played.
-
-        Raises:
-            ValueError: there are several simulations, whose rows lie in one block.
         """
         if len(self.active) != 1:
             raise ValueError(f"Rows of {len(self.active)} simulations lie in one block; only a single one may borrow.")

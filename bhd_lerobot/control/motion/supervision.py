@@ -25,8 +25,6 @@ class Verdict:
     """What became of the goal of one simulation.
 
     Attributes:
-        sim: the simulation.
-        code: how the goal ended.
         message: in words, with the offending value and the limit.
     """
 
@@ -40,10 +38,6 @@ class FollowingLimit:
 
     A joint with a latency is where its reference was so long ago: behind by what the present speed, and a change of it
     at the largest acceleration, make of that time.
-
-    Args:
-        arm: the arm.
-        n: number of simulations.
     """
 
     def __init__(self, arm: Arm, n: int) -> None:
@@ -66,12 +60,7 @@ class FollowingLimit:
 class Supervisor:
     """Judges goals of n simulations by what is measured, once a tick.
 
-    Attributes:
-        limit: how far joints may be from their references.
-
     Args:
-        arm: the arm.
-        n: number of simulations.
         control_hz: ticks a second [Hz].
     """
 
@@ -119,7 +108,6 @@ class Supervisor:
         """Return the goals that end now.
 
         Args:
-            ids: the simulations that follow a goal.
             playing: whose trajectory has not ended yet, shape (n,).
             reference: what the plant was last commanded: positions and velocities, each of shape (n, dof + 1).
             measured: what it did: positions and velocities, each of shape (n, dof + 1).

@@ -22,11 +22,7 @@ _ROUNDING = 1e-9  # as a share of a speed
 
 @cache
 def load_ruckig() -> Any:
-    """Return Ruckig, which only arms need: it is imported with the first, and not before its first motion.
-
-    Raises:
-        VersionError: it is not installed; the message says how to get it where there is no wheel.
-    """
+    """Return Ruckig, which only arms need: it is imported with the first, and not before its first motion."""
     try:
         check_version("ruckig")
     except VersionError as error:
@@ -175,9 +171,7 @@ def to_target(
     way from a moving start would leave the position limits, the motion is braked first.
 
     Args:
-        start: where it starts.
         target: the end [rad or m], within the position limits, shape (dof,).
-        limits: the limits.
         hz: ticks a second [Hz].
         brake_limits: the limits to brake with if gentler ones do not suffice; `limits` if None.
     """
@@ -204,7 +198,6 @@ def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFai
     comes to rest on it.
 
     Args:
-        start: where it starts.
         limits: the limits; those of a stop if it is urgent.
         hz: ticks a second [Hz].
     """

@@ -36,9 +36,6 @@ def plant_class(name: str) -> Callable[[Any, Any], Plant]:
 
     Args:
         name: ``"package.module:Class"``.
-
-    Raises:
-        ConfigError: there is none, or it lacks a call.
     """
     module, _, attribute = name.partition(":")
     try:

@@ -73,9 +73,7 @@ class Receipt:
     """What was accepted of a command, of n robots.
 
     Attributes:
-        sent: what became of setpoints.
         refusals: why setpoints were refused, in words, by simulation, where a `Reason` does not say it all.
-        results: goals that were refused, by simulation.
     """
 
     sent: SendResult

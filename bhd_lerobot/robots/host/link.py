@@ -41,19 +41,12 @@ class LiveLink:
     """The processes of one robot.
 
     Attributes:
-        block: what they share.
         bridge_side: this process's ends of the queues for requests and goals.
         grants: what the real-time process was granted or refused, as plain values.
         problem: what was wrong with a plant in FAULT when the loop last stood still, in words.
 
     Args:
         mirror: a host like the one that is to run; this process's image of the robot.
-        config: the robot's configuration.
-        name: name of the running robot, for `bhd-monitor`.
-
-    Raises:
-        ConfigError: the plant's time-out is shorter than two control ticks.
-        RealtimeError: a process could not be started, or real time is required and was refused.
     """
 
     def __init__(self, mirror: Host, config: Any, name: str) -> None:
@@ -197,11 +190,7 @@ class LiveLink:
             self._running = False
 
     def check(self) -> None:
-        """Raise if a process has ended, or the plant's is stopped.
-
-        Raises:
-            RealtimeError: names it, and what became of the robot.
-        """
+        """Raise if a process has ended, or the plant's is stopped."""
         for name, process in self._processes.items():
             status = process.poll()
             if status is not None:
@@ -253,11 +242,7 @@ class LiveLink:
             self.block.show_life(Word.BRAIN_ALIVE)
 
     def wait(self) -> None:
-        """Wait for about a tick.
-
-        Raises:
-            RealtimeError: a process has ended.
-        """
+        """Wait for about a tick."""
         self.check()
         time.sleep(0.0005)
 

@@ -27,9 +27,7 @@ class PlantTick:
     """A tick of the plant, for its state.
 
     Attributes:
-        slot: the tick.
         start_ns: when it started, monotonic [ns].
-        grid: what the loop has done so far.
         actuators: what the actuators got, shape (1, joints).
     """
 
@@ -59,14 +57,7 @@ class PlantLoop:
     """Runs the ticks of a plant, each half a period after one of the cerebellum's.
 
     Args:
-        world: what is run.
-        guard: whose commands count.
-        stop: what the actuators get when the plant stops by itself.
-        words: the block's words.
-        joints: number of actuators.
         control_hz: ticks a second [Hz].
-        most_catch_up: so many missed ticks at the most are caught up at once.
-        is_orphan: whether the brain's process is gone.
         clock: monotonic time [ns].
         sleep: waits for a time [s].
     """
@@ -123,9 +114,7 @@ class PlantLoop:
         """Run one tick.
 
         Args:
-            slot: the tick.
             now_ns: the time [ns].
-            grid: the grid that it lies on.
         """
         guard, world, reading = self.guard, self.world, self.reading
         stops = guard.stops

@@ -94,15 +94,7 @@ class SensedWorld:
 
 
 class PlantProcess:
-    """The process's side of the pipe.
-
-    Args:
-        spec: what to run.
-        connection: the pipe to the brain's process.
-
-    Raises:
-        RealtimeError: the block is that of a robot without a plant's process.
-    """
+    """The process's side of the pipe."""
 
     def __init__(self, spec: LiveSpec, connection: Connection) -> None:
         self._connection = connection

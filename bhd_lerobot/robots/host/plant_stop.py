@@ -30,11 +30,7 @@ class PlantStop(Protocol):
 
 
 class WheelStop:
-    """Wheels that are commanded to stand.
-
-    Args:
-        joints: number of wheels.
-    """
+    """Wheels that are commanded to stand."""
 
     def __init__(self, joints: int) -> None:
         self._actuators = np.zeros((1, joints))
@@ -57,9 +53,6 @@ class ServoStop:
 
     Attributes:
         hold: where the joints are held [rad], the opening last [m], shape (1, joints).
-
-    Args:
-        arm: the arm.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -87,11 +80,7 @@ class ServoStop:
 
 
 class TorqueStop:
-    """Torque motors that carry the arm's weight, brake it, and then hold it where it is.
-
-    Args:
-        arm: the arm.
-    """
+    """Torque motors that carry the arm's weight, brake it, and then hold it where it is."""
 
     def __init__(self, arm: Arm) -> None:
         self._where = ServoStop(arm)
@@ -117,12 +106,7 @@ class TorqueStop:
 
 
 def make_stop(body: Body, joints: int) -> PlantStop:
-    """Return how a robot is stopped.
-
-    Args:
-        body: the robot.
-        joints: number of its actuators.
-    """
+    """Return how a robot is stopped."""
     if not isinstance(body, Arm):
         return WheelStop(joints)
     return TorqueStop(body) if body.actuation == "torque" else ServoStop(body)

@@ -53,12 +53,6 @@ class LiveSpec:
     Attributes:
         host: module and class of the simulation, or of the host of a plant, ``"package.module:Class"``.
         plant: module and class of the plant that is driven; empty for a simulated one.
-        values: the robot's configuration as plain values.
-        rates: the rates.
-        body: the hardware.
-        block: name of the shared block.
-        privileges: what to ask the system for.
-        limits: when the loop stops the robot.
     """
 
     host: str
@@ -81,11 +75,7 @@ class LiveSpec:
         return max(3 * NANOSECONDS // self.rates.control_hz, round(self.limits.plant_timeout_s * NANOSECONDS))
 
     def make_simulation(self, planning: Planning | None = None) -> Simulation:
-        """Return a simulation of one robot.
-
-        Args:
-            planning: who plans its goals, for an arm that takes goals.
-        """
+        """Return a simulation of one robot."""
         kind = _load(self.host)
         made: Simulation = kind(self._config, 1, 1) if planning is None else kind(self._config, 1, 1, planning)
         return made
@@ -107,12 +97,7 @@ def _load(name: str) -> Any:
 
 
 class LiveProcess:
-    """The process's side of the pipe.
-
-    Args:
-        spec: what to run.
-        connection: the pipe to the brain's process.
-    """
+    """The process's side of the pipe."""
 
     def __init__(self, spec: LiveSpec, connection: Connection) -> None:
         self._connection = connection
@@ -208,11 +193,7 @@ class LiveProcess:
         self._warm = True
 
     def _run(self, start_ns: int) -> tuple[int, int, str]:
-        """Run a segment that begins at a monotonic time [ns].
-
-        Returns:
-            How many ticks were executed and skipped, and what is wrong with a plant that is in FAULT, in words.
-        """
+        """Run a segment that begins at a monotonic time [ns]."""
         self._statistics.reset()
         self._publisher.restart(int(self._words[Word.SEGMENT]) + 1)
         # What is so before the first tick: the first frame's observation.
@@ -276,14 +257,7 @@ class Worker(Protocol):
 
 
 def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
-    """Run a real-time process; the program's one argument is the descriptor of its pipe.
-
-    Args:
-        make: makes what it runs, from what the brain's process sends and the pipe.
-
-    Returns:
-        The process's exit status.
-    """
+    """Run a real-time process; the program's one argument is the descriptor of its pipe."""
     connection = Connection(int(sys.argv[1]))
     # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

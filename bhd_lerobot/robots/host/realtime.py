@@ -37,15 +37,10 @@ class LiveFrame:
     """A frame that went by on the wall clock.
 
     Attributes:
-        number: its number in the episode.
-        seen: the observation that it began with.
         physics: the simulator's generalised positions and velocities at its start, shape (1, nq + nv).
         requested: the last setpoint of the brain by its end, in the space of the actions, shape (1, actions).
-        end: the state at its end.
-        touches: what was touched during it, by kind.
         lateness_ns: the latest start of one of its ticks [ns].
         overruns: its ticks that ended after the next was due.
-        skipped: its ticks that were skipped.
     """
 
     number: int
@@ -261,11 +256,7 @@ class LiveHost(Host):
         return self.live_bridge.send_chunk(rows, int(self._boundary["frame"]) * self._frame_ns)
 
     def _frame(self, receipt: Receipt) -> FrameReport:
-        """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report.
-
-        Raises:
-            RealtimeError: a process has ended or is stuck.
-        """
+        """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report."""
         # Boundary k is the end of tick k F - 1, one period before k frames.
         now = time.monotonic_ns() - self._origin
         last = max(int(self._boundary["frame"]) + 1, now // self._frame_ns + 1)

@@ -31,13 +31,6 @@ class RemoteSimulation(Simulation):
     """One robot with its cerebellum here and its world in another process.
 
     The own world is never stepped: it is put into what the plant publishes.
-
-    Attributes:
-        remote: the plant.
-
-    Args:
-        own: a simulation of one robot, of the same kind as that in the plant's process.
-        link: what both processes share.
     """
 
     def __init__(self, own: Simulation, link: PlantLink) -> None:

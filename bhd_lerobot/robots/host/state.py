@@ -67,7 +67,6 @@ class StatePublisher:
     """Publishes the states of one robot, into a ring.
 
     Args:
-        host: the robot.
         ring: where they go, of dtype `state_dtype(host)`.
         clock: monotonic time [ns].
     """
@@ -100,10 +99,8 @@ class StatePublisher:
         """Publish the state at the end of a tick.
 
         Args:
-            slot: the tick.
             start_ns: when it started [ns].
             ended_ns: when its predecessor ended [ns].
-            grid: what the loop has done so far.
         """
         host, cerebellum, field = self._host, self._cerebellum, self._field
         self._count(slot)

@@ -67,17 +67,7 @@ class ExportOptions:
 
 
 class EpisodeTopics:
-    """Makes the topics of a dataset's episodes; the clock goes on from one to the next.
-
-    Args:
-        state: the dataset.
-        view: what is known of the robot.
-        repo_id: name of the dataset.
-        options: how bags are written.
-
-    Raises:
-        UnsupportedDatasetError: the dataset holds something that no message is made for.
-    """
+    """Makes the topics of a dataset's episodes; the clock goes on from one to the next."""
 
     def __init__(self, state: DatasetState, view: views.RobotView, repo_id: str, options: ExportOptions) -> None:
         self._state, self._view, self._repo_id, self._options = state, view, repo_id, options

@@ -27,11 +27,8 @@ def frame_columns(
     """Return the columns of an episode.
 
     Args:
-        options: what becomes of the bag.
-        tracks: by role, each sorted by time.
         times: of the frames [ns], shape (n,).
         ages: of the oldest of each frame's newest readings [ns], shape (n,).
-        outcome: what the episode ended with, if that is known.
     """
     n = len(times)
     commands, command_age = _commands(options, tracks, times)
@@ -101,10 +98,7 @@ def unexplained_frames(
     """Return in how many frames the robot moves without a command, and in how many it stands against one.
 
     Args:
-        options: what becomes of the bag.
-        tracks: by role, each sorted by time.
         times: of the frames [ns], shape (n,).
-        timeout_s: silence after which a command is no longer in force.
     """
     commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
     moves = _moves(options, _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times))

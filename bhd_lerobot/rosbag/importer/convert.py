@@ -165,11 +165,7 @@ class _Recording:
         return self._recorder
 
     def refuse_again(self, bag: Path, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.
-
-        Raises:
-            DatasetError: it is. No two drives have the same numbers at the same nanosecond.
-        """
+        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage."""
         vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
         numbers = (start, *(crc32(values.tobytes()) for values in vectors))
         if numbers in self._seen:
@@ -182,11 +178,7 @@ class _Recording:
 
 @dataclass(frozen=True)
 class _Episode:
-    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time.
-
-    Attributes:
-        exported: its description, if `bhd-data export` wrote the bag.
-    """
+    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time."""
 
     grid: Grid
     tracks: Mapping[str, Track]
@@ -211,11 +203,7 @@ class _RobotBag:
         self._check_clocks()
 
     def _check_clocks(self) -> None:
-        """Check that commands and sensors are of one time.
-
-        Raises:
-            DatasetError: they are not: a bare Twist has the recorder's time, and headers may have a simulation's.
-        """
+        """Check that commands and sensors are of one time."""
         if "cmd" not in self._tracks:
             return
         cmd = self._tracks["cmd"].times
@@ -230,11 +218,7 @@ class _RobotBag:
             )
 
     def episodes(self) -> Iterator[_Episode]:
-        """Yield the episodes in order.
-
-        Raises:
-            DatasetError: the pose that is to be observed jumps all the time.
-        """
+        """Yield the episodes in order."""
         options = self._options
         parts = segments(
             self._tracks,
@@ -273,11 +257,7 @@ class _RobotBag:
                     )
 
     def check_commands(self, episodes: Sequence[_Episode]) -> None:
-        """Check that commands explain how the robot moves, unless the user said how long they are in force.
-
-        Raises:
-            DatasetError: they do not; says what the user may choose, and what each choice gives.
-        """
+        """Check that commands explain how the robot moves, unless the user said how long they are in force."""
         options, n = self._options, sum(len(episode.grid.times) for episode in episodes)
         if "cmd" not in self._tracks:
             return
@@ -305,11 +285,7 @@ class _RobotBag:
         )
 
     def save(self, episode: _Episode) -> int:
-        """Save an episode and return its number of frames.
-
-        Raises:
-            DatasetError: its images cannot be decoded, or it was saved before.
-        """
+        """Save an episode and return its number of frames."""
         recorder = self._recording.recorder(self._cameras)
         episode = self._with_images(episode)
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)

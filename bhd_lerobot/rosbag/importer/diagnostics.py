@@ -36,11 +36,7 @@ def pace(received: Times, stamps: Times) -> float:
 
 
 def pace_warnings(paces: Mapping[str, float]) -> list[str]:
-    """Return, in sentences, which topics' headers are of a clock that is slower or faster than the recorder's.
-
-    Args:
-        paces: topic -> its `pace`.
-    """
+    """Return, in sentences, which topics' headers are of a clock that is slower or faster than the recorder's."""
     other = {topic: pace for topic, pace in paces.items() if abs(pace - 1) > _PACE}
     if not other:
         return []
@@ -58,7 +54,6 @@ def speed_warnings(topic: str, times: Times, speeds: Array, pose: Array) -> list
     So it is if a driver fills in the pose alone, or writes degrees.
 
     Args:
-        topic: its name.
         times: of the messages [ns], shape (n,).
         speeds: forward and turning [m/s, rad/s], shape (n, 2).
         pose: x, y and unwrapped yaw [m, m, rad], shape (n, 3).

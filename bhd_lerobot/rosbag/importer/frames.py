@@ -41,11 +41,7 @@ def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
 
 
 def the_frame(topic: str, frames: Sequence[str]) -> str:
-    """Return the one frame that all messages of a topic are in.
-
-    Raises:
-        DatasetError: there are several.
-    """
+    """Return the one frame that all messages of a topic are in."""
     names, counts = np.unique(np.array(frames, dtype=str), return_counts=True)
     if len(names) > 1:
         found = ", ".join(f"{str(name)!r} in {count} messages" for name, count in zip(names, counts, strict=True))
@@ -60,14 +56,9 @@ def scanner_rotation(topic: str, frame: str, static: Static, given: str | None, 
     """Return how the scanner is turned in the robot, shape (3, 3), and where that is known from.
 
     Args:
-        topic: of the scans.
         frame: that they are in.
-        static: the bag's static transforms.
         given: the scanner's frame, if the user names it.
         yaw: the scanner's angle in the robot [rad], if the user gives it.
-
-    Raises:
-        DatasetError: the frame is not known.
     """
     rotation = _from_base(frame, static)
     known = rotation is not None or frame == given or _last(frame) == SCAN_FRAME
@@ -85,11 +76,7 @@ def scanner_rotation(topic: str, frame: str, static: Static, given: str | None, 
 
 
 def check_base_frame(topic: str, frame: str, given: str | None) -> None:
-    """Check that odometry is of the robot's base.
-
-    Raises:
-        DatasetError: it is of something else.
-    """
+    """Check that odometry is of the robot's base."""
     if frame and _last(frame) not in BASE_FRAMES and frame != given:
         raise DatasetError(
             f"The speeds of {topic} are of the frame {frame!r} (child_frame_id), not of {' or '.join(BASE_FRAMES)}. If "

@@ -37,7 +37,6 @@ def message_times(received: Times, stamps: Times | None, policy: str, tolerance_
     """Return when messages happened [ns], shape (n,).
 
     Args:
-        received: when the recorder got them.
         stamps: of their headers; None if they have none.
         policy: ``"header"`` or ``"receive"`` take one of them; ``"auto"`` takes the headers' of a topic if nearly all
             of them are sane: before the message was received, and not by more than the tolerance. Two clocks in one
@@ -76,13 +75,7 @@ def apart(one: tuple[Times, Times], other: tuple[Times, Times]) -> int:
 
 
 def clock_jumps(times: Sequence[Times], order: Sequence[Times], step_ns: int = STEP_BACK_NS) -> Times:
-    """Return where the clock jumped back: places in the bag's order, of the first message after each jump.
-
-    Args:
-        times: of each topic's messages, in the order in which they were written.
-        order: their places among all messages of the bag.
-        step_ns: by how much a clock that has jumped goes back.
-    """
+    """Return where the clock jumped back: places in the bag's order, of the first message after each jump."""
     if not any((np.diff(reading) < -step_ns).any() for reading in times):
         return np.zeros(0, np.int64)  # a bag may also have been written topic by topic
     places = np.concatenate(list(order))
@@ -115,11 +108,7 @@ def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: 
     have readings older than `max_age_ns` are left out.
 
     Args:
-        sensors: times of each sensor's messages, ascending.
         fps: frames a second.
-        max_age_ns: age at which a reading is too old.
-        max_gap_ns: silence that ends an episode, at least `max_age_ns`.
-        why: what began the first one.
     """
     if not sensors or any(not len(times) for times in sensors):
         return []

@@ -26,7 +26,6 @@ def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: floa
 
     Args:
         ranges: as they came [m].
-        lidar: the scanner that the dataset is of.
         range_min: of the scanner that measured [m].
         range_max: of the same; one that is not positive is none.
     """
@@ -50,17 +49,7 @@ class Sweep(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: str) -> NDArray[np.intp]:
-    """Return which measured beam is nearest to each of ours, shape (beams,).
-
-    Args:
-        sweep: what was measured.
-        beams: how many are wanted.
-        rotation: of the scanner in the robot, a rotation matrix, row by row.
-        topic: for messages.
-
-    Raises:
-        DatasetError: one of ours has none nearby: the scanner does not see all around. Or the angles cannot be true.
-    """
+    """Return which measured beam is nearest to each of ours, shape (beams,)."""
     count, angle_min, angle_increment = sweep
     if abs(angle_increment) * (count - 1) > _MOST:
         raise DatasetError(
@@ -98,15 +87,8 @@ def resampled_scans(
     """Return scans with our beams, shape (n, beams) [m]; not a number where a scan is none: without beams or angles.
 
     Args:
-        ranges: of n scans, each of any length.
         geometry: ``angle_min``, ``angle_increment`` [rad], ``range_min`` and ``range_max`` [m] of each, shape (n,).
-        lidar: the scanner that the dataset is of.
-        beams: how many are wanted.
         rotation: of the scanner in the robot, a rotation matrix, shape (3, 3).
-        topic: for messages.
-
-    Raises:
-        DatasetError: most scans do not see all around, or have impossible angles; single ones that do not are lost.
     """
     n = len(ranges)
     result = np.empty((n, beams))

@@ -51,15 +51,7 @@ def segments(
     """Return the parts of a bag between its breaks, in order.
 
     Args:
-        tracks: by role.
-        starts: places at which episodes of an exported bag begin.
-        stamps: whose time counts, see `ImportOptions.stamps`.
         max_speed: of the robot forward [m/s] and turning [rad/s], if its pose matters; None if it does not.
-        max_gap_s: silence that ends an episode anyway.
-        notes: what is found is added to it.
-
-    Raises:
-        DatasetError: the pose jumps all the time.
     """
     every = list(tracks.values())
     step = CLOCK_STEP_NS if stamps == "receive" else STEP_BACK_NS
@@ -142,7 +134,6 @@ def silence_notes(sensors: Mapping[str, Track], start: int, gap: int) -> list[st
     """Return, in sentences, where a sensor was silent in a segment: at its beginning, within it, or at its end.
 
     Args:
-        sensors: tracks of the segment, sorted by time.
         start: of the bag [ns].
         gap: silence that is reported [ns].
     """

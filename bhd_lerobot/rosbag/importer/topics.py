@@ -16,11 +16,7 @@ _NAMED = 6  # joints
 
 
 def _refuse_arm(bag: Bag) -> None:
-    """Refuse a bag of an arm: it has joints that are no wheels, no scans and no odometry.
-
-    Raises:
-        DatasetError: it is of an arm; names its joints.
-    """
+    """Refuse a bag of an arm: it has joints that are no wheels, no scans and no odometry."""
     if any(topic.msgtype in _BASE and topic.count for topic in bag.topics.values()):
         return
     for topic in bag.topics.values():
@@ -65,12 +61,7 @@ def wanted_topics(bag: Bag, names: Mapping[str, str]) -> dict[str, Topic]:
     """Return the topics that roles are read from.
 
     Args:
-        bag: the bag.
         names: role, a key of `TYPES`, of a camera with its name behind a slash -> topic; ``scan`` is ``/scan``, too.
-
-    Raises:
-        DatasetError: the bag is of another robot; topics are missing or empty, all of which are named; or one is of
-            another type, of two types, or not in ROS 2's serialisation.
     """
     found = {role: bag.topics.get(name) or bag.topics.get(other_form(name)) for role, name in names.items()}
     lacking = [_lacking(bag, role, names[role], topic) for role, topic in found.items() if not topic or not topic.count]
@@ -120,11 +111,7 @@ def _checked(bag: Bag, role: str, topic: Topic) -> Topic:
 
 
 def exported_topic(bag: Bag, role: str, part: Part) -> Topic:
-    """Return the topic of an exported bag that carries numbers of a feature.
-
-    Raises:
-        DatasetError: it is missing, empty or of another type.
-    """
+    """Return the topic of an exported bag that carries numbers of a feature."""
     topic = bag.topics.get(part.topic)
     if topic is None or not topic.count:
         raise DatasetError(

@@ -34,13 +34,10 @@ class Track:
     """Messages of one topic, in the order in which they were written.
 
     Attributes:
-        topic: its name.
-        msgtype: their type.
         times: when they happened [ns], shape (n,).
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
         stamps: of their headers [ns], shape (n,); None if they have none.
-        names: of the numbers in the dataset, in order.
     """
 
     topic: str
@@ -64,16 +61,7 @@ class Track:
 
 
 def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str, Track]:
-    """Return the tracks of a bag by role; cameras' as ``camera/<name>``.
-
-    Args:
-        bag: the bag.
-        options: what is wanted.
-        notes: what the user should know is added to it.
-
-    Raises:
-        DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
-    """
+    """Return the tracks of a bag by role; cameras' as ``camera/<name>``."""
     wanted = wanted_topics(bag, {role: topic for role, topic in options.topic_of.items() if role not in options.parts})
     cameras = {role: wanted.pop(role) for role in list(wanted) if role.startswith("camera/")}
     wanted |= {role: exported_topic(bag, role, part) for role, part in options.parts.items()}
@@ -133,11 +121,7 @@ def _unset(role: str, decoded: Sequence[Any], options: ImportOptions) -> NDArray
 
 
 def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:
-    """Check that the messages of all topics are of one time.
-
-    Raises:
-        DatasetError: they are not: a bare Twist has the recorder's time, and headers may have another computer's.
-    """
+    """Check that the messages of all topics are of one time."""
     for topic, clock in clocks.items():
         ahead = apart(clock, clocks[reference])
         if abs(ahead) > _APART_NS:
@@ -159,9 +143,6 @@ def _decoded(bag: Bag, topic: Topic, messages: Messages) -> tuple[Messages, list
     """Return the messages of a topic that can be read, and what is in them; of cameras, nothing is.
 
     The others are as if they had been lost, and are counted. An image that is cut off is found when it is decoded.
-
-    Raises:
-        DatasetError: too many cannot be read.
     """
     is_camera = topic.msgtype in TYPES["camera"]
     decoded: list[Any] = []

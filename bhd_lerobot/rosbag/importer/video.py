@@ -20,18 +20,7 @@ _TRIED = 10  # images at the beginning, of which one must be readable
 
 
 class CameraImages:
-    """One camera.
-
-    Attributes:
-        role: of its track.
-        name: of the camera.
-
-    Args:
-        bag: the bag.
-        role: of its track.
-        track: all of its messages.
-        notes: what is left out is added to it.
-    """
+    """One camera."""
 
     def __init__(self, bag: Bag, role: str, track: Track, notes: list[str]) -> None:
         self.role, self.name = role, role.removeprefix(CAMERA)
@@ -41,11 +30,7 @@ class CameraImages:
         self._image: NDArray[np.uint8] | None = None  # of that message, once it is decoded
 
     def shape(self) -> tuple[int, int, int]:
-        """Return the shape of its images.
-
-        Raises:
-            DatasetError: none of the first ones can be decoded.
-        """
+        """Return the shape of its images."""
         height, width, channels = self._decode(
             self._track, self._first(self._track, range(len(self._track.times)))
         ).shape
@@ -55,11 +40,7 @@ class CameraImages:
         """Return how many frames at the beginning of an episode have no image that can be decoded.
 
         Args:
-            track: the camera's messages in the segment in which the episode lies, sorted by time.
             times: of the frames [ns].
-
-        Raises:
-            DatasetError: none of the first images can.
         """
         rows, first = np.unique(newest(track.times, times), return_index=True)
         return int(first[rows == self._first(track, rows.tolist())][0])
@@ -71,12 +52,7 @@ class CameraImages:
         is there in its place, with its age.
 
         Args:
-            track: as in `blind`.
             times: of the frames [ns]; the first one has an image that can be decoded.
-            writer: the episode.
-
-        Raises:
-            DatasetError: too many cannot be decoded.
         """
         rows = newest(track.times, times)
         total = len(np.unique(rows))
@@ -107,11 +83,7 @@ class CameraImages:
         return track.times[shown]
 
     def _first(self, track: Track, rows: Sequence[int]) -> int:
-        """Return the first of some messages that can be decoded.
-
-        Raises:
-            DatasetError: none of the first ten can; gives the reason of the first.
-        """
+        """Return the first of some messages that can be decoded."""
         reason: DatasetError | None = None
         for row in rows[:_TRIED]:
             try:

@@ -42,11 +42,7 @@ def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, com
 
 
 def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
-    """Return the image in a message, shape (H, W, 3).
-
-    Raises:
-        DatasetError: it has an encoding that is not known, or is damaged.
-    """
+    """Return the image in a message, shape (H, W, 3)."""
     found = decode(msgtype, message)
     if msgtype == COMPRESSED:
         return _decompressed(topic, found.format, found.data)

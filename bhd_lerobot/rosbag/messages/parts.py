@@ -73,7 +73,6 @@ class Part(ABC):
     """Numbers of a feature that one topic carries.
 
     Attributes:
-        topic: the topic.
         names: of the numbers, in the order in which they are given and taken.
     """
 
@@ -88,18 +87,10 @@ class Part(ABC):
 
     @abstractmethod
     def decode(self, messages: Sequence[Any]) -> Array:
-        """Return the values in deserialised messages, shape (n, len(names)).
-
-        Raises:
-            DatasetError: they are not what this part writes.
-        """
+        """Return the values in deserialised messages, shape (n, len(names))."""
 
     def table(self, rows: Sequence[Sequence[float]]) -> Array:
-        """Return rows of numbers as an array, shape (n, len(names)).
-
-        Raises:
-            DatasetError: one has another length.
-        """
+        """Return rows of numbers as an array, shape (n, len(names))."""
         if any(len(row) != len(self.names) for row in rows):
             raise DatasetError(f"{self.topic} does not have {len(self.names)} numbers in each message.")
         return np.array(rows, np.float64).reshape(-1, len(self.names))

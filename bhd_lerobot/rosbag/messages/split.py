@@ -47,12 +47,7 @@ def parts_of(
     """Return what carries a vector of floats; every name is in exactly one part.
 
     Args:
-        key: the feature.
-        names: of its numbers.
-        robot_type: of a robot whose body is not known, units are not known either, and `Numbers` carry everything.
-        lidar: of the robot, if it has one.
         noise: of what it measures of its own motion, if it is known; only needed to write.
-        bare_twist: commands of a base without stamps.
     """
     left = list(names)
     parts: list[Part] = []
@@ -85,11 +80,7 @@ def parts_of(
 
 
 def check_topics(parts: Iterable[Part]) -> None:
-    """Check that no two parts share a topic.
-
-    Raises:
-        UnsupportedDatasetError: two do.
-    """
+    """Check that no two parts share a topic."""
     seen: set[str] = set()
     for part in parts:
         if part.topic in seen:

@@ -148,9 +148,6 @@ def type_store() -> Any:
     """Return `rosbags`' store of the standard types and ours.
 
     The standard types that are used here are the same in all distributions since Foxy.
-
-    Raises:
-        ConfigError: `rosbags` is not installed.
     """
     require_rosbags()
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -35,15 +35,9 @@ class McapFile:
     Attributes:
         channels: number -> topic, type, serialisation; those read so far.
         profiles: number -> quality of service of the topic's publishers, as the recorder wrote it.
-        budget: how much it may still unpack to.
-        problems: what could not be read, in sentences.
 
     Args:
-        path: the file.
         budget: how much it may unpack to; by its own size if None.
-
-    Raises:
-        DatasetError: it is no MCAP file.
     """
 
     def __init__(self, path: Path, budget: Budget | None = None) -> None:
@@ -79,11 +73,7 @@ class McapFile:
         return counts if counts.keys() <= self.channels.keys() else None
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel, receive time [ns] and bytes of each message, in the file's order.
-
-        Raises:
-            DatasetError: it unpacks to more than any recording does, or its compression is not known.
-        """
+        """Yield channel, receive time [ns] and bytes of each message, in the file's order."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Chunk, DataEnd, Message
 

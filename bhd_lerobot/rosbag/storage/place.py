@@ -36,13 +36,6 @@ def complete_or_not(target: Path, option: str, action: str, consequence: str) ->
 
     Args:
         target: its place; nothing may be there but an empty folder.
-        option: what named it, for the error.
-        action: what is being done, for the error.
-        consequence: what is intact if it fails.
-
-    Raises:
-        DatasetExistsError: something is there, or came there meanwhile.
-        DatasetWriteError: it cannot be written.
     """
     with (
         write_errors(action, target, consequence),

@@ -31,9 +31,6 @@ class Topic:
 
     Attributes:
         name, msgtype: what it is called, and the type of most of its messages.
-        count: how many messages it has.
-        others: other types of which it has messages, too.
-        serialisation: of its messages.
         connections: messages of each connection (of a publisher, if the recorder kept them apart) in one of the bag's
             files; empty if there is but one.
         publishers: how many offered it when the recorder subscribed; 0 if that is not known.

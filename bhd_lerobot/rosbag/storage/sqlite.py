@@ -18,17 +18,10 @@ class SqliteFile:
     """One file.
 
     Attributes:
-        channels: number -> topic, type, serialisation.
         profiles: number -> quality of service of the topic's publishers, where the recorder wrote it.
-        budget: how much compressed messages may still unpack to.
-        problems: what could not be read, in sentences.
 
     Args:
-        path: the file.
         budget: how much may be unpacked; by its own size if None.
-
-    Raises:
-        DatasetError: it is no bag, or not even its list of topics can be read.
     """
 
     def __init__(self, path: Path, budget: Budget | None = None) -> None:
@@ -104,12 +97,7 @@ class SqliteFile:
                 )
 
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
-        """Yield rows; together they have no more bytes than the file.
-
-        Raises:
-            DatasetError: they have.
-            sqlite3.Error: they cannot be read.
-        """
+        """Yield rows; together they have no more bytes than the file."""
         left = self._bytes
         for row in self._connection.execute(query):
             left -= sum(max(len(value), 1) if isinstance(value, str | bytes) else 1 for value in row)
@@ -153,11 +141,7 @@ class SqliteFile:
         return dict.fromkeys(self.channels, 0) | rows
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield topic, receive time [ns] and bytes of each message, as they were written.
-
-        Raises:
-            DatasetError: there are more than the file can hold.
-        """
+        """Yield topic, receive time [ns] and bytes of each message, as they were written."""
         self.problems = []
         self.budget.start()
         self._bound()

@@ -23,11 +23,7 @@ _BLOCK = 1 << 20
 
 
 class Budget:
-    """How much may still be unpacked of a file.
-
-    Args:
-        path: the file.
-    """
+    """How much may still be unpacked of a file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -39,11 +35,7 @@ class Budget:
         self.left = self._most
 
     def take(self, size: int) -> None:
-        """Count what is unpacked, or what is declared before it is.
-
-        Raises:
-            DatasetError: it is more than the file may unpack to.
-        """
+        """Count what is unpacked, or what is declared before it is."""
         self.left -= size
         if self.left < 0:
             raise DatasetError(
@@ -56,14 +48,8 @@ class Budget:
         """Return what is compressed.
 
         Args:
-            name: how: `zstd` or `lz4`.
-            data: what is compressed.
             declared: the size that the file declares [bytes]; one byte more at most is unpacked, and of data that are
                 cut off, as much as there is. If None, the data must be whole.
-
-        Raises:
-            DatasetError: it is more than the file may unpack to, or the compression is not known.
-            ValueError: the data are cut off; other faults raise what the library raises.
         """
         decompressor = _decompressor(name, self.path)
         content: bytes = decompressor.decompress(data, min(self.left, declared or self.left) + 1)
@@ -88,11 +74,7 @@ def zstd() -> Any:
 
 @contextlib.contextmanager
 def plain_file(path: Path) -> Iterator[Path]:
-    """Give a file without the compression around it.
-
-    Raises:
-        DatasetError: it cannot be decompressed, unpacks to too much, or there is no room for it.
-    """
+    """Give a file without the compression around it."""
     if path.suffix != ".zstd":
         yield path
         return
@@ -102,16 +84,7 @@ def plain_file(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def temporary_copy(path: Path, name: str, blocks: Iterable[bytes]) -> Iterator[Path]:
-    """Give a file in a temporary folder of its own, which only this user can read.
-
-    Args:
-        path: what it is made of, for the error.
-        name: its name.
-        blocks: its content.
-
-    Raises:
-        DatasetError: there is no room for it.
-    """
+    """Give a file in a temporary folder of its own, which only this user can read."""
     with contextlib.ExitStack() as stack:
         with room(path):
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="bhd-bag-"))

@@ -20,8 +20,6 @@ class Stream:
     """The messages of one topic.
 
     Attributes:
-        topic: its name.
-        msgtype: of its messages.
         messages: when each was received [ns], in order, and its bytes.
         latched: late subscribers get the last message, too (transient local).
     """
@@ -37,11 +35,6 @@ class BagWriter:
 
     Args:
         path: the folder to write; it must not exist.
-        storage: one of `FORMATS`.
-        custom: texts to keep in the bag's metadata.
-
-    Raises:
-        ConfigError: there is no such storage, or the extra ``ros2`` is not installed.
     """
 
     def __init__(self, path: Path, storage: str, custom: Mapping[str, str]) -> None:
