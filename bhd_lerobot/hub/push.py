@@ -23,7 +23,6 @@ def push_dataset(
     licence: str = "apache-2.0",
     card: bool = True,
     replace: bool = False,
-    verify: bool = False,
     storage: str | None = None,
     again: str | None = None,
 ) -> "PushReport":
@@ -39,7 +38,6 @@ def push_dataset(
         licence: licence of the card.
         card: whether a card is made.
         replace: overwrite a dataset there that is another one, or has more episodes.
-        verify: read what lies below a URL and compare that, instead of the list of it.
         storage: options of the URL's file system, JSON.
         again: the command to repeat.
 
@@ -60,7 +58,7 @@ def push_dataset(
     quiet_bars()
     try:
         remote = remote_of(target, storage, revision=branch, private=private, tag=tag, create=True)
-        return push(root, remote, make_card=make if card else None, replace=replace, verify=verify)
+        return push(root, remote, make_card=make if card else None, replace=replace)
     except ConfigError:
         raise
     except BhdError as error:
@@ -75,7 +73,7 @@ def push_command(root: Path, target: str, *, private: bool = False, tags: Sequen
 
 def left_by_interrupt(root: Path, again: str) -> str:
     """Return what an interrupted push leaves, and how to go on."""
-    return f"the dataset at {root} is unchanged, and what arrived is not sent again. Go on with:\n  {again}"
+    return f"the dataset at {root} is unchanged. Go on with:\n  {again}"
 
 
 def check_pushable(repo_id: str) -> None:

@@ -68,12 +68,13 @@ class DatasetState:
         """Camera features."""
         return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
-    def files(self) -> set[str]:
-        """Return all files of committed episodes, relative to the root."""
-        names = {layout.data_file(slot_of(row, "data")) for row in self.rows}
-        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in self.rows}
+    def files(self, episodes: Iterable[int] | None = None) -> set[str]:
+        """Return all files of some committed episodes, or of all, relative to the root."""
+        rows = self.rows if episodes is None else [self.rows[episode] for episode in episodes]
+        names = {layout.data_file(slot_of(row, "data")) for row in rows}
+        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in rows}
         for key in self.video_keys:
-            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in self.rows}
+            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in rows}
         return names
 
 
@@ -142,11 +143,12 @@ def no_dataset(root: Path) -> DatasetError:
     return DatasetError(message + hint)
 
 
-def load_state(root: Path, *, videos: bool = True, counted: bool = True) -> DatasetState:
+def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
 
     Args:
         root: the dataset.
+        files: whether data and videos must be there; else only the metadata are read.
         videos: whether videos must be there, too.
         counted: whether ``info.json`` must count the frames that the episodes have.
 
@@ -174,7 +176,8 @@ def load_state(root: Path, *, videos: bool = True, counted: bool = True) -> Data
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
-        _check_files(state, videos, counted)
+        if files:
+            _check_files(state, videos, counted)
     return state
 
 

@@ -183,15 +183,14 @@ def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_p
     assert stored(hub)["same.txt"] == b"mine"
 
 
-def test_the_list_of_files_of_a_url_is_not_sent(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    """A folder that was pushed to as a URL is a dataset as well."""
+def test_the_checksums_of_version_0_2_are_not_copied_and_go(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
     shelf = tmp_path / "shelf"
     push(root, StoreDataset(f"file://{shelf}"))
-    assert (shelf / MANIFEST).is_file()
+    (shelf / MANIFEST).write_text("{}")
     assert MANIFEST not in send(shelf).sent
     assert stored(hub) == content(root)
-    # One that an earlier version sent goes, and does not come along.
-    hub.dataset("me/d").files()[MANIFEST] = hub.dataset("me/d").files()[layout.INFO]
-    pull(HubDataset("me/d"), tmp_path / "e")
+    pull(StoreDataset(f"file://{shelf}"), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
-    assert send(root).deleted == [MANIFEST]
+    assert push(root, StoreDataset(f"file://{shelf}")).deleted == [MANIFEST]
