@@ -9,7 +9,6 @@ from typing import Any
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
-from bhd_lerobot.renames import present
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -71,7 +70,7 @@ def check_identity(
     recorded["features"] = comparable(state.info["features"])
     requested["features"] = comparable(schema.features)
     if recording is not None:
-        recorded["recording"], requested["recording"] = present(state.identity["recording"]), as_json(recording)
+        recorded["recording"], requested["recording"] = _present(state.identity["recording"]), as_json(recording)
     if video is not None:
         recorded["video"], requested["video"] = state.identity["video"], as_json(video)
     found = list(differences("", recorded, requested))
@@ -130,3 +129,17 @@ def default_root(repo_id: str) -> Path:
     from huggingface_hub.constants import HF_HOME
 
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser() / repo_id
+
+
+_RENAMED = {"corrected": "dagger"}
+"""Types of brains in the metadata of version 0.1: old to new."""
+
+
+def _present(recorded: Any) -> Any:
+    """Return metadata of a recording, as plain values, with the present names of what was renamed."""
+    if isinstance(recorded, Mapping):
+        values = {key: _present(value) for key, value in recorded.items()}
+        if isinstance(values.get("type"), str):
+            values["type"] = _RENAMED.get(values["type"], values["type"])
+        return values
+    return [_present(value) for value in recorded] if isinstance(recorded, list) else recorded
