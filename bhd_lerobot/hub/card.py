@@ -40,13 +40,7 @@ class CardOptions:
 
 
 def make_card(state: DatasetState, options: CardOptions, *, has_image: bool = False) -> Card:
-    """Return the card of a dataset; always the same for the same dataset.
-
-    Args:
-        state: the dataset.
-        options: what it has besides.
-        has_image: the user has put an image beside the dataset: the card shows that one, and none is drawn.
-    """
+    """Return the card of a dataset; always the same for the same dataset."""
     summary, identity = dataset_info(state.root), state.identity or {}
     drawn = (None, "An image of the dataset") if has_image else draw(summary, state)
     rows = [

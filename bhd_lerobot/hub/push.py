@@ -40,9 +40,6 @@ def push_dataset(
         replace: overwrite a dataset there that is another one, or has more episodes.
         storage: options of the URL's file system, JSON.
         again: the command to repeat.
-
-    Raises:
-        BhdError: it was not uploaded; the message has the reason, that the dataset is kept, and the command to repeat.
     """
     from bhd_lerobot.datasets.format.state import DatasetState
     from bhd_lerobot.datasets.remote.push import Card, push
@@ -77,11 +74,7 @@ def left_by_interrupt(root: Path, again: str) -> str:
 
 
 def check_pushable(repo_id: str) -> None:
-    """Check what can be checked without asking the Hub: the name, and that there is a token.
-
-    Raises:
-        BhdError: names what is missing.
-    """
+    """Check what can be checked without asking the Hub: the name, and that there is a token."""
     from bhd_lerobot.datasets.remote.hub_errors import require_token
 
     require_token(check_repo_id(repo_id))

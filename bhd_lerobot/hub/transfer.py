@@ -53,11 +53,7 @@ def repeat_line(options: argparse.Namespace, *places: object, **others: object) 
 
 
 def refuse_empty(options: argparse.Namespace) -> None:
-    """Refuse an option without a value: it is a variable of the shell that was not set, more often than a wish.
-
-    Raises:
-        ConfigError: there is one.
-    """
+    """Refuse an option without a value: it is a variable of the shell that was not set, more often than a wish."""
     for name, value in vars(options).items():
         if value == "" or (isinstance(value, list) and "" in value):
             what = f"--{name}" if name not in ("places", "source") else "A name"
@@ -65,11 +61,7 @@ def refuse_empty(options: argparse.Namespace) -> None:
 
 
 def folder_of(text: str) -> Path:
-    """Return the folder that is meant.
-
-    Raises:
-        ConfigError: no folder can have this name, or it must not be read.
-    """
+    """Return the folder that is meant."""
     try:
         folder = Path(text).expanduser()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -95,10 +87,6 @@ def remote_of(place: str, storage: str | None, **options: Any) -> "Remote":
         place: a name on the Hub, or a URL.
         storage: options of the URL's file system, JSON.
         options: what `HubDataset` takes.
-
-    Raises:
-        ConfigError: it can be no such place, or `storage` is no JSON object, or is given for the Hub.
-        TransferError: what serves the URL is not installed, or cannot be reached.
     """
     from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.store import StoreDataset

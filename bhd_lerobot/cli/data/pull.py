@@ -84,11 +84,7 @@ def format_report(report: "PullReport", source: str) -> str:
 
 
 def _selection(options: argparse.Namespace) -> "Select | None":
-    """Return what chooses the episodes; None if all are wanted.
-
-    Raises:
-        ConfigError: a value that cannot be honoured.
-    """
+    """Return what chooses the episodes; None if all are wanted."""
     if options.episodes is None and options.outcome is None and options.min_score is None:
         return None
     episodes = None if options.episodes is None else sorted(set(parse_episodes(options.episodes)))

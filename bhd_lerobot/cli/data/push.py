@@ -64,11 +64,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _places(options: argparse.Namespace) -> tuple[Path, str]:
-    """Return the folder and the target that were named in one way or another.
-
-    Raises:
-        ConfigError: one is missing, or named twice.
-    """
+    """Return the folder and the target that were named in one way or another."""
     refuse_empty(options)
     places = list(options.places)
     if places and options.root is None and not is_url(places[0]):

@@ -39,10 +39,6 @@ def compact(
 
     Returns:
         False if there was nothing to do.
-
-    Raises:
-        OSError: a file cannot be written; the dataset is then as it was.
-        DatasetCorruptError: a file cannot be read.
     """
     picks, rows = [Pick(state, row) for row in state.rows], [dict(row) for row in state.rows]
     plan = Plan(picks, rows, {task: index for index, task in enumerate(state.tasks)}, state.info, Files(picks))

@@ -42,10 +42,6 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
         info: content of ``meta/info.json``.
         identity: content of ``meta/bhd.json``.
         disk: how to write.
-
-    Raises:
-        DatasetExistsError: `root` exists.
-        DatasetWriteError: it cannot be written.
     """
 
     def fill(building: Path) -> None:
@@ -64,11 +60,6 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
         fill: writes everything into the folder that it is given.
         disk: how to write.
         remedy: what can be done if it exists.
-
-    Raises:
-        DatasetExistsError: `root` exists.
-        DatasetLockedError: it exists, and is being written.
-        DatasetWriteError: it cannot be written.
     """
 
     def refuse() -> None:

@@ -83,11 +83,7 @@ class Files:
         return self._of_frames(pick)[0]
 
     def instructions(self, pick: Pick) -> list[str]:
-        """Return the instructions of an episode: those of its frames, whatever its row says.
-
-        Raises:
-            DatasetCorruptError: the data file cannot be read, or has a number that is no instruction's.
-        """
+        """Return the instructions of an episode: those of its frames, whatever its row says."""
         return self._of_frames(pick)[1]
 
     def _of_frames(self, pick: Pick) -> tuple[NDArray[np.int64], list[str]]:

@@ -64,13 +64,6 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
     Args:
         roots: the datasets; they stay as they are.
         target: the new one; must not exist.
-
-    Raises:
-        ConfigError: fewer than two datasets, or one of them twice.
-        DatasetMismatchError: they have other robots, frame rates or features.
-        DatasetExistsError: `target` exists.
-        DatasetLockedError: one of them is being recorded.
-        DatasetError: one of them is no valid, finalised dataset, or cannot be written.
     """
     paths = [Path(root) for root in roots]
     if len(paths) < 2:
@@ -94,11 +87,6 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
         root: the dataset.
         episodes: the wanted ones, in the wanted order.
         target: the new one; must not exist.
-
-    Raises:
-        DatasetExistsError: `target` exists.
-        DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
     """
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
@@ -113,12 +101,6 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
         root: the dataset.
         parts: the episodes of each new dataset, by its name.
         folder: where they come to lie, each under its name; none of them may exist.
-
-    Raises:
-        ConfigError: an episode is wanted in two parts.
-        DatasetExistsError: one of the new datasets exists; then none is written.
-        DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
     """
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
@@ -159,16 +141,6 @@ def delete(root: Path | str, episodes: Sequence[int], on_done: OnDone = lambda _
 
     A kill at any moment leaves either the old dataset or the new one. If the new one is in place and `on_done` has not
     returned, the same call only reports that, and another one with numbers of episodes is refused once.
-
-    Args:
-        root: the dataset.
-        episodes: what is removed.
-        on_done: called with the report.
-
-    Raises:
-        DatasetLockedError: it is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, no episode would be left, or the disk
-            refuses.
     """
     edit = {"edit": "delete", "episodes": sorted(set(episodes))}
 
@@ -201,18 +173,7 @@ class Change:
 def rewrite(
     root: Path, request: Mapping[str, Any], change: Callable[[DatasetState], Change], on_done: OnDone
 ) -> EditReport:
-    """Put other content into a dataset.
-
-    Args:
-        root: the dataset.
-        request: JSON values by which a repeated edit is recognised.
-        change: makes the new content from the old.
-        on_done: called with the report.
-
-    Raises:
-        DatasetWriteError: the disk refuses; the dataset is as it was.
-        DatasetCorruptError: one of its files cannot be read.
-    """
+    """Put other content into a dataset."""
     with contextlib.ExitStack() as stack:
         lock = _lock(root)
         stack.callback(lock.release)
@@ -258,11 +219,7 @@ def _unreported(root: Path) -> dict[str, Any] | None:
 
 
 def check_reported(root: Path) -> None:
-    """Refuse, once, numbers of episodes after an edit that was not reported.
-
-    Raises:
-        DatasetError: there was one.
-    """
+    """Refuse, once, numbers of episodes after an edit that was not reported."""
     if (last := _unreported(root)) is None:
         return
     request = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
@@ -337,12 +294,7 @@ def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = Fals
 
 
 def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
-    """Check that there are such episodes, and that none is named twice.
-
-    Raises:
-        DatasetError: there is no such episode.
-        ConfigError: one is named twice.
-    """
+    """Check that there are such episodes, and that none is named twice."""
     wrong = sorted({episode for episode in episodes if not 0 <= episode < len(state.rows)})
     if wrong:
         raise DatasetError(f"There is no episode {wrong[0]} in {state.root}; valid: 0 to {len(state.rows) - 1}.")

@@ -68,9 +68,6 @@ def in_order(table: pa.Table, rows: Sequence[Row], path: Path) -> pa.Table:
         table: the frames, at least their numbers.
         rows: the episodes whose frames they have to be, ascending.
         path: the file that they were read from.
-
-    Raises:
-        DatasetCorruptError: they are others, or their numbers contradict each other.
     """
     wanted = numbers_of(rows)
     order = order_of(table, wanted)
@@ -100,9 +97,6 @@ def frames_of(path: Path, rows: Sequence[Row], columns: Sequence[str] | None = N
         path: the file.
         rows: all episodes of the file, ascending.
         columns: the columns that are needed; None for all.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or does not hold the frames of these episodes.
     """
     table = read_frames(path, None if columns is None else list(dict.fromkeys((*NUMBERS, *columns))))
     table = in_order(table, rows, path)
@@ -122,9 +116,6 @@ def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str
         task_index: number of the instruction of each frame, shape (T,).
         tasks: the instructions in the order of their numbers.
         path: the file of the frames.
-
-    Raises:
-        DatasetCorruptError: a number is no instruction's.
     """
     numbers, first = np.unique(task_index, return_index=True)
     if numbers[0] < 0 or numbers[-1] >= len(tasks):
@@ -157,10 +148,6 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
         root: the dataset.
         keys: the columns; those that the dataset does not have are left out.
         episode: the only episode that is wanted; all if None.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: a file cannot be read.
     """
     root = Path(root)
     state = load_state(root)
@@ -176,26 +163,12 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
 
 
 def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
-    """Return every column of an episode but its videos, by key, each of shape (frames, ...).
-
-    Args:
-        root: the dataset.
-        index: the episode.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: the file cannot be read.
-    """
+    """Return every column of an episode but its videos, by key, each of shape (frames, ...)."""
     return next(read_episodes(root, [index]))
 
 
 def read_episodes(root: Path | str, indices: Iterable[int]) -> Iterator[dict[str, NDArray]]:
-    """Yield every column of episodes as `read_episode` returns them, one episode at a time.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: a file cannot be read.
-    """
+    """Yield every column of episodes as `read_episode` returns them, one episode at a time."""
     root = Path(root)
     state = load_state(root)
     for index in indices:
@@ -240,9 +213,6 @@ def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.
         path: the video.
         start_s: time of the first one [s].
         count: how many.
-
-    Raises:
-        DatasetCorruptError: the video cannot be read, or ends before.
     """
     import av
 

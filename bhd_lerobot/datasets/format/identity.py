@@ -15,11 +15,7 @@ FORMAT = 1
 
 
 def as_json(recording: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `recording` as it will read after a trip through JSON.
-
-    Raises:
-        ConfigError: it holds something that JSON cannot.
-    """
+    """Return `recording` as it will read after a trip through JSON."""
     try:
         return json.loads(json.dumps(dict(recording)))
     except (TypeError, ValueError) as error:
@@ -44,10 +40,6 @@ def check_identity(
         robot_type: the requested robot.
         recording: the requested description; None accepts the recorded one.
         video: the requested video settings; None accepts the recorded ones.
-
-    Raises:
-        DatasetMismatchError: with every difference: key, recorded value, requested value.
-        DatasetEditedError: it was edited after its recording.
     """
     if state.identity is None:
         raise DatasetMismatchError(
@@ -111,11 +103,7 @@ def _short(value: Any) -> str:
 
 
 def local_name(root: str | Path | None) -> str:
-    """Return the `repo_id` of a dataset that was given a folder and no name: ``local/`` and the folder's name.
-
-    Raises:
-        ConfigError: no folder either.
-    """
+    """Return the `repo_id` of a dataset that was given a folder and no name: ``local/`` and the folder's name."""
     if not root:
         raise ConfigError("Neither dataset.root nor dataset.repo_id is given: name a folder, or user/name on the Hub.")
     name = re.sub(r"[^\w.-]", "_", Path(root).expanduser().resolve().name).strip("-.") or "dataset"

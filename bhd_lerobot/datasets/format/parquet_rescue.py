@@ -91,10 +91,6 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
         path: the file.
         schema: its columns, in order; used only if there is no footer.
         shapes: the shape of a row's value in columns of nested lists, whose type does not define it.
-
-    Raises:
-        OSError: the file cannot be read at all.
-        ValueError: rows of a column may have any length, so that the ends of its pages cannot be known.
     """
     try:
         whole = pq.ParquetFile(path, page_checksum_verification=True)

@@ -154,10 +154,6 @@ def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: 
 
     Reads file footers, not their pages: a damaged value inside a file is found by
     `bhd_lerobot.datasets.recovery.repair.repair`.
-
-    Raises:
-        DatasetError: `root` is not a dataset, or a link in it leads out of it.
-        DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
     """
     complete_interrupted(root)
     if not (root / layout.INFO).is_file():
@@ -182,11 +178,7 @@ def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: 
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object.
-
-    Raises:
-        DatasetCorruptError: there is none.
-    """
+    """Return a JSON object."""
     try:
         return parse_object(path.read_bytes())
     except (OSError, InfoError) as error:
@@ -194,11 +186,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_identity(root: Path) -> dict[str, Any] | None:
-    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, or does not describe a recording.
-    """
+    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset."""
     path = root / layout.IDENTITY
     if not path.exists():
         return None
@@ -210,12 +198,7 @@ def read_identity(root: Path) -> dict[str, Any] | None:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, or a value is missing or not valid.
-        DatasetError: it is of another version.
-    """
+    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`."""
     path = root / layout.INFO
     try:
         return read_info(path, root)
@@ -224,11 +207,7 @@ def load_info(root: Path) -> dict[str, Any]:
 
 
 def numbered_tasks(path: Path) -> dict[int, str]:
-    """Return the instructions by their numbers, in the order of the file.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or has a number twice or none.
-    """
+    """Return the instructions by their numbers, in the order of the file."""
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
@@ -244,11 +223,7 @@ def numbered_tasks(path: Path) -> dict[int, str]:
 
 
 def read_tasks(path: Path) -> list[str]:
-    """Return the instructions in the order of their numbers.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or its numbers are not those of a list.
-    """
+    """Return the instructions in the order of their numbers."""
     tasks = numbered_tasks(path)
     if tasks.keys() != set(range(len(tasks))):
         raise corrupt(path, f"its numbers are not 0 to {len(tasks) - 1}, each once")
@@ -292,11 +267,7 @@ def _read_rows(state: DatasetState) -> None:
 
 
 def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Return a data file, or some of its columns.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, a page is not what was written, or a number is missing.
-    """
+    """Return a data file, or some of its columns."""
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
     except UNREADABLE as error:

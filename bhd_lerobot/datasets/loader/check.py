@@ -16,10 +16,6 @@ def check(dataset: Any, keys: Collection[str]) -> None:
     Args:
         dataset: a `TableDataset` or `LeRobotDataset`.
         keys: features that the policy reads or predicts.
-
-    Raises:
-        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; or a standard deviation
-            is stored as 0 though its feature changes. The message names episode, frame and feature.
     """
     meta = dataset.meta
     if not dataset.num_frames:

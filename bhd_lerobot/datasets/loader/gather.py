@@ -94,11 +94,7 @@ def delta_indices(
     tolerance_s: float,
     keep: Collection[str] | None = None,
 ) -> dict[str, tuple[int, ...]]:
-    """Return delta_timestamps in frames.
-
-    Raises:
-        DatasetError: a key that the dataset does not have or that is not kept, or a time between two frames.
-    """
+    """Return delta_timestamps in frames."""
     result = {}
     for key, times in (delta_timestamps or {}).items():
         if key not in meta.features:

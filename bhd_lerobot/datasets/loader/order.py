@@ -48,9 +48,6 @@ class BatchOrder:
             weights: relative frequency of each of `samples`, shape (M,), not negative; needs `shuffle`.
             rank: this process among `world_size`.
             world_size: processes that train together.
-
-        Raises:
-            ConfigError: no sample or no batch is left, or weights that cannot be used.
         """
         self.batch_size, self.seed, self.shuffle, self.drop_last = batch_size, seed, shuffle, drop_last
         self.rank, self.world_size = rank, world_size
@@ -106,11 +103,7 @@ class BatchOrder:
         return {"epoch": self._epoch, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state that `state_dict` returned; the next iteration starts there.
-
-        Raises:
-            ConfigError: the position does not exist.
-        """
+        """Go on from a state that `state_dict` returned; the next iteration starts there."""
         epoch, position = int(state["epoch"]), int(state["position"])
         if epoch < 0 or not 0 <= position <= len(self.samples):
             raise ConfigError(

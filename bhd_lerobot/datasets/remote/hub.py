@@ -56,9 +56,6 @@ class HubDataset:
             private: whether a repository that is made is private; None leaves it to the Hub.
             tag: a further tag that a push sets.
             create: make the repository and the branch where they do not exist, for a push.
-
-        Raises:
-            ConfigError: it is no name.
         """
         self.name, self.revision = check_repo_id(repo_id), revision
         self.commit: str | None = None

@@ -54,11 +54,7 @@ def explain(error: BaseException, name: str, revision: str | None = None) -> str
 
 
 def require_token(name: str) -> None:
-    """Check that there is something to log in with.
-
-    Raises:
-        TransferError: there is no token.
-    """
+    """Check that there is something to log in with."""
     from huggingface_hub import get_token
 
     if not get_token():

@@ -100,11 +100,7 @@ class Remote(Protocol):
         """Copy listed files into a folder."""
 
     def send(self, source: "LocalDataset", items: Sequence[Item], deleted: Sequence[str]) -> None:
-        """Put files there and remove others, so that a reader never takes a part for the whole.
-
-        Raises:
-            DatasetError: the dataset was changed meanwhile, which is checked before anything becomes visible.
-        """
+        """Put files there and remove others, so that a reader never takes a part for the whole."""
 
 
 def matching(contents: Mapping[str, Path | bytes], files: Mapping[str, RemoteFile]) -> set[str]:
@@ -115,11 +111,7 @@ def matching(contents: Mapping[str, Path | bytes], files: Mapping[str, RemoteFil
 
 
 def refuse_overlap(root: Path, remote: Remote) -> None:
-    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced.
-
-    Raises:
-        ConfigError: the two folders are one, or one lies in the other.
-    """
+    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced."""
     if remote.folder is None:
         return
     here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
@@ -134,11 +126,7 @@ def is_url(place: str) -> bool:
 
 
 def check_repo_id(name: str) -> str:
-    """Return a name on the Hub if it is one.
-
-    Raises:
-        ConfigError: it is not of the form user/name.
-    """
+    """Return a name on the Hub if it is one."""
     if not _REPO_ID.fullmatch(name) or ".." in name or "--" in name or name.endswith((".git", ".", "-")):
         raise ConfigError(
             f"{name!r} is neither a name on the Hub, such as user/name, nor a URL, such as s3://bucket/folder or "
@@ -174,11 +162,7 @@ def listed(names: Iterable[str], at_most: int = 3) -> str:
 
 
 def parse_info(content: bytes | None, place: str) -> dict[str, Any]:
-    """Return the content of a `meta/info.json`, checked and with defaults; see `info.checked_info`.
-
-    Raises:
-        DatasetError: it is gone, is none, or is that of another format; the message has the reason.
-    """
+    """Return the content of a `meta/info.json`, checked and with defaults; see `info.checked_info`."""
     if content is None:
         raise DatasetError(f"{place} is no LeRobot dataset any more: its {layout.INFO} is gone.")
     try:

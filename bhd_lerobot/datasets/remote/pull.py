@@ -71,14 +71,6 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
         select: chooses the episodes whose files are wanted, of a dataset on the Hub; None wants all.
         replace: put the remote dataset in the place of another one, or of a changed one; files that belong to no
             dataset stay.
-
-    Raises:
-        ConfigError: both are the same folder; or episodes of a dataset below a URL are chosen.
-        DatasetExistsError: there is another dataset at `root`, or a changed one, and `replace` is false.
-        DatasetError: the remote dataset has another format, or none of the wanted episodes.
-        DatasetLockedError: `root` is being recorded, repaired or pulled by another process.
-        DatasetWriteError: this disk refuses the files.
-        TransferError: not all of it arrived.
     """
     root = Path(root).expanduser().resolve()
     refuse_overlap(root, remote)
@@ -217,11 +209,7 @@ class _Pull:
 
 
 def _files(remote: Remote) -> dict[str, RemoteFile]:
-    """Return the files of a remote dataset that a copy is to have.
-
-    Raises:
-        TransferError: there is no dataset, or a path that would lie outside of a copy.
-    """
+    """Return the files of a remote dataset that a copy is to have."""
     there, name = remote.files(), remote.name
     if layout.INFO not in there:
         raise TransferError(

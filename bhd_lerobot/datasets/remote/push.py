@@ -89,12 +89,6 @@ def push(
         remote: where to.
         make_card: generates a card; None generates none.
         replace: overwrite a dataset at the remote place that is another one, or has more episodes.
-
-    Raises:
-        DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
-        ConfigError: both are the same folder.
-        DatasetError: the dataset is not complete and finalised, is in use, or was changed meanwhile.
-        TransferError: the place cannot be reached or does not let this user write.
     """
     refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:
@@ -155,12 +149,7 @@ def _cards(
 
 
 def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
-    """Refuse to overwrite what this dataset is no later version of; a store keeps no history.
-
-    Raises:
-        DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes than
-            were deleted here since; or it is no dataset of this format at all.
-    """
+    """Refuse to overwrite what this dataset is no later version of; a store keeps no history."""
     name, info = remote.name, there.get(layout.INFO)
     if info is None or (info.digest is not None and info.matches(local.root / layout.INFO)):
         return
@@ -185,12 +174,7 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
 
 
 def _deleted_since(root: Path, there: bytes | None) -> int:
-    """Return how many episodes were deleted from a dataset since a copy of it was made.
-
-    Args:
-        root: the dataset.
-        there: the list of edits of the copy.
-    """
+    """Return how many episodes were deleted from a dataset since a copy of it was made."""
     try:
         edits, former = edits_of(root), [json.loads(line) for line in (there or b"").splitlines()]
         known = len(former) if edits[: len(former)] == former else 0

@@ -29,11 +29,7 @@ class Staging:
     """
 
     def __init__(self, root: Path) -> None:
-        """Make the folder, or take up that of an attempt before.
-
-        Raises:
-            DatasetError: something else lies where the folder must be.
-        """
+        """Make the folder, or take up that of an attempt before."""
         self._root = root
         # Where nothing can be put beside the dataset, its staging folder is the place.
         self.folder = folder = root / PULL if is_fixed(root) else root.with_name(f".{root.name}.pull")

@@ -42,10 +42,6 @@ class StoreDataset:
         Args:
             url: for example ``s3://bucket/folder``.
             storage_options: what fsspec's file system takes: keys, endpoint; else its environment variables count.
-
-        Raises:
-            ConfigError: an unknown protocol, or a URL that is no place for a dataset.
-            TransferError: what serves this protocol is not installed, or cannot be reached.
         """
         self.name = shown(url)
         self._fs, self._root = open_place(url, storage_options)

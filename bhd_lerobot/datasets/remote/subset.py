@@ -11,12 +11,7 @@ from bhd_lerobot.errors import DatasetError
 
 
 def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
-    """Return the files that hold some episodes, by the metadata in `root`.
-
-    Raises:
-        DatasetError: there is no such episode.
-        DatasetCorruptError: the metadata cannot be read.
-    """
+    """Return the files that hold some episodes, by the metadata in `root`."""
     state = load_state(root, files=False)
     if unknown := [episode for episode in episodes if not 0 <= episode < state.num_episodes]:
         raise DatasetError(

@@ -30,12 +30,7 @@ def shown(url: str) -> str:
 
 
 def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple[Any, str]:
-    """Return fsspec's file system for a URL, and the path of the folder in it.
-
-    Raises:
-        ConfigError: the URL names no folder, or nothing that a dataset could lie in.
-        TransferError: what serves the protocol is not installed, or cannot be reached.
-    """
+    """Return fsspec's file system for a URL, and the path of the folder in it."""
     import fsspec  # type: ignore[import-untyped]
     from fsspec.core import url_to_fs  # type: ignore[import-untyped]
 
@@ -63,11 +58,7 @@ def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple
 
 
 def check_url(url: str) -> None:
-    """Check what can be seen without asking anybody.
-
-    Raises:
-        ConfigError: a chain of file systems, no folder, no bucket, a path that is not whole, or no place for a dataset.
-    """
+    """Check what can be seen without asking anybody."""
     protocol, _, path = url.partition("://")
     name = shown(url)
     if not url.isprintable():

@@ -98,11 +98,7 @@ class Disk:
         self.move(part, path)
 
     def swap(self, first: Path, second: Path) -> None:
-        """Swap two folders atomically.
-
-        Raises:
-            OSError: this kernel or file system cannot do that, among others.
-        """
+        """Swap two folders atomically."""
         _before_step("swap", second)
         function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
         if function is None:
@@ -197,9 +193,6 @@ class RootLock:
             root: an existing folder.
             shown_as: the path to name in an error, if `root` is a temporary one.
             is_choice: whether the error proposes another root, too.
-
-        Raises:
-            DatasetLockedError: another process records, repairs or edits it.
         """
         self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
         self._handle: int | None = None

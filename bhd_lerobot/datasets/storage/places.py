@@ -43,11 +43,7 @@ def wrong_path(path: object) -> str:
 
 
 def wrong_info(info: Mapping[str, Any]) -> str:
-    """Return which name in an `info.json` leads out of the dataset; nothing if none does.
-
-    Args:
-        info: its content, of which the features' keys and the templates of paths become names of files.
-    """
+    """Return which name in an `info.json` leads out of the dataset; nothing if none does."""
     for key in info.get("features") or ():
         if why := wrong_name(key):
             return f"a feature's name {why}"
@@ -72,9 +68,6 @@ def check_inside(root: Path, path: Path) -> Path:
     Args:
         root: the dataset.
         path: the file, which need not exist.
-
-    Raises:
-        DatasetError: a link leads elsewhere; names both, and the remedy.
     """
     try:
         # Unlike Path.resolve, it accepts a link to itself; opening that fails later with a message.
@@ -96,9 +89,6 @@ def check_links(root: Path) -> None:
     Args:
         root: the dataset. Searched are `meta`, `data`, `videos`, and the folders of videos that LeRobot has not encoded
             yet, `images` and `tmp…`.
-
-    Raises:
-        DatasetError: one does.
     """
     pending = [*(root / name for name in ("meta", "data", "videos", "images")), *root.glob("tmp*")]
     seen: set[Path] = set()  # a link to a folder above would never end

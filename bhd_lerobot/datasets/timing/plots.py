@@ -32,9 +32,6 @@ def draw_timing(report: TimingReport, path: Path) -> None:
     Args:
         report: what is drawn.
         path: where the image goes; its suffix decides the format.
-
-    Raises:
-        OSError: it cannot be written.
     """
     if report.simulated:
         figure = Figure(figsize=(12, 3.6), layout="constrained")

@@ -30,11 +30,7 @@ class _Steps:
 
 
 class StepCheck:
-    """The check of steps, over all files.
-
-    Args:
-        features: of the dataset.
-    """
+    """The check of steps, over all files."""
 
     def __init__(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         self._features = features

@@ -38,9 +38,6 @@ _LATE_SHARE = 0.01
 class ValueCheck:
     """The check of all numbers.
 
-    Attributes:
-        frames: how many were read.
-
     Args:
         files: what the small files say.
         findings: what is found is added to it.
