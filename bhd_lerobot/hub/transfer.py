@@ -39,13 +39,7 @@ def command_line(command: str, places: Sequence[object], **options: Any) -> str:
 
 
 def repeat_line(options: argparse.Namespace, *places: object, **others: object) -> str:
-    """Return the command that repeats this one, with the options that are not defaults.
-
-    Args:
-        options: of this command, with the `command_parser` that read them.
-        places: what stands behind the command's name, whichever way it was given.
-        others: options that say a place, likewise.
-    """
+    """Return the command that repeats this one, with the options that are not defaults."""
     parser: argparse.ArgumentParser = options.command_parser
     given = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
     rest = {name: value for name, value in given.items() if name not in _PLACES}
@@ -81,13 +75,7 @@ def warn_of_folder(name: str, root: Path) -> None:
 
 
 def remote_of(place: str, storage: str | None, **options: Any) -> "Remote":
-    """Return a place that a dataset is copied to or from.
-
-    Args:
-        place: a name on the Hub, or a URL.
-        storage: options of the URL's file system, JSON.
-        options: what `HubDataset` takes.
-    """
+    """Return a place that a dataset is copied to or from."""
     from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.store import StoreDataset
 

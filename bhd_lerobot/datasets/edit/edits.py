@@ -59,12 +59,7 @@ type OnDone = Callable[[EditReport], object]
 
 
 def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
-    """Make one dataset of all episodes of several, in their order.
-
-    Args:
-        roots: the datasets; they stay as they are.
-        target: the new one; must not exist.
-    """
+    """Make one dataset of all episodes of several, in their order."""
     paths = [Path(root) for root in roots]
     if len(paths) < 2:
         raise ConfigError(f"Merging takes at least two datasets; got {len(paths)}.")
@@ -81,13 +76,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
 
 
 def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:
-    """Make a dataset of some episodes of another, which stays as it is.
-
-    Args:
-        root: the dataset.
-        episodes: the wanted ones, in the wanted order.
-        target: the new one; must not exist.
-    """
+    """Make a dataset of some episodes of another, which stays as it is."""
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         edit, recording = _kept(state, episodes, "keep")
@@ -95,13 +84,7 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
 
 
 def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | str) -> list[EditReport]:
-    """Make several datasets of the episodes of one, which stays as it is.
-
-    Args:
-        root: the dataset.
-        parts: the episodes of each new dataset, by its name.
-        folder: where they come to lie, each under its name; none of them may exist.
-    """
+    """Make several datasets of the episodes of one, which stays as it is."""
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
         for episode in episodes:

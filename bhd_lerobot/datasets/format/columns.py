@@ -29,11 +29,7 @@ NUMBERS = ("episode_index", "frame_index", "index")
 
 
 def numbers_of(rows: Sequence[Row]) -> dict[str, NDArray[np.int64]]:
-    """Return the numbers that the frames of a data file have to have, in order, each of shape (frames,).
-
-    Args:
-        rows: all episodes of the file, ascending.
-    """
+    """Return the numbers that the frames of a data file have to have, in order, each of shape (frames,)."""
     lengths = np.array([row["length"] for row in rows], np.int64)
     frame = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return {
@@ -48,10 +44,6 @@ def order_of(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> NDArra
 
     `index` follows from the others. It need not be right where they are in order, and else says whether they are to be
     believed.
-
-    Args:
-        table: its columns, at least those of `NUMBERS`.
-        wanted: what they have to be, in order; see `numbers_of`.
     """
     got = {key: table[key].to_numpy() for key in NUMBERS}
     if all(np.array_equal(got[key], wanted[key]) for key in ("episode_index", "frame_index")):
@@ -126,11 +118,7 @@ def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str
 
 
 def wrong_order(slots: Sequence[layout.Slot]) -> str:
-    """Return in which way the data files do not have the order of the episodes; empty if they do.
-
-    Args:
-        slots: the file of each episode, in the order of the episodes.
-    """
+    """Return in which way the data files do not have the order of the episodes; empty if they do."""
     names = [layout.data_file(slot) for slot in slots]
     for episode in range(1, len(names)):
         if names[episode] < names[episode - 1]:

@@ -39,12 +39,7 @@ def _type_of(key: str, value: Any) -> pa.DataType:
 
 
 def checked_metadata(metadata: Mapping[str, Any], types: Mapping[str, pa.DataType]) -> Row:
-    """Return the metadata columns of one episode.
-
-    Args:
-        metadata: values by name.
-        types: what the episodes before had.
-    """
+    """Return the metadata columns of one episode."""
     if metadata.keys() != types.keys():
         raise FrameError(
             f"Every episode needs the same metadata. Missing: {sorted(types.keys() - metadata.keys())}; "

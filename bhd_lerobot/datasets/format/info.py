@@ -68,14 +68,7 @@ def read_info(path: Path, place: str | Path, *, features: bool = True, counts: b
 def checked_info(
     values: Mapping[str, Any], place: str | Path, *, features: bool = True, counts: bool = True
 ) -> dict[str, Any]:
-    """Return the content of an `info.json` with defaults for what may be left out.
-
-    Args:
-        values: the content.
-        place: the dataset, for the message about its version.
-        features: check every feature, too; otherwise only that they are an object.
-        counts: whether the counts are required and checked.
-    """
+    """Return the content of an `info.json` with defaults for what may be left out."""
     for key in _REQUIRED if counts else ("codebase_version", "features", "fps"):
         if key not in values:
             raise InfoError(f"it has no {key!r}")

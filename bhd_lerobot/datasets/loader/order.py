@@ -88,11 +88,7 @@ class BatchOrder:
         return self.follow(iter)
 
     def follow(self, fetch: Callable[[Iterator[Tensor]], Iterator[T]]) -> Iterator[T]:
-        """Return what `fetch` makes of the batches of the epoch; the state counts what came out, not what went in.
-
-        Args:
-            fetch: gets the indices of all batches, and yields one result for each, in the same order.
-        """
+        """Return what `fetch` makes of the batches of the epoch; the state counts what came out, not what went in."""
         if self._running:
             self._epoch, self._position = self._epoch + 1, 0
         self._running = True

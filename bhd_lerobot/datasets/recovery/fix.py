@@ -36,10 +36,6 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     """Repair what can be repaired, if everything that it follows from is valid; return a line for each thing.
 
     A kill at any moment leaves either the old dataset or the new one.
-
-    Args:
-        root: the dataset.
-        findings: what `check_dataset` found there.
     """
     root = Path(root)
     wanted = [finding for finding in findings if is_fixable(finding)]

@@ -89,13 +89,6 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
     """Recover every whole episode.
 
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
-
-    Args:
-        root: the corrupted dataset.
-        disk: how to write.
-        lock: of the dataset.
-        wrong: what was found to be wrong, for the error if nothing is left.
-        is_ours: whether our recorder alone wrote it.
     """
     check_unused(root)
     check_readable(root)

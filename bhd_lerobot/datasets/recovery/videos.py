@@ -127,11 +127,6 @@ class Videos:
     Where a row of ``meta/episodes`` is left, it says where the episode is. Episodes without one come after those with
     one, in videos of their own; these hold whole episodes in the order of their numbers, one after the other, so their
     lengths say where each is. Where that does not come out even, no episode gets a video that may be another's.
-
-    Args:
-        root: the corrupted dataset.
-        info: content of its ``info.json``.
-        rows: readable rows of ``meta/episodes``, by the number of the episode.
     """
 
     def __init__(self, root: Path, info: dict[str, Any], rows: Mapping[int, Row]) -> None:

@@ -37,12 +37,7 @@ class StoreDataset:
     has_checksums = False
 
     def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
-        """Name it.
-
-        Args:
-            url: for example ``s3://bucket/folder``.
-            storage_options: what fsspec's file system takes: keys, endpoint; else its environment variables count.
-        """
+        """Name it."""
         self.name = shown(url)
         self._fs, self._root = open_place(url, storage_options)
         kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)

@@ -96,9 +96,6 @@ class Workspace:
         """Move the folder to its place, or its content to the places of the same names.
 
         Signals that would end the process wait until it is done.
-
-        Args:
-            done: the result, a sentence without a full stop; see `noting_what_is_done`.
         """
         if self._is_inside:
             move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new)
@@ -126,13 +123,7 @@ class Workspace:
 
 @contextlib.contextmanager
 def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Workspace]:
-    """Give a workspace for something new, and publish it when the block ends well.
-
-    Args:
-        target: its place.
-        disk: how to write.
-        refuse: raises if something is at the place; called before and after the block.
-    """
+    """Give a workspace for something new, and publish it when the block ends well."""
     remove_abandoned(real(target))
     complete_interrupted(target)
     refuse()

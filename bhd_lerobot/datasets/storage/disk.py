@@ -187,13 +187,7 @@ class RootLock:
     """
 
     def __init__(self, root: Path, shown_as: Path | None = None, *, is_choice: bool = False) -> None:
-        """Take the lock.
-
-        Args:
-            root: an existing folder.
-            shown_as: the path to name in an error, if `root` is a temporary one.
-            is_choice: whether the error proposes another root, too.
-        """
+        """Take the lock."""
         self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
         self._handle: int | None = None
         self.acquire()

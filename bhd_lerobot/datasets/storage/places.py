@@ -19,11 +19,7 @@ _FIELD = re.compile(r"\{\w+(?::0?\d{1,2}d)?\}")
 
 
 def wrong_name(name: object) -> str:
-    """Return why a name from a file cannot be a part of a path; nothing if it can.
-
-    Args:
-        name: a feature's key, a file's name, or whatever else becomes one part of a path.
-    """
+    """Return why a name from a file cannot be a part of a path; nothing if it can."""
     if not isinstance(name, str):
         return f"{name!r} is no text"
     if name in ("", ".", "..") or "/" in name or "\\" in name:
@@ -84,12 +80,7 @@ def check_inside(root: Path, path: Path) -> Path:
 
 
 def check_links(root: Path) -> None:
-    """Check that no link among the files of a dataset leads out of it.
-
-    Args:
-        root: the dataset. Searched are `meta`, `data`, `videos`, and the folders of videos that LeRobot has not encoded
-            yet, `images` and `tmp…`.
-    """
+    """Check that no link among the files of a dataset leads out of it."""
     pending = [*(root / name for name in ("meta", "data", "videos", "images")), *root.glob("tmp*")]
     seen: set[Path] = set()  # a link to a folder above would never end
     while pending:

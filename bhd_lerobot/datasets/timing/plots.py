@@ -27,12 +27,7 @@ _MARKS, _FEW = 500, 60  # marks at most, and so many are few
 
 
 def draw_timing(report: TimingReport, path: Path) -> None:
-    """Draw the timing of an episode, or of all episodes one after the other.
-
-    Args:
-        report: what is drawn.
-        path: where the image goes; its suffix decides the format.
-    """
+    """Draw the timing of an episode, or of all episodes one after the other."""
     if report.simulated:
         figure = Figure(figsize=(12, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2.1, 1))
