@@ -24,14 +24,7 @@ _UNITS = ((".pos", "m or rad"), (".vel", "m/s or rad/s"))
 
 @dataclass(frozen=True)
 class CardOptions:
-    """What a card has besides the content of the dataset.
-
-    Attributes:
-        repo_id: its name on the Hub; None if it lies elsewhere.
-        url: where it lies then.
-        licence: identifier of the licence, as the Hub knows them.
-        tags: further tags.
-    """
+    """What a card has besides the content of the dataset; it lies at `url` if it is not on the Hub."""
 
     repo_id: str | None = None
     url: str = ""

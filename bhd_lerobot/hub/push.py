@@ -26,21 +26,7 @@ def push_dataset(
     storage: str | None = None,
     again: str | None = None,
 ) -> "PushReport":
-    """Upload a dataset, with its card.
-
-    Args:
-        root: the dataset.
-        target: name on the Hub, or a URL.
-        branch: branch of the Hub to write to; the main one if None.
-        tag: a further tag for what is pushed.
-        private: whether a repository that is made is private; None leaves it to the Hub.
-        tags: tags of the card.
-        licence: licence of the card.
-        card: whether a card is made.
-        replace: overwrite a dataset there that is another one, or has more episodes.
-        storage: options of the URL's file system, JSON.
-        again: the command to repeat.
-    """
+    """Upload a dataset, with its card."""
     from bhd_lerobot.datasets.format.state import DatasetState
     from bhd_lerobot.datasets.remote.push import Card, push
     from bhd_lerobot.datasets.remote.url import shown

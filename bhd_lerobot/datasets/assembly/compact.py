@@ -30,13 +30,6 @@ def compact(
 ) -> bool:
     """Compact a dataset and store all statistics.
 
-    Args:
-        state: what is on disk now.
-        schema: its columns.
-        disk: how to write.
-        lock: of the dataset.
-        known: statistics of episodes that are still in memory; those of others are computed from their data.
-
     Returns:
         False if there was nothing to do.
     """

@@ -43,16 +43,7 @@ def video_groups(plan: Plan, key: str) -> list[Group]:
 def build_data(
     plan: Plan, groups: Sequence[Group], new: Path, disk: Disk, *, take: Take, schema: pa.Schema | None = None
 ) -> None:
-    """Write the data files below `new`, and into the rows the file of each episode.
-
-    Args:
-        plan: the new dataset.
-        groups: from `data_groups`.
-        new: its root.
-        disk: how to write.
-        take: called with the old and the new path of a file that stays as it is.
-        schema: the columns; those of the first file if None.
-    """
+    """Write the data files below `new`, and into the rows the file of each episode."""
     first = groups[0].runs[0]
     schema = schema or _schema(first.source.root / layout.data_file(first.slot))
     for group in groups:

@@ -66,7 +66,6 @@ class Files:
     """The episodes of each file, computed once for each dataset."""
 
     def __init__(self, picks: Sequence[Pick]) -> None:
-        """Store the picks."""
         self._picks = picks
         self._rows: dict[tuple[int, str], dict[Slot, list[Row]]] = {}
         self._tasks: dict[tuple[int, Slot], dict[int, tuple[NDArray[np.int64], list[str]]]] = {}

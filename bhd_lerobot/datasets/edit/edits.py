@@ -48,7 +48,6 @@ class EditReport:
     is_repeated: bool = False
 
     def __str__(self) -> str:
-        """Return the report for a terminal."""
         note = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
         size = f"{counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}"
         return f"{self.root}: {size}{note if self.is_repeated else ''}"
@@ -240,7 +239,6 @@ def _write_new(
 def _fill(
     folder: Path, disk: Disk, picks: Sequence[Pick], edit: Mapping[str, Any], recording: Mapping[str, Any]
 ) -> None:
-    """Write a new dataset into a folder."""
     identities = [pick.source.identity for pick in picks]
     identity = None
     if identities and all(identity is not None for identity in identities):
@@ -305,7 +303,6 @@ def _lock(root: Path) -> RootLock:
 
 
 def _state_of(root: Path) -> DatasetState:
-    """Return what is in a dataset that has episodes."""
     state = load_state(root)
     if not state.rows:
         raise DatasetError(f"{root} is empty: it has no episodes.")

@@ -89,7 +89,6 @@ def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
 
 
 def _task_of(state: DatasetState, row: Row) -> str | None:
-    """Return the type of an episode's task; None if it is unknown."""
     try:
         task = json.loads(row.get("bhd/task") or "null") or (state.identity or {})["recording"]["task"]
         return str(task["type"])

@@ -54,13 +54,7 @@ def order_of(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> NDArra
 
 
 def in_order(table: pa.Table, rows: Sequence[Row], path: Path) -> pa.Table:
-    """Return frames in the order of their numbers; the table itself if they are.
-
-    Args:
-        table: the frames, at least their numbers.
-        rows: the episodes whose frames they have to be, ascending.
-        path: the file that they were read from.
-    """
+    """Return frames in the order of their numbers; the table itself if they are."""
     wanted = numbers_of(rows)
     order = order_of(table, wanted)
     if order is None:
@@ -83,13 +77,7 @@ def wrong_number(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> st
 
 
 def frames_of(path: Path, rows: Sequence[Row], columns: Sequence[str] | None = None) -> dict[int, pa.Table]:
-    """Return the frames of each episode of a data file, by its number.
-
-    Args:
-        path: the file.
-        rows: all episodes of the file, ascending.
-        columns: the columns that are needed; None for all.
-    """
+    """Return the frames of each episode of a data file, by its number."""
     table = read_frames(path, None if columns is None else list(dict.fromkeys((*NUMBERS, *columns))))
     table = in_order(table, rows, path)
     starts = np.cumsum([0, *(row["length"] for row in rows)]).tolist()
@@ -130,13 +118,7 @@ def wrong_order(slots: Sequence[layout.Slot]) -> str:
 
 
 def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = None) -> list[dict[str, NDArray]]:
-    """Return columns of scalars, by key, of one episode or of all, each of shape (frames,).
-
-    Args:
-        root: the dataset.
-        keys: the columns; those that the dataset does not have are left out.
-        episode: the only episode that is wanted; all if None.
-    """
+    """Return columns of scalars, by key, of one episode or of all, each of shape (frames,)."""
     root = Path(root)
     state = load_state(root)
     present = [key for key in keys if key in state.info["features"]]

@@ -115,7 +115,6 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
 
 
 def _read(file: pq.ParquetFile) -> Rescued:
-    """Return the row groups whose pages are what was written."""
     tables: list[pa.Table] = []
     problems: list[str] = []
     lost = 0
@@ -167,7 +166,6 @@ def _example(kind: pa.DataType, name: str, shapes: Mapping[str, Sequence[int]]) 
 
 
 def _walk(data: memoryview, factors: Sequence[int]) -> list[list[_Chunk]]:
-    """Return the row groups from the beginning on."""
     groups: list[list[_Chunk]] = []
     position = len(MAGIC)
     while (chunks := _group(data, position, factors)) is not None:

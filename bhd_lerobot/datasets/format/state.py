@@ -146,14 +146,8 @@ def no_dataset(root: Path) -> DatasetError:
 def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
 
-    Args:
-        root: the dataset.
-        files: whether data and videos must be there; else only the metadata are read.
-        videos: whether videos must be there, too.
-        counted: whether ``info.json`` must count the frames that the episodes have.
-
-    Reads file footers, not their pages: a damaged value inside a file is found by
-    `bhd_lerobot.datasets.recovery.repair.repair`.
+    File footers are read, not pages: `bhd_lerobot.datasets.recovery.repair.repair` finds damage inside a file. With
+    `files` off, data and videos need not be there; with `counted` off, ``info.json`` may count other frames.
     """
     complete_interrupted(root)
     if not (root / layout.INFO).is_file():

@@ -37,7 +37,6 @@ class Reader:
     """
 
     def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
-        """Start at `position`."""
         self._data, self.position = data, position
 
     def struct(self, depth: int = 0) -> Struct:

@@ -24,13 +24,6 @@ class Gatherer:
     """What all subsets of a dataset share: how to gather rows, worked out once."""
 
     def __init__(self, table: FrameTable, frames: FrameCache, deltas: Mapping[str, tuple[int, ...]]) -> None:
-        """Stack the columns.
-
-        Args:
-            table: the columns.
-            frames: the decoded images.
-            deltas: key -> window, in frames relative to the sample.
-        """
         self._table, self._frames = table, frames
         self._deltas = dict(deltas)
         self._windows = {window: np.asarray(window, dtype=np.int64) for window in deltas.values()}

@@ -79,7 +79,6 @@ class BatchOrder:
         return samples
 
     def __len__(self) -> int:
-        """Return the number of batches that this rank has in a full epoch."""
         everyone = self.batch_size * self.world_size
         return len(self.samples) // everyone if self.drop_last else math.ceil(len(self.samples) / everyone)
 

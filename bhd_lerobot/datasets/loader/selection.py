@@ -70,7 +70,6 @@ class EpisodeFilter:
     exclude_late: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         names = [self.outcome] if isinstance(self.outcome, str) else list(self.outcome)
         if not names:
             raise ConfigError(f"No outcome is given. Valid: all, {', '.join(OUTCOMES)}.")

@@ -125,7 +125,6 @@ class FrameTable:
         return cls(meta, _read(meta, wanted, stored, sources or {}), stored)
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.first)
 
     @property

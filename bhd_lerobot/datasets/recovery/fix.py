@@ -114,7 +114,6 @@ def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]
 
 
 def _tables(state: DatasetState) -> Iterator[pa.Table]:
-    """Yield the frames of every episode."""
     for slot, rows in ordered_slots(state.rows, "data").items():
         frames = frames_of(state.root / layout.data_file(slot), rows)
         yield from (frames[row["episode_index"]] for row in rows)

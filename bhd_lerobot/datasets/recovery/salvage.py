@@ -66,11 +66,9 @@ class RepairReport:
         return _losses(self.findings)
 
     def __bool__(self) -> bool:
-        """Whether anything was repaired."""
         return bool(self.completed or self.dropped)
 
     def __str__(self) -> str:
-        """Return the report for a terminal."""
         empty = "" if self.episodes else ": it is empty"
         lines = [f"{self.root}: {counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}{empty}"]
         lines += [f"  completed: {item}" for item in self.completed]

@@ -137,13 +137,7 @@ class Videos:
         self._whole_copies: dict[Path, Path] = {}
 
     def assign(self, found: Sequence[FoundEpisode], findings: Findings, *, is_torn: bool) -> list[FoundEpisode]:
-        """Find the video of every episode, and return the episodes whose videos are complete.
-
-        Args:
-            found: episodes whose frames are whole, in order.
-            findings: losses are added to it.
-            is_torn: whether frames are missing behind them: then a video may show more than they need.
-        """
+        """Find the video of every episode, and return the episodes whose videos are complete."""
         for episode in found:
             episode.has_row = self._rows.get(episode.number, {}).get("length") == episode.table.num_rows
         found, certain = self._without_repeated(found, findings)

@@ -48,15 +48,6 @@ class HubDataset:
         tag: str | None = None,
         create: bool = False,
     ) -> None:
-        """Name it; nothing is requested yet.
-
-        Args:
-            repo_id: `user/name`.
-            revision: branch, tag or commit to read; the branch to write.
-            private: whether a repository that is made is private; None leaves it to the Hub.
-            tag: a further tag that a push sets.
-            create: make the repository and the branch where they do not exist, for a push.
-        """
         self.name, self.revision = check_repo_id(repo_id), revision
         self.commit: str | None = None
         self._private, self._tag, self._create = private, tag, create
@@ -129,7 +120,6 @@ class HubDataset:
         return VERSION_TAG if VERSION_TAG in self._tags() else MAIN
 
     def _tags(self) -> dict[str, str]:
-        """Return the commits of the tags."""
         refs = self._api.list_repo_refs(self.name, repo_type="dataset")
         return {tag.name: tag.target_commit for tag in refs.tags}
 

@@ -23,13 +23,7 @@ _STATUS = {
 
 @contextmanager
 def hub_errors(name: str, action: str, *, revision: str | None = None) -> Iterator[None]:
-    """Turn what goes wrong between this machine and the Hub into a `TransferError`.
-
-    Args:
-        name: the repository.
-        action: what is being done, for example ``"upload the dataset to"``.
-        revision: the branch, tag or commit that is requested; None if none is.
-    """
+    """Turn what goes wrong between this machine and the Hub into a `TransferError`."""
     try:
         yield
     except BhdError:

@@ -23,14 +23,7 @@ _TEMPORARY = ("images",)  # LeRobot's own, of frames whose video is not encoded 
 
 @dataclass(frozen=True)
 class LocalDataset:
-    """A valid dataset on this machine.
-
-    Attributes:
-        root: its folder.
-        state: what is in it.
-        items: the files that belong to it, in order of their paths; a `README.md` of the user's among them.
-        left_out: files in it that belong to no episode, and are not copied.
-    """
+    """A valid dataset on this machine; what is `left_out` belongs to no episode, and is not copied."""
 
     root: Path
     state: DatasetState

@@ -63,15 +63,7 @@ class PullReport:
 
 
 def pull(remote: Remote, root: Path | str, *, select: Select | None = None, replace: bool = False) -> PullReport:
-    """Make the dataset on this machine the same as a remote one.
-
-    Args:
-        remote: where from.
-        root: where to.
-        select: chooses the episodes whose files are wanted, of a dataset on the Hub; None wants all.
-        replace: put the remote dataset in the place of another one, or of a changed one; files that belong to no
-            dataset stay.
-    """
+    """Make the dataset on this machine the same as a remote one."""
     root = Path(root).expanduser().resolve()
     refuse_overlap(root, remote)
     if select is not None and not remote.has_checksums:
@@ -223,7 +215,6 @@ def _files(remote: Remote) -> dict[str, RemoteFile]:
 
 
 def _problem(root: Path) -> str:
-    """Return why a dataset is not valid; nothing if it is."""
     try:
         load_state(root)
     except DatasetError as error:

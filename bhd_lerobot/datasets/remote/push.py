@@ -33,12 +33,7 @@ _SIGNATURE = re.compile(r"\n<!-- bhd-card ([0-9a-f]{64}) -->\n\Z")
 
 @dataclass(frozen=True)
 class Card:
-    """A generated card.
-
-    Attributes:
-        text: Markdown, signed by `sign`.
-        image: a PNG file's bytes; None if there is none.
-    """
+    """A generated card: Markdown, signed by `sign`, and a PNG file's bytes if it shows an image."""
 
     text: str
     image: bytes | None = None
@@ -83,12 +78,6 @@ def push(
     """Make a remote dataset the same as the one on this machine, which is not changed.
 
     A `README.md` in the folder is its card. Without one a card is generated, unless there is one that was not.
-
-    Args:
-        root: the dataset.
-        remote: where to.
-        make_card: generates a card; None generates none.
-        replace: overwrite a dataset at the remote place that is another one, or has more episodes.
     """
     refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:

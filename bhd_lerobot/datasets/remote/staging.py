@@ -21,12 +21,7 @@ _OURS = {_MARKER, SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout
 
 
 class Staging:
-    """A folder beside a dataset.
-
-    Attributes:
-        folder: where files come together.
-        is_new: whether no attempt before left one.
-    """
+    """A folder beside a dataset; `is_new` says whether no attempt before left one."""
 
     def __init__(self, root: Path) -> None:
         """Make the folder, or take up that of an attempt before."""
@@ -66,12 +61,7 @@ class Staging:
                 self.folder.parent.rmdir()
 
     def publish(self, wanted: set[str], note: bytes | None) -> None:
-        """Let the folder become the dataset; what belongs to no dataset comes along from the one before.
-
-        Args:
-            wanted: the files that the dataset is to have.
-            note: content of `SUBSET`; no such file if None.
-        """
+        """Let the folder become the dataset; what belongs to no dataset comes along from the one before."""
         root, folder = self._root, self.folder
         if root.is_dir():
             folder.chmod(root.stat().st_mode & 0o7777)  # the permissions stay the same

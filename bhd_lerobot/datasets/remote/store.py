@@ -26,18 +26,11 @@ _VERSION = ("size", "mtime", "created", "updated", "last_modified", "LastModifie
 
 
 class StoreDataset:
-    """A dataset below a URL.
-
-    Attributes:
-        name: the URL, without a password.
-        folder: where it lies, if that is on this machine.
-        has_checksums: no.
-    """
+    """A dataset below a URL."""
 
     has_checksums = False
 
     def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
-        """Name it."""
         self.name = shown(url)
         self._fs, self._root = open_place(url, storage_options)
         kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)

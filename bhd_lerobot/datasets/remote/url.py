@@ -12,9 +12,6 @@ from bhd_lerobot.errors import ConfigError, TransferError
 LOCAL = {"file", "local"}
 """Protocols of this machine's own folders."""
 
-_EXTRAS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs"}
-_EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
-
 _BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oci", "oss", "r2"}
 """Where the first name of a URL is that of a bucket, or of a container."""
 
@@ -42,9 +39,7 @@ def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple
     try:
         fs, path = url_to_fs(url.rstrip("/"), **(storage_options or {}))
     except ImportError as error:
-        package = _EXTRAS.get(protocol, "")
-        remedy = f" Install it: pip install '{package}'" if package else ""
-        raise TransferError(f"What serves {protocol}:// is not installed ({error}).{remedy}") from error
+        raise TransferError(f"What serves {protocol}:// is not installed: {error}.") from error
     except OSError as error:  # those that connect at once: FTP, SFTP
         _drop_half_made(error)
         reason = " ".join(str(error).split()).rstrip(".")

@@ -55,14 +55,7 @@ class Workspace:
     """
 
     def __init__(self, place: Path, disk: Disk, lock: RootLock | None = None) -> None:
-        """Make the folder; a change that was interrupted is completed first.
-
-        Args:
-            place: a folder, or where one is going to be made.
-            disk: how to write.
-            lock: of the dataset that is there, some folders of which are going to be replaced. None if something new is
-                made.
-        """
+        """Make the folder; a change that was interrupted is completed first."""
         self.place = place = real(place)
         self._disk, self._is_new = disk, lock is None
         self._is_inside = lock is not None or bool(_names(place)) or is_fixed(place)
@@ -361,7 +354,6 @@ def _is_there(path: Path, inode: int | None) -> bool:
 
 
 def _unused(path: Path) -> Path:
-    """Return a path that does not exist."""
     number = 1
     while os.path.lexists(path):
         path, number = path.with_name(f"{path.name.partition('~')[0]}~{number}"), number + 1

@@ -60,10 +60,6 @@ def check_inside(root: Path, path: Path) -> Path:
 
     These places are the folder `blobs` of the Hub's cache, if the dataset is a snapshot in that cache, and the folders
     that the environment variable `BHD_LINKED_FOLDERS` lists.
-
-    Args:
-        root: the dataset.
-        path: the file, which need not exist.
     """
     try:
         # Unlike Path.resolve, it accepts a link to itself; opening that fails later with a message.

@@ -56,7 +56,6 @@ def _heading(report: TimingReport) -> str:
 
 
 def _draw_all_series(report: TimingReport, panels: dict[str, Axes]) -> None:
-    """Draw what was measured of every frame, each column in its panel."""
     columns, tolerated = report.total.columns, report.total.summary.tolerated
     late = np.flatnonzero(columns[keys.LATE])
     for key, axes in panels.items():
@@ -71,7 +70,6 @@ def _draw_all_series(report: TimingReport, panels: dict[str, Axes]) -> None:
 
 
 def _draw_series(axes: Axes, values: NDArray, late: NDArray[np.intp], *, label: str, limit: float | None) -> None:
-    """Draw a time of every frame in milliseconds, its limit, and the late frames."""
     scaled = 1e3 * np.asarray(values, np.float64)
     axes.set_title(label, fontsize=10, loc="left")
     axes.grid(alpha=0.25)
@@ -101,7 +99,6 @@ def _thinned(values: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _draw_intervals(axes: Axes, report: TimingReport) -> None:
-    """Draw how far apart observations are."""
     intervals, wanted = 1e3 * report.total.intervals, 1e3 / report.fps
     axes.set_title("time between observations [ms]", fontsize=10, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
@@ -125,7 +122,6 @@ def _draw_intervals(axes: Axes, report: TimingReport) -> None:
 
 
 def _draw_numbers(axes: Axes, report: TimingReport) -> None:
-    """Write what no curve shows."""
     axes.set_axis_off()
     total, frame = report.total.summary, quantiles(report.total.intervals)
     lines = (

@@ -24,7 +24,6 @@ class _Steps:
     episodes: set[int] = field(default_factory=set)
 
     def __str__(self) -> str:
-        """Return how often, and where first."""
         often = "once" if self.count == 1 else f"{self.count} times in {len(self.episodes)} episodes"
         return f"{often}, {'in' if self.count == 1 else 'first in'} episode {self.episode}, frame {self.frame}"
 

@@ -52,7 +52,6 @@ class Committer:
     """
 
     def __init__(self, schema: Schema, disk: Disk, video: VideoSettings) -> None:
-        """Remember how to write."""
         self._schema, self._disk, self._video = schema, disk, video
         self._features_text: tuple[dict[str, Any], str] | None = None
 

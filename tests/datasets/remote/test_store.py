@@ -189,7 +189,7 @@ def test_what_is_not_installed_is_named(monkeypatch) -> None:
         raise ImportError("Install s3fs to access S3")
 
     monkeypatch.setattr("fsspec.core.url_to_fs", missing)
-    with pytest.raises(TransferError, match=r"pip install 's3fs'"):
+    with pytest.raises(TransferError, match=r"not installed: Install s3fs to access S3"):
         StoreDataset("s3://bucket/d")
 
 
