@@ -183,9 +183,7 @@ def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_p
     assert stored(hub)["same.txt"] == b"mine"
 
 
-def test_the_checksums_of_version_0_2_are_not_copied_and_go(
-    hub: HubServer, root: Path, tmp_path: Path
-) -> None:
+def test_the_checksums_of_version_0_2_are_not_copied_and_go(hub: HubServer, root: Path, tmp_path: Path) -> None:
     shelf = tmp_path / "shelf"
     push(root, StoreDataset(f"file://{shelf}"))
     (shelf / MANIFEST).write_text("{}")
