@@ -110,7 +110,8 @@ class _Pull:
         info = parse_info((self._staging.folder / layout.INFO).read_bytes(), name)
         if not self._remote.has_checksums:
             self._get(there)
-            there |= {path: RemoteFile.of(self._staging.folder / path) for path in there}
+            if self._root.exists():
+                there |= {path: RemoteFile.of(self._staging.folder / path) for path in there}
             self._compare(replace)
         episodes, wanted = None, set(there)
         if select is not None:

@@ -105,15 +105,6 @@ def test_an_interrupted_download_goes_on_where_it_was(hub: HubServer, root: Path
     assert not again & arrived
 
 
-def test_an_error_now_and_then_and_a_broken_download_are_repeated(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    hub.faults = [Fault("^PUT", times=2, status=500), Fault("/preupload/", status=503)]
-    send(root)
-    assert stored(hub) == content(root)
-    hub.faults = [Fault("^GET .*/resolve/.*/data/", times=2, after_bytes=100)]
-    pull(HubDataset("me/d"), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
-
-
 def test_the_reason_why_a_user_may_not_write_is_named(running_hub: HubServer, root: Path) -> None:
     before = content(root)
     for token, name, reason in (

@@ -95,17 +95,6 @@ def test_folders_that_hold_something_else_are_never_replaced(hub: HubServer, roo
         pull(HubDataset("me/d"), tmp_path / "file" / "below")
 
 
-def test_a_foreign_folder_at_the_staging_place_is_not_touched(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    name = ".e.pull"
-    send(root)
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "thesis.txt").write_text("years")
-    with pytest.raises(DatasetError, match="is in the way"):
-        pull(HubDataset("me/d"), tmp_path / "e")
-    assert (tmp_path / name / "thesis.txt").read_text() == "years"
-    assert not (tmp_path / "e").exists()
-
-
 def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
     send(root)
     usage = shutil.disk_usage(tmp_path)

@@ -130,14 +130,6 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_p
     assert b"anew" in stored(hub)["README.md"]
 
 
-def test_an_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> None:
-    (root / "preview.png").write_bytes(b"mine")
-    send(root, make_card=made())
-    assert stored(hub)["preview.png"] == b"mine"
-    assert b"True" in stored(hub)["README.md"]
-    assert not send(root, make_card=made()).sent
-
-
 def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
     hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,24 +114,6 @@ def test_a_download_that_dies_leaves_nothing(root: Path, url: str, tmp_path: Pat
     assert content(tmp_path / "e") == content(root)
 
 
-def test_a_dataset_that_another_program_put_there(root: Path, tmp_path: Path) -> None:
-    there = tmp_path / "there"
-    shutil.copytree(root, there)
-    url = f"file://{there}"
-    pull(StoreDataset(url), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
-    assert len(push(root, StoreDataset(url)).sent) == len(content(root))
-
-
-def test_a_file_that_would_lie_outside_is_refused(root: Path, tmp_path: Path, monkeypatch) -> None:
-    push(root, StoreDataset("memory://b/d"))
-    source = StoreDataset("memory://b/d")
-    files = source.files()
-    monkeypatch.setattr(source, "files", lambda: {**files, "../../evil": files[layout.INFO]})
-    with pytest.raises(TransferError, match="is no path within the dataset"):
-        pull(source, tmp_path / "e")
-
-
 def test_a_change_during_the_upload_is_not_shown(root: Path, monkeypatch) -> None:
     store = StoreDataset("memory://b/changed")
     put = store._fs.put_file
