@@ -17,7 +17,6 @@ from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.recovery import salvage as guard
 from bhd_lerobot.datasets.recovery.repair import repair
-from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
@@ -205,38 +204,6 @@ def test_files_that_cannot_be_read_now_are_not_given_up(
                 repair(root)
         assert snapshot(root) == before
         assert repair(root).episodes == 4
-
-
-def test_a_kill_at_any_step_leaves_a_recoverable_dataset(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Killed(BaseException):
-        """Ends the process."""
-
-    step, done, wanted = 0, False, content(recorded)
-    while not done:
-        root = copied(recorded, tmp_path / f"d{step}")
-        cut(500)(root / DATA)
-        before = (root / DATA).read_bytes()
-        seen: list[str] = []
-
-        def before_step(action: str, path: Path, seen: list[str] = seen, last: int = step) -> None:
-            seen.append(action)
-            if len(seen) == last + 1:
-                raise Killed
-
-        with monkeypatch.context() as patched:
-            patched.setattr(disk, "_before_step", before_step)
-            done = True
-            try:
-                repair(root)
-            except Killed:
-                done = False
-        repair(root)
-        assert content(root) == wanted, step
-        assert any(path.read_bytes() == before for path in tmp_path.glob(f"d{step}.damaged-*/{DATA}")), step
-        assert not (root / ".bhd").exists()
-        step += 7
 
 
 def test_a_damaged_identity_is_not_replaced(recorded: Path, tmp_path: Path) -> None:
