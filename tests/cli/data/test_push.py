@@ -24,7 +24,7 @@ from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.hub.transfer import repeat_line
 from bhd_lerobot.recording import record as record_module
-from tests.hub_server.fixtures import content
+from tests.datasets.support import snapshot as content
 from tests.hub_server.server import Fault, HubServer
 from tests.recording.support import options as record_options
 from tests.recording.support import run_record

@@ -18,8 +18,9 @@ from bhd_lerobot.errors import (
     TransferError,
 )
 from tests.datasets import support
+from tests.datasets.support import snapshot as content
 from tests.hub_server.client import real_client
-from tests.hub_server.fixtures import EPISODES, content, send, stored
+from tests.hub_server.fixtures import EPISODES, send, stored
 from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]

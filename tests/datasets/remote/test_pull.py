@@ -23,7 +23,8 @@ from bhd_lerobot.errors import (
     TransferError,
 )
 from tests.datasets import support
-from tests.hub_server.fixtures import EPISODES, content, send
+from tests.datasets.support import snapshot as content
+from tests.hub_server.fixtures import EPISODES, send
 from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]

@@ -19,7 +19,8 @@ from bhd_lerobot.errors import (
     DatasetLockedError,
 )
 from tests.datasets import support
-from tests.hub_server.fixtures import content, send, stored
+from tests.datasets.support import snapshot as content
+from tests.hub_server.fixtures import send, stored
 from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]

@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.datasets import support
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
-from tests.hub_server.fixtures import content
+from tests.datasets.support import snapshot as content
 
 pytest_plugins = ["tests.datasets.remote.store_fixtures", "tests.hub_server.fixtures"]
 
