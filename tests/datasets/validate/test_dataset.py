@@ -21,6 +21,7 @@ from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding,
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
 from tests.datasets.loader import support as loader_support
+from tests.datasets.support import snapshot
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
 STATE = ["a.pos", "b.pos", "tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"]
@@ -116,12 +117,12 @@ def bad(found: DatasetCheck) -> list[Finding]:
 
 
 def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
-    before = support.snapshot(valid)
+    before = snapshot(valid)
     found = check_dataset(valid, limits)
     assert bad(found) == []
     assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
     assert [finding.what for finding in found.findings if finding.check == "outcome"] == ["success 6"]
-    assert support.snapshot(valid) == before
+    assert snapshot(valid) == before
 
 
 def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:
