@@ -85,9 +85,11 @@ class HubDataset:
         """Download files of the listed commit."""
         from huggingface_hub import snapshot_download
 
-        place: dict[str, Any] = {"repo_type": "dataset", "revision": self.commit, "local_dir": folder}
+        others = self._listed.keys() - set(paths)
+        wanted = ("allow_patterns", paths) if len(paths) < len(others) else ("ignore_patterns", others)
+        options: dict[str, Any] = {wanted[0]: [glob.escape(path) for path in wanted[1]], "local_dir": folder}
         with hub_errors(self.name, "download", revision=self.revision):
-            snapshot_download(self.name, allow_patterns=[glob.escape(path) for path in paths], **place)
+            snapshot_download(self.name, repo_type="dataset", revision=self.commit, **options)
 
     def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
         """Upload files and remove others in one commit, and set the tags."""

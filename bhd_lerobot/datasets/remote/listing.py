@@ -3,18 +3,19 @@
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.datasets.format.info import InfoError, checked_info, parse_object
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
-    from bhd_lerobot.datasets.remote.local import LocalDataset
+    from bhd_lerobot.datasets.remote.hub import HubDataset
+    from bhd_lerobot.datasets.remote.store import StoreDataset
 
 CARD = "README.md"
 PREVIEW = "preview.png"
@@ -77,30 +78,11 @@ class Item:
     size: int
 
 
-class Remote(Protocol):
-    """A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
+type Remote = HubDataset | StoreDataset
+"""A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
 
-    Attributes:
-        name: what the user calls it.
-        folder: where it lies, if that is on this machine.
-        has_checksums: whether its files are listed with checksums; then an interrupted download can be resumed.
-    """
-
-    name: str
-    folder: Path | None
-    has_checksums: bool
-
-    def files(self) -> dict[str, RemoteFile]:
-        """Return all files by path; none if there is nothing yet."""
-
-    def read(self, path: str) -> bytes | None:
-        """Return the content of a small file; None if there is none."""
-
-    def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy listed files into a folder."""
-
-    def send(self, source: "LocalDataset", items: Sequence[Item], deleted: Sequence[str]) -> None:
-        """Put files there and remove others, so that a reader never takes a part for the whole."""
+Where `has_checksums` is on, files are listed with theirs, and an interrupted download can be resumed.
+"""
 
 
 def matching(contents: Mapping[str, Path | bytes], files: Mapping[str, RemoteFile]) -> set[str]:

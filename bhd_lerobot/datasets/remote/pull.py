@@ -39,17 +39,10 @@ _SPARE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class PullReport:
-    """What a pull did.
+    """What a pull did: files that were fetched, and those that were there already (`kept`).
 
-    Attributes:
-        root: the dataset on this machine.
-        episodes: the episodes that were chosen, and those that were there before, by number; None if none were.
-        is_whole: whether it holds all files, though only some episodes may have been requested.
-        total_episodes: episodes of the whole dataset.
-        fetched: files that were fetched.
-        fetched_bytes: their bytes.
-        kept: files that were there already.
-        problem: why the dataset is not valid, as it is not where it came from either; empty if it is.
+    `episodes` are those that were chosen, now or before, None if none were; `is_whole` says whether all files are there
+    nevertheless. `problem` says why the dataset is not valid, as it is not where it came from either.
     """
 
     root: Path
@@ -180,7 +173,7 @@ class _Pull:
                     (folder / path).unlink(missing_ok=True)
                 raise TransferError(
                     f"Could not download {self._remote.name}: {listed(wrong)} differs from what is listed. It was "
-                    "changed meanwhile, or damaged on the way."
+                    "changed meanwhile, or lost or damaged on the way."
                 )
             self._fetched += missing
         self._staged |= new

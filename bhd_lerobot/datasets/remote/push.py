@@ -45,17 +45,9 @@ type MakeCard = Callable[[DatasetState, bool], Card]
 
 @dataclass(frozen=True)
 class PushReport:
-    """What a push did.
+    """What a push did: files that were sent, there already (`kept`), removed there, and not sent (`left_out`).
 
-    Attributes:
-        name: where the dataset lies now.
-        episodes: episodes it holds.
-        sent: files that were sent.
-        sent_bytes: their bytes.
-        kept: files that were there already.
-        deleted: files that belonged to no episode any more and were removed there.
-        left_out: files on this machine that belong to no episode and were not sent.
-        kept_card: whether a card there that was not generated is left as it is.
+    `kept_card` says whether a card there that was not generated is left as it is.
     """
 
     name: str
