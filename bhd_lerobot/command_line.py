@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from bhd_lerobot.errors import BhdError, unknown_name
-from bhd_lerobot.renames import check_options
 
 FAILED = 2
 """The exit status after an error with a message."""
@@ -72,7 +71,7 @@ def asks_for_help(arguments: Sequence[str]) -> bool:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of options that names the nearest command or option, and what replaced one of version 0.1."""
+    """A parser of options that names the nearest command or option."""
 
     def error(self, message: str) -> NoReturn:
         """End with status 2, the usage, and what is wrong."""
@@ -81,15 +80,10 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
-        """Return what a command line asks for.
-
-        Raises:
-            ConfigError: an option of version 0.1 that was renamed or removed.
-        """
+        """Return what a command line asks for."""
         options, unknown = self.parse_known_args(arguments)
         if unknown:
             command: argparse.ArgumentParser = getattr(options, "command_parser", self)
-            check_options(command.prog.rpartition(" ")[2], unknown)
             if not unknown[0].startswith("-"):
                 command.error(f"there is an argument too many: {' '.join(unknown)}")
             valid = set(re.findall(r"(?<![\w-])--[\w-]+", command.format_help()))

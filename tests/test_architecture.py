@@ -27,10 +27,9 @@ _TASKS = ("bodies", "control", "control.geometry")
 _DATASETS = ("datasets.format", "datasets.storage")
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
-    "renames": (),
     "versions": (),
     "stock": (),
-    "command_line": ("renames",),
+    "command_line": (),
     "bodies": (),
     "plugins": ("bodies",),
     "sim": ("versions", "bodies.body", "bodies.tabletop"),
@@ -56,7 +55,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "policies.language": (*_TASKS, "policies", "policies.manipulation", "policies.perception"),
     "policies.dagger": (*_TASKS, "policies", "policies.manipulation", "policies.navigation"),
     "datasets.storage": (),
-    "datasets.format": ("renames", "datasets.storage"),
+    "datasets.format": ("datasets.storage",),
     "datasets.assembly": _DATASETS,
     "datasets.edit": (*_DATASETS, "datasets.assembly", "plugins", "tasks"),
     "datasets.validate": (*_DATASETS, "control.geometry"),
@@ -70,7 +69,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "rosbag.exporter": (*_DATASETS, "datasets.edit", "rosbag.messages", "rosbag.storage"),
     "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),
     "rollout": (
-        *("__version__", "command_line", "renames", "plugins", "registry"),
+        *("__version__", "command_line", "plugins", "registry"),
         *("tasks", "bodies", "sim", "control", "robots.*", "policies.*", "datasets.format"),
     ),
     "hub": ("plugins", "bodies.body", *_DATASETS, "datasets.remote", "rollout"),

@@ -24,14 +24,7 @@ _UNITS = ((".pos", "m or rad"), (".vel", "m/s or rad/s"))
 
 @dataclass(frozen=True)
 class CardOptions:
-    """What a card has besides the content of the dataset.
-
-    Attributes:
-        repo_id: its name on the Hub; None if it lies elsewhere.
-        url: where it lies then.
-        licence: identifier of the licence, as the Hub knows them.
-        tags: further tags.
-    """
+    """What a card has besides the content of the dataset; it lies at `url` if it is not on the Hub."""
 
     repo_id: str | None = None
     url: str = ""
@@ -40,13 +33,7 @@ class CardOptions:
 
 
 def make_card(state: DatasetState, options: CardOptions, *, has_image: bool = False) -> Card:
-    """Return the card of a dataset; always the same for the same dataset.
-
-    Args:
-        state: the dataset.
-        options: what it has besides.
-        has_image: the user has put an image beside the dataset: the card shows that one, and none is drawn.
-    """
+    """Return the card of a dataset; always the same for the same dataset."""
     summary, identity = dataset_info(state.root), state.identity or {}
     drawn = (None, "An image of the dataset") if has_image else draw(summary, state)
     rows = [

@@ -23,29 +23,10 @@ def push_dataset(
     licence: str = "apache-2.0",
     card: bool = True,
     replace: bool = False,
-    verify: bool = False,
     storage: str | None = None,
     again: str | None = None,
 ) -> "PushReport":
-    """Upload a dataset, with its card.
-
-    Args:
-        root: the dataset.
-        target: name on the Hub, or a URL.
-        branch: branch of the Hub to write to; the main one if None.
-        tag: a further tag for what is pushed.
-        private: whether a repository that is made is private; None leaves it to the Hub.
-        tags: tags of the card.
-        licence: licence of the card.
-        card: whether a card is made.
-        replace: overwrite a dataset there that is another one, or has more episodes.
-        verify: read what lies below a URL and compare that, instead of the list of it.
-        storage: options of the URL's file system, JSON.
-        again: the command to repeat.
-
-    Raises:
-        BhdError: it was not uploaded; the message has the reason, that the dataset is kept, and the command to repeat.
-    """
+    """Upload a dataset, with its card."""
     from bhd_lerobot.datasets.format.state import DatasetState
     from bhd_lerobot.datasets.remote.push import Card, push
     from bhd_lerobot.datasets.remote.url import shown
@@ -60,7 +41,7 @@ def push_dataset(
     quiet_bars()
     try:
         remote = remote_of(target, storage, revision=branch, private=private, tag=tag, create=True)
-        return push(root, remote, make_card=make if card else None, replace=replace, verify=verify)
+        return push(root, remote, make_card=make if card else None, replace=replace)
     except ConfigError:
         raise
     except BhdError as error:
@@ -75,15 +56,11 @@ def push_command(root: Path, target: str, *, private: bool = False, tags: Sequen
 
 def left_by_interrupt(root: Path, again: str) -> str:
     """Return what an interrupted push leaves, and how to go on."""
-    return f"the dataset at {root} is unchanged, and what arrived is not sent again. Go on with:\n  {again}"
+    return f"the dataset at {root} is unchanged. Go on with:\n  {again}"
 
 
 def check_pushable(repo_id: str) -> None:
-    """Check what can be checked without asking the Hub: the name, and that there is a token.
-
-    Raises:
-        BhdError: names what is missing.
-    """
+    """Check what can be checked without asking the Hub: the name, and that there is a token."""
     from bhd_lerobot.datasets.remote.hub_errors import require_token
 
     require_token(check_repo_id(repo_id))

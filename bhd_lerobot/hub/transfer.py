@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 PATIENCE_S = 3.0
 """How long the threads of a transfer may take to end after Ctrl-C [s]; a stalled connection holds them for minutes."""
 
+_PLACES = {"command", "places", "source", "root", "repo_id"}
+
 
 def command_line(command: str, places: Sequence[object], **options: Any) -> str:
     """Return a command as the user would type it; options that are None, false or empty are left out."""
@@ -37,29 +39,15 @@ def command_line(command: str, places: Sequence[object], **options: Any) -> str:
 
 
 def repeat_line(options: argparse.Namespace, *places: object, **others: object) -> str:
-    """Return the command that repeats this one.
-
-    Args:
-        options: of this command, with the `command_parser` that read them; values that are its defaults are left
-            out.
-        places: what stands behind the command's name, whichever way it was given.
-        others: options that say a place, likewise.
-    """
+    """Return the command that repeats this one, with the options that are not defaults."""
     parser: argparse.ArgumentParser = options.command_parser
     given = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
     rest = {name: value for name, value in given.items() if name not in _PLACES}
     return command_line(options.command, places, **others, **rest)
 
 
-_PLACES = {"command", "places", "source", "root", "repo_id"}
-
-
 def refuse_empty(options: argparse.Namespace) -> None:
-    """Refuse an option without a value: it is a variable of the shell that was not set, more often than a wish.
-
-    Raises:
-        ConfigError: there is one.
-    """
+    """Refuse an option without a value: it is a variable of the shell that was not set, more often than a wish."""
     for name, value in vars(options).items():
         if value == "" or (isinstance(value, list) and "" in value):
             what = f"--{name}" if name not in ("places", "source") else "A name"
@@ -67,11 +55,7 @@ def refuse_empty(options: argparse.Namespace) -> None:
 
 
 def folder_of(text: str) -> Path:
-    """Return the folder that is meant.
-
-    Raises:
-        ConfigError: no folder can have this name, or it must not be read.
-    """
+    """Return the folder that is meant."""
     try:
         folder = Path(text).expanduser()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -84,47 +68,20 @@ def folder_of(text: str) -> Path:
 
 
 def warn_of_folder(name: str, root: Path) -> None:
-    """Warn that a name is one on the Hub if it could also be a folder here.
-
-    Args:
-        name: the name on the Hub.
-        root: the folder of the dataset here, which is not meant.
-    """
+    """Warn that a name is one on the Hub if it could also be a folder here, other than that of the dataset."""
     folder = Path(name).absolute()
     if folder.parent.is_dir() and folder != root.absolute():
         print(f"{name} is taken for a name on the Hub. The folder here would be file://{folder}", file=sys.stderr)
 
 
-def for_urls(options: argparse.Namespace) -> None:
-    """Refuse what means something for a URL only, where a name on the Hub was given.
-
-    Raises:
-        ConfigError: there is such an option.
-    """
-    if options.storage_options is not None:
-        raise ConfigError("--storage_options is for URLs, not for the Hub.")
-    if options.verify:
-        raise ConfigError(
-            "--verify is for URLs. The Hub makes its checksums from the contents itself, so they are always compared."
-        )
-
-
 def remote_of(place: str, storage: str | None, **options: Any) -> "Remote":
-    """Return a place that a dataset is copied to or from.
-
-    Args:
-        place: a name on the Hub, or a URL.
-        storage: options of the URL's file system, JSON.
-        options: what `HubDataset` takes.
-
-    Raises:
-        ConfigError: it can be no such place, or `storage` is no JSON object.
-        TransferError: what serves the URL is not installed, or cannot be reached.
-    """
+    """Return a place that a dataset is copied to or from."""
     from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.store import StoreDataset
 
     if not is_url(place):
+        if storage is not None:
+            raise ConfigError("--storage_options is for URLs, not for the Hub.")
         return HubDataset(place, **options)
     try:
         found = json.loads(storage or "{}")

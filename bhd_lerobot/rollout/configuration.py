@@ -23,7 +23,6 @@ import yaml
 from bhd_lerobot.command_line import asks_for_help, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 from bhd_lerobot.plugins import load_named, load_plugins
-from bhd_lerobot.renames import check_values
 
 CONFIG_PATH = "config_path"
 
@@ -55,9 +54,8 @@ def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -
         prefix: what stands before the fields' names in messages, ``"robot."``, for example.
 
     Raises:
-        ConfigError: an unknown or missing key, a value that cannot be honoured, or names of version 0.1.
+        ConfigError: an unknown or missing key, or a value that cannot be honoured.
     """
-    check_values(values)
     _check_keys(config_class, values, prefix)
     try:
         return draccus.decode(config_class, values)

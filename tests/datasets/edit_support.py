@@ -1,6 +1,5 @@
 """What is in a dataset, episode by episode, read without the code that edits datasets."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from tests.datasets import support
 
@@ -72,23 +70,6 @@ def assert_valid(root: Path) -> None:
     """Assert that `bhd-data check` finds no error: counts, files, videos, and statistics that are those of the data."""
     found = check_dataset(root, lambda robot: {})
     assert [str(finding) for finding in found.findings if finding.severity is Severity.ERROR] == []
-
-
-def steps_of(action: Callable[[], object]) -> int:
-    """Return how many changes of the disk an action makes."""
-    count = 0
-
-    def step(name: str, path: Path) -> None:
-        nonlocal count
-        count += 1
-
-    before = disk._before_step
-    disk._before_step = step
-    try:
-        action()
-    finally:
-        disk._before_step = before
-    return count
 
 
 def stack(root: Path, key: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What processes do that a test kills: they record or edit, and may die before a given change of the disk."""
+"""What processes do that a test kills: they record, and may die before a given change of the disk."""
 
 import itertools
 import os
@@ -6,15 +6,8 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from bhd_lerobot.datasets.edit import edits
 from bhd_lerobot.datasets.storage import disk
 from tests.datasets import support
-
-
-def delete(root: Path, episodes: list[int], die_at: int) -> None:
-    """Delete episodes, and die before the change of the disk with this number."""
-    disk._before_step = _dying(die_at)
-    edits.delete(root, episodes)
 
 
 def save(

@@ -98,6 +98,11 @@ def read_back(root: Path) -> int:
     return len(summary.episodes)
 
 
+def snapshot(root: Path) -> dict[str, bytes]:
+    """Return every file below a folder."""
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
 def verify(root: Path, saved: int, *, video: bool = False, exact: bool = True, stats: bool = False) -> int:
     """Load a dataset with stock LeRobot and compare everything in it with what was recorded.
 

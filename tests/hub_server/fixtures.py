@@ -68,8 +68,3 @@ def stored(hub: HubServer, revision: str = "main") -> dict[str, bytes]:
     """Return every file there but the one that the Hub makes."""
     files = hub.dataset("me/d").files(revision)
     return {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
-
-
-def content(root: Path) -> dict[str, bytes]:
-    """Return every file below a folder."""
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}

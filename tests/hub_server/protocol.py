@@ -16,7 +16,6 @@ _REPO = r"(?P<kind>models|datasets)/(?P<name>[^/]+/[^/]+)"
 
 
 ROUTES = [
-    ("GET", "/api/whoami-v2", "whoami"),
     ("POST", "/api/repos/create", "create"),
     ("DELETE", "/api/repos/delete", "delete"),
     ("POST", "/api/validate-yaml", "validate"),
@@ -24,7 +23,6 @@ ROUTES = [
     ("GET", rf"/api/{_REPO}/revision/(?P<revision>.+)", "info"),
     ("GET", rf"/api/{_REPO}/refs", "refs"),
     ("GET", rf"/api/{_REPO}/tree/(?P<revision>[^/]+)(?:/(?P<path>.+))?", "tree"),
-    ("POST", rf"/api/{_REPO}/paths-info/(?P<revision>[^/]+)", "paths"),
     ("POST", rf"/api/{_REPO}/preupload/(?P<revision>.+)", "preupload"),
     ("POST", rf"/api/{_REPO}/commit/(?P<revision>.+)", "commit"),
     ("POST DELETE", rf"/api/{_REPO}/tag/(?P<revision>.+)", "tag"),
@@ -63,12 +61,6 @@ class HubHandler(Handler):
         if oid is None:
             raise RefusalError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
         return oid
-
-    def _whoami(self, _: bytes) -> None:
-        user, _may = self._user()
-        if not user:
-            raise RefusalError(401, "Invalid username or password.")
-        self._answer({"type": "user", "name": user, "orgs": [], "auth": {"type": "access_token"}})
 
     def _create(self, body: bytes) -> None:
         wanted = json.loads(body)
@@ -113,21 +105,6 @@ class HubHandler(Handler):
         query = parse_qs(urlsplit(self.path).query)
         recursive = query.get("recursive", ["false"])[0].lower() in ("true", "1")
         self._answer(entries(files, path or "", recursive=recursive))
-
-    def _paths(self, body: bytes, kind: str, name: str, revision: str) -> None:
-        repository = self._repository(kind, name)
-        files = repository.commits[self._revision(repository, revision)]
-        if self.headers.get("Content-Type", "").startswith("application/json"):
-            wanted = json.loads(body)["paths"]
-        else:
-            wanted = parse_qs(body.decode()).get("paths", [])
-        every = [one for path in files for one in entries(files, path.rpartition("/")[0], recursive=False)]
-        known = {one["path"]: one for one in every}
-        for path in files:
-            for number in range(1, path.count("/") + 1):
-                folder = "/".join(path.split("/")[:number])
-                known.setdefault(folder, {"type": "directory", "oid": "0" * 40, "path": folder, "size": 0})
-        self._answer([known[path] for path in wanted if path in known])
 
     def _refs(self, _: bytes, kind: str, name: str) -> None:
         repository = self._repository(kind, name)
@@ -184,11 +161,8 @@ class HubHandler(Handler):
                     if value["oid"] not in repository.objects:
                         raise RefusalError(400, "the LFS object was not uploaded")
                     files[value["path"]] = Blob(repository.objects[value["oid"]], lfs=True)
-                elif one["key"] == "deletedFile":
-                    if files.pop(value["path"], None) is None:
-                        raise RefusalError(404, "A file with this name doesn't exist", "EntryNotFound")
-                elif one["key"] == "deletedFolder":
-                    files = {path: blob for path, blob in files.items() if not path.startswith(value["path"])}
+                elif one["key"] == "deletedFile" and files.pop(value["path"], None) is None:
+                    raise RefusalError(404, "A file with this name doesn't exist", "EntryNotFound")
             oid = repository.add(revision, files)
         url = f"{self.hub.url}/{'' if kind == 'models' else kind + '/'}{name}/commit/{oid}"
         self._answer({"success": True, "commitOid": oid, "commitUrl": url})

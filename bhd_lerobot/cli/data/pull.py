@@ -2,7 +2,6 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,11 +9,9 @@ from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url, megabytes
-from bhd_lerobot.datasets.remote.url import shown
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError, counted
+from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError, counted
 from bhd_lerobot.hub.transfer import (
     folder_of,
-    for_urls,
     prompt_interrupt,
     quiet_bars,
     refuse_empty,
@@ -30,7 +27,7 @@ if TYPE_CHECKING:
 
 def add_to(commands: Commands) -> None:
     """Add `pull`."""
-    help_text = "download a dataset from the Hub or from below a URL, or some episodes of it; repeat it to go on"
+    help_text = "download a dataset from the Hub or from below a URL; from the Hub, also some episodes of it"
     command = add_command(commands, "pull", help_text, _run, names_dataset=False)
     command.add_argument("source", nargs="?", help="user/name on the Hub, or a URL")
     command.add_argument("--repo_id", help="the name on the Hub, as an option")
@@ -40,9 +37,6 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--outcome", help="only the files of episodes that ended so, such as success")
     command.add_argument("--min_score", type=float, help="only the files of episodes with at least this score, 0 to 1")
     command.add_argument("--replace", action="store_true", help="give up another or a changed dataset that is there")
-    command.add_argument(
-        "--verify", action="store_true", help="of a URL: read what is there also of files that are here, and compare"
-    )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
 
@@ -51,14 +45,14 @@ def _run(options: argparse.Namespace) -> int:
 
     source, root = _places(options)
     again = repeat_line(options, source, root=root)
-    kept = f"{root} is as it was, and what arrived is not fetched again."
+    kept = f"{root} is as it was{'' if is_url(source) else ', and what arrived is not fetched again'}."
     options.stopped = f"{kept} Go on with:\n  {again}"
     select = _selection(options)
     quiet_bars()
     with prompt_interrupt(options.stopped):
         remote = remote_of(source, options.storage_options, revision=options.revision)
         try:
-            report = pull(remote, root, select=select, replace=options.replace, verify=options.verify)
+            report = pull(remote, root, select=select, replace=options.replace)
         except (TransferError, DatasetWriteError) as error:
             raise type(error)(f"{error}\n{kept} When that is resolved, repeat:\n  {again}") from error
     print(format_report(report, source))
@@ -75,18 +69,11 @@ def format_report(report: "PullReport", source: str) -> str:
         )
     else:
         lines.append(f"  nothing to fetch: all {report.kept} files are there")
-    if report.by_size:
-        files = "1 file was" if report.by_size == 1 else f"{report.by_size} files were"
-        lines.append(
-            f"  {files} compared by size only, because no checksums are listed at {shown(source)}; --verify compares "
-            "contents"
-        )
     if report.episodes is not None:
         count = counted(len(report.episodes), "episode")
         lines[0] = f"{report.root}: {count} of {report.total_episodes}: {short(report.episodes)}"
         others = f"all {report.total_episodes}" if report.is_whole else "others, too"
-        label = source if not is_url(source) else report.root.name
-        words = ["bhd-train", f"--dataset.repo_id={label}", f"--dataset.root={report.root}"]
+        words = ["bhd-train", f"--dataset.repo_id={source}", f"--dataset.root={report.root}"]
         lines += [
             f"  a file holds many episodes: those that are here hold {others}. Name yours where you load them:",
             f'    {shlex.join(words)} --dataset.episodes="{report.episodes}"',
@@ -97,34 +84,17 @@ def format_report(report: "PullReport", source: str) -> str:
 
 
 def _selection(options: argparse.Namespace) -> "Select | None":
-    """Return what chooses the episodes; None if all are wanted.
-
-    Raises:
-        ConfigError: a value that cannot be honoured.
-    """
+    """Return what chooses the episodes; None if all are wanted."""
     if options.episodes is None and options.outcome is None and options.min_score is None:
         return None
     episodes = None if options.episodes is None else sorted(set(parse_episodes(options.episodes)))
     if options.outcome is None and options.min_score is None:
         return lambda _: episodes or []
-    from bhd_lerobot.datasets.loader.selection import EpisodeFilter
+    from bhd_lerobot.datasets.format.state import load_state
+    from bhd_lerobot.datasets.loader.selection import EpisodeFilter, StoredEpisodes
 
     wanted = EpisodeFilter(outcome=split_list(options.outcome) or "all", min_score=options.min_score)
-
-    def select(folder: Path) -> Sequence[int]:
-        from bhd_lerobot.stock import LeRobotDatasetMetadata
-
-        try:
-            return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
-        except BhdError:
-            raise
-        except Exception as error:  # LeRobot does not validate what it reads
-            raise DatasetError(
-                f"The metadata of the dataset cannot be read, so no episode can be chosen ({error!r}). Pull all of "
-                "it, without --outcome and --min_score, and run bhd-data check on it."
-            ) from error
-
-    return select
+    return lambda folder: wanted.select(StoredEpisodes.of(load_state(folder, files=False)), episodes)
 
 
 def _places(options: argparse.Namespace) -> tuple[str, Path]:
@@ -139,7 +109,6 @@ def _places(options: argparse.Namespace) -> tuple[str, Path]:
             raise ConfigError(f"{source} is a URL: it has no revisions. Leave --revision out.")
         return source, folder_of(options.root)
     check_repo_id(source)
-    for_urls(options)
     root = folder_of(options.root) if options.root else default_root(source)
     warn_of_folder(source, root)
     return source, root

@@ -10,7 +10,6 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.hub.push import format_push_report, left_by_interrupt, push_dataset
 from bhd_lerobot.hub.transfer import (
     folder_of,
-    for_urls,
     prompt_interrupt,
     refuse_empty,
     repeat_line,
@@ -21,7 +20,7 @@ from bhd_lerobot.hub.transfer import (
 
 def add_to(commands: Commands) -> None:
     """Add `push`."""
-    help_text = "upload a dataset to the Hub or below a URL: what differs, with a card; repeat it to go on"
+    help_text = "upload a dataset to the Hub or below a URL, with a card; to the Hub only what differs"
     command = add_command(commands, "push", help_text, _run, names_dataset=False)
     command.add_argument("places", nargs="*", metavar="ROOT [TARGET]", help="folder; user/name on the Hub, or a URL")
     command.add_argument("--root", help="the folder, as an option; LeRobot's default place of the name if nothing")
@@ -38,9 +37,6 @@ def add_to(commands: Commands) -> None:
     )
     command.add_argument(
         "--replace", action="store_true", help="overwrite a dataset there that is another one, or has more episodes"
-    )
-    command.add_argument(
-        "--verify", action="store_true", help="of a URL: read what is there, and compare that instead of the manifest"
     )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
@@ -60,7 +56,6 @@ def _run(options: argparse.Namespace) -> int:
             licence=options.licence,
             card=not options.no_card,
             replace=options.replace,
-            verify=options.verify,
             storage=options.storage_options,
             again=again,
         )
@@ -69,11 +64,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _places(options: argparse.Namespace) -> tuple[Path, str]:
-    """Return the folder and the target that were named in one way or another.
-
-    Raises:
-        ConfigError: one is missing, or named twice.
-    """
+    """Return the folder and the target that were named in one way or another."""
     refuse_empty(options)
     places = list(options.places)
     if places and options.root is None and not is_url(places[0]):
@@ -94,7 +85,6 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
             raise ConfigError("Name the folder of the dataset first: bhd-data push ROOT URL.")
         return folder_of(options.root), target
     check_repo_id(target)
-    for_urls(options)
     root = folder_of(options.root) if options.root else default_root(target)
     warn_of_folder(target, root)
     return root, target

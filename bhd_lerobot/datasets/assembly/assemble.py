@@ -71,12 +71,6 @@ def assemble(
         edit: the entry in ``meta/edits.jsonl``.
         identity: content of ``meta/bhd.json``; no such file if None.
         known: feature -> statistic -> values of all episodes of the only source; those that are stored if None.
-
-    Raises:
-        DatasetMismatchError: the sources have other columns, frame rates or robots.
-        DatasetCorruptError: a file of a source cannot be read.
-        UnsupportedDatasetError: a video cannot be cut without encoding again.
-        OSError: a file cannot be written.
     """
     sources = _sources(picks, known is not None)
     check_alike(sources)
@@ -116,11 +110,7 @@ def logged_now(edit: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_alike(sources: Sequence[DatasetState]) -> None:
-    """Check that episodes of several datasets can be in one.
-
-    Raises:
-        DatasetMismatchError: they cannot; the message lists every difference.
-    """
+    """Check that episodes of several datasets can be in one."""
     first = sources[0]
     for other in sources[1:]:
         found = list(differences("", _kind(first), _kind(other)))

@@ -30,19 +30,8 @@ def compact(
 ) -> bool:
     """Compact a dataset and store all statistics.
 
-    Args:
-        state: what is on disk now.
-        schema: its columns.
-        disk: how to write.
-        lock: of the dataset.
-        known: statistics of episodes that are still in memory; those of others are computed from their data.
-
     Returns:
         False if there was nothing to do.
-
-    Raises:
-        OSError: a file cannot be written; the dataset is then as it was.
-        DatasetCorruptError: a file cannot be read.
     """
     picks, rows = [Pick(state, row) for row in state.rows], [dict(row) for row in state.rows]
     plan = Plan(picks, rows, {task: index for index, task in enumerate(state.tasks)}, state.info, Files(picks))

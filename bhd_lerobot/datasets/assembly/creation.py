@@ -36,16 +36,6 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
     """Create an empty dataset and return the lock on it.
 
     It is built beside its place and renamed, so that a kill leaves either no dataset or a complete, empty one.
-
-    Args:
-        root: where to put it; must not exist.
-        info: content of ``meta/info.json``.
-        identity: content of ``meta/bhd.json``.
-        disk: how to write.
-
-    Raises:
-        DatasetExistsError: `root` exists.
-        DatasetWriteError: it cannot be written.
     """
 
     def fill(building: Path) -> None:
@@ -57,19 +47,7 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
 
 
 def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str = _RESUME) -> RootLock:
-    """Build a dataset beside its place, put it there, and return the lock on it.
-
-    Args:
-        root: where to put it; must not exist, or be an empty folder.
-        fill: writes everything into the folder that it is given.
-        disk: how to write.
-        remedy: what can be done if it exists.
-
-    Raises:
-        DatasetExistsError: `root` exists.
-        DatasetLockedError: it exists, and is being written.
-        DatasetWriteError: it cannot be written.
-    """
+    """Build a dataset beside its place, put it there, and return the lock on it."""
 
     def refuse() -> None:
         if not is_free(root):

@@ -31,11 +31,7 @@ def data_groups(plan: Plan) -> list[Group]:
 
 
 def video_groups(plan: Plan, key: str) -> list[Group]:
-    """Return which new video of a camera holds which runs of episodes; all of one video have the same encoding.
-
-    Raises:
-        DatasetCorruptError: a video cannot be read.
-    """
+    """Return which new video of a camera holds which runs of episodes; all of one video have the same encoding."""
     runs = list(plan.files.runs(f"videos/{key}"))
     paths = [run.source.root / layout.video_file(key, run.slot) for run in runs]
     signatures = {path: video.stream_signature(path) for path in dict.fromkeys(paths)}
@@ -47,21 +43,7 @@ def video_groups(plan: Plan, key: str) -> list[Group]:
 def build_data(
     plan: Plan, groups: Sequence[Group], new: Path, disk: Disk, *, take: Take, schema: pa.Schema | None = None
 ) -> None:
-    """Write the data files below `new`, and into the rows the file of each episode.
-
-    Args:
-        plan: the new dataset.
-        groups: from `data_groups`.
-        new: its root.
-        disk: how to write.
-        take: called with the old and the new path of a file that stays as it is.
-        schema: the columns; those of the first file if None.
-
-    Raises:
-        DatasetCorruptError: a data file cannot be read.
-        DatasetMismatchError: the columns of one dataset are stored in another way.
-        OSError: a file cannot be written.
-    """
+    """Write the data files below `new`, and into the rows the file of each episode."""
     first = groups[0].runs[0]
     schema = schema or _schema(first.source.root / layout.data_file(first.slot))
     for group in groups:
@@ -82,13 +64,7 @@ def build_data(
 
 
 def build_videos(plan: Plan, key: str, groups: Sequence[Group], new: Path, disk: Disk, *, take: Take) -> None:
-    """Write the videos of a camera below `new`, and into the rows the place of each episode; see `build_data`.
-
-    Raises:
-        DatasetCorruptError: a video cannot be read.
-        UnsupportedDatasetError: one cannot be cut without encoding again.
-        OSError: a file cannot be written.
-    """
+    """Write the videos of a camera below `new`, and into the rows the place of each episode; see `build_data`."""
     fps, rows, kind = plan.info["fps"], plan.rows, f"videos/{key}"
     for group in groups:
         target = new / layout.video_file(key, group.target)

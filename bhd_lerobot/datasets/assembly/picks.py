@@ -66,7 +66,6 @@ class Files:
     """The episodes of each file, computed once for each dataset."""
 
     def __init__(self, picks: Sequence[Pick]) -> None:
-        """Store the picks."""
         self._picks = picks
         self._rows: dict[tuple[int, str], dict[Slot, list[Row]]] = {}
         self._tasks: dict[tuple[int, Slot], dict[int, tuple[NDArray[np.int64], list[str]]]] = {}
@@ -83,11 +82,7 @@ class Files:
         return self._of_frames(pick)[0]
 
     def instructions(self, pick: Pick) -> list[str]:
-        """Return the instructions of an episode: those of its frames, whatever its row says.
-
-        Raises:
-            DatasetCorruptError: the data file cannot be read, or has a number that is no instruction's.
-        """
+        """Return the instructions of an episode: those of its frames, whatever its row says."""
         return self._of_frames(pick)[1]
 
     def _of_frames(self, pick: Pick) -> tuple[NDArray[np.int64], list[str]]:

@@ -48,7 +48,6 @@ class EditReport:
     is_repeated: bool = False
 
     def __str__(self) -> str:
-        """Return the report for a terminal."""
         note = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
         size = f"{counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}"
         return f"{self.root}: {size}{note if self.is_repeated else ''}"
@@ -59,19 +58,7 @@ type OnDone = Callable[[EditReport], object]
 
 
 def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
-    """Make one dataset of all episodes of several, in their order.
-
-    Args:
-        roots: the datasets; they stay as they are.
-        target: the new one; must not exist.
-
-    Raises:
-        ConfigError: fewer than two datasets, or one of them twice.
-        DatasetMismatchError: they have other robots, frame rates or features.
-        DatasetExistsError: `target` exists.
-        DatasetLockedError: one of them is being recorded.
-        DatasetError: one of them is no valid, finalised dataset, or cannot be written.
-    """
+    """Make one dataset of all episodes of several, in their order."""
     paths = [Path(root) for root in roots]
     if len(paths) < 2:
         raise ConfigError(f"Merging takes at least two datasets; got {len(paths)}.")
@@ -88,18 +75,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
 
 
 def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:
-    """Make a dataset of some episodes of another, which stays as it is.
-
-    Args:
-        root: the dataset.
-        episodes: the wanted ones, in the wanted order.
-        target: the new one; must not exist.
-
-    Raises:
-        DatasetExistsError: `target` exists.
-        DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
-    """
+    """Make a dataset of some episodes of another, which stays as it is."""
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         edit, recording = _kept(state, episodes, "keep")
@@ -107,19 +83,7 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
 
 
 def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | str) -> list[EditReport]:
-    """Make several datasets of the episodes of one, which stays as it is.
-
-    Args:
-        root: the dataset.
-        parts: the episodes of each new dataset, by its name.
-        folder: where they come to lie, each under its name; none of them may exist.
-
-    Raises:
-        ConfigError: an episode is wanted in two parts.
-        DatasetExistsError: one of the new datasets exists; then none is written.
-        DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
-    """
+    """Make several datasets of the episodes of one, which stays as it is."""
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
         for episode in episodes:
@@ -159,16 +123,6 @@ def delete(root: Path | str, episodes: Sequence[int], on_done: OnDone = lambda _
 
     A kill at any moment leaves either the old dataset or the new one. If the new one is in place and `on_done` has not
     returned, the same call only reports that, and another one with numbers of episodes is refused once.
-
-    Args:
-        root: the dataset.
-        episodes: what is removed.
-        on_done: called with the report.
-
-    Raises:
-        DatasetLockedError: it is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, no episode would be left, or the disk
-            refuses.
     """
     edit = {"edit": "delete", "episodes": sorted(set(episodes))}
 
@@ -201,18 +155,7 @@ class Change:
 def rewrite(
     root: Path, request: Mapping[str, Any], change: Callable[[DatasetState], Change], on_done: OnDone
 ) -> EditReport:
-    """Put other content into a dataset.
-
-    Args:
-        root: the dataset.
-        request: JSON values by which a repeated edit is recognised.
-        change: makes the new content from the old.
-        on_done: called with the report.
-
-    Raises:
-        DatasetWriteError: the disk refuses; the dataset is as it was.
-        DatasetCorruptError: one of its files cannot be read.
-    """
+    """Put other content into a dataset."""
     with contextlib.ExitStack() as stack:
         lock = _lock(root)
         stack.callback(lock.release)
@@ -258,11 +201,7 @@ def _unreported(root: Path) -> dict[str, Any] | None:
 
 
 def check_reported(root: Path) -> None:
-    """Refuse, once, numbers of episodes after an edit that was not reported.
-
-    Raises:
-        DatasetError: there was one.
-    """
+    """Refuse, once, numbers of episodes after an edit that was not reported."""
     if (last := _unreported(root)) is None:
         return
     request = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
@@ -300,7 +239,6 @@ def _write_new(
 def _fill(
     folder: Path, disk: Disk, picks: Sequence[Pick], edit: Mapping[str, Any], recording: Mapping[str, Any]
 ) -> None:
-    """Write a new dataset into a folder."""
     identities = [pick.source.identity for pick in picks]
     identity = None
     if identities and all(identity is not None for identity in identities):
@@ -337,12 +275,7 @@ def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = Fals
 
 
 def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
-    """Check that there are such episodes, and that none is named twice.
-
-    Raises:
-        DatasetError: there is no such episode.
-        ConfigError: one is named twice.
-    """
+    """Check that there are such episodes, and that none is named twice."""
     wrong = sorted({episode for episode in episodes if not 0 <= episode < len(state.rows)})
     if wrong:
         raise DatasetError(f"There is no episode {wrong[0]} in {state.root}; valid: 0 to {len(state.rows) - 1}.")
@@ -370,7 +303,6 @@ def _lock(root: Path) -> RootLock:
 
 
 def _state_of(root: Path) -> DatasetState:
-    """Return what is in a dataset that has episodes."""
     state = load_state(root)
     if not state.rows:
         raise DatasetError(f"{root} is empty: it has no episodes.")

@@ -49,13 +49,6 @@ def mark(
         clear_interventions: take back all interventions.
         note: why; for the log.
         on_done: called with the report; see `bhd_lerobot.datasets.edit.edits.delete`.
-
-    Raises:
-        ConfigError: there is no mark, or an unknown outcome, one that the task or robot cannot have, or impossible
-            frames.
-        DatasetLockedError: the dataset is being recorded.
-        DatasetError: there is no such episode or no valid, finalised dataset, the dataset has no column for it, or the
-            disk refuses; it is then as it was.
     """
     if outcome is not None and outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", outcome, OUTCOMES))
@@ -96,7 +89,6 @@ def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
 
 
 def _task_of(state: DatasetState, row: Row) -> str | None:
-    """Return the type of an episode's task; None if it is unknown."""
     try:
         task = json.loads(row.get("bhd/task") or "null") or (state.identity or {})["recording"]["task"]
         return str(task["type"])

@@ -29,11 +29,7 @@ NUMBERS = ("episode_index", "frame_index", "index")
 
 
 def numbers_of(rows: Sequence[Row]) -> dict[str, NDArray[np.int64]]:
-    """Return the numbers that the frames of a data file have to have, in order, each of shape (frames,).
-
-    Args:
-        rows: all episodes of the file, ascending.
-    """
+    """Return the numbers that the frames of a data file have to have, in order, each of shape (frames,)."""
     lengths = np.array([row["length"] for row in rows], np.int64)
     frame = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return {
@@ -48,10 +44,6 @@ def order_of(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> NDArra
 
     `index` follows from the others. It need not be right where they are in order, and else says whether they are to be
     believed.
-
-    Args:
-        table: its columns, at least those of `NUMBERS`.
-        wanted: what they have to be, in order; see `numbers_of`.
     """
     got = {key: table[key].to_numpy() for key in NUMBERS}
     if all(np.array_equal(got[key], wanted[key]) for key in ("episode_index", "frame_index")):
@@ -62,16 +54,7 @@ def order_of(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> NDArra
 
 
 def in_order(table: pa.Table, rows: Sequence[Row], path: Path) -> pa.Table:
-    """Return frames in the order of their numbers; the table itself if they are.
-
-    Args:
-        table: the frames, at least their numbers.
-        rows: the episodes whose frames they have to be, ascending.
-        path: the file that they were read from.
-
-    Raises:
-        DatasetCorruptError: they are others, or their numbers contradict each other.
-    """
+    """Return frames in the order of their numbers; the table itself if they are."""
     wanted = numbers_of(rows)
     order = order_of(table, wanted)
     if order is None:
@@ -94,16 +77,7 @@ def wrong_number(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> st
 
 
 def frames_of(path: Path, rows: Sequence[Row], columns: Sequence[str] | None = None) -> dict[int, pa.Table]:
-    """Return the frames of each episode of a data file, by its number.
-
-    Args:
-        path: the file.
-        rows: all episodes of the file, ascending.
-        columns: the columns that are needed; None for all.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or does not hold the frames of these episodes.
-    """
+    """Return the frames of each episode of a data file, by its number."""
     table = read_frames(path, None if columns is None else list(dict.fromkeys((*NUMBERS, *columns))))
     table = in_order(table, rows, path)
     starts = np.cumsum([0, *(row["length"] for row in rows)]).tolist()
@@ -122,9 +96,6 @@ def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str
         task_index: number of the instruction of each frame, shape (T,).
         tasks: the instructions in the order of their numbers.
         path: the file of the frames.
-
-    Raises:
-        DatasetCorruptError: a number is no instruction's.
     """
     numbers, first = np.unique(task_index, return_index=True)
     if numbers[0] < 0 or numbers[-1] >= len(tasks):
@@ -135,11 +106,7 @@ def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str
 
 
 def wrong_order(slots: Sequence[layout.Slot]) -> str:
-    """Return in which way the data files do not have the order of the episodes; empty if they do.
-
-    Args:
-        slots: the file of each episode, in the order of the episodes.
-    """
+    """Return in which way the data files do not have the order of the episodes; empty if they do."""
     names = [layout.data_file(slot) for slot in slots]
     for episode in range(1, len(names)):
         if names[episode] < names[episode - 1]:
@@ -151,17 +118,7 @@ def wrong_order(slots: Sequence[layout.Slot]) -> str:
 
 
 def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = None) -> list[dict[str, NDArray]]:
-    """Return columns of scalars, by key, of one episode or of all, each of shape (frames,).
-
-    Args:
-        root: the dataset.
-        keys: the columns; those that the dataset does not have are left out.
-        episode: the only episode that is wanted; all if None.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: a file cannot be read.
-    """
+    """Return columns of scalars, by key, of one episode or of all, each of shape (frames,)."""
     root = Path(root)
     state = load_state(root)
     present = [key for key in keys if key in state.info["features"]]
@@ -176,26 +133,12 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
 
 
 def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
-    """Return every column of an episode but its videos, by key, each of shape (frames, ...).
-
-    Args:
-        root: the dataset.
-        index: the episode.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: the file cannot be read.
-    """
+    """Return every column of an episode but its videos, by key, each of shape (frames, ...)."""
     return next(read_episodes(root, [index]))
 
 
 def read_episodes(root: Path | str, indices: Iterable[int]) -> Iterator[dict[str, NDArray]]:
-    """Yield every column of episodes as `read_episode` returns them, one episode at a time.
-
-    Raises:
-        DatasetError: there is no such dataset or episode.
-        DatasetCorruptError: a file cannot be read.
-    """
+    """Yield every column of episodes as `read_episode` returns them, one episode at a time."""
     root = Path(root)
     state = load_state(root)
     for index in indices:
@@ -240,9 +183,6 @@ def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.
         path: the video.
         start_s: time of the first one [s].
         count: how many.
-
-    Raises:
-        DatasetCorruptError: the video cannot be read, or ends before.
     """
     import av
 

@@ -22,11 +22,7 @@ _FLOATS = pa.list_(pa.field("element", pa.float64()))
 
 
 def metadata_types(metadata: Mapping[str, Any]) -> dict[str, pa.DataType]:
-    """Return the column type of every value of an episode's metadata.
-
-    Raises:
-        FrameError: a value is not a str, int, float, bool or list of floats.
-    """
+    """Return the column type of every value of an episode's metadata."""
     return {key: _type_of(key, value) for key, value in metadata.items()}
 
 
@@ -43,15 +39,7 @@ def _type_of(key: str, value: Any) -> pa.DataType:
 
 
 def checked_metadata(metadata: Mapping[str, Any], types: Mapping[str, pa.DataType]) -> Row:
-    """Return the metadata columns of one episode.
-
-    Args:
-        metadata: values by name.
-        types: what the episodes before had.
-
-    Raises:
-        FrameError: other keys than before, or a value that does not fit its column.
-    """
+    """Return the metadata columns of one episode."""
     if metadata.keys() != types.keys():
         raise FrameError(
             f"Every episode needs the same metadata. Missing: {sorted(types.keys() - metadata.keys())}; "
@@ -117,11 +105,7 @@ def _nested(stacked: np.ndarray) -> pa.Array:
 
 
 def read_stats(file: pq.ParquetFile) -> dict[str, dict[str, np.ndarray]]:
-    """Return the statistics in one file of ``meta/episodes``: feature -> statistic -> values of shape (E, ...).
-
-    Raises:
-        ValueError: one is no array of numbers.
-    """
+    """Return the statistics in one file of ``meta/episodes``: feature -> statistic -> values of shape (E, ...)."""
     names = [name for name in file.schema_arrow.names if name.startswith("stats/")]
     if len(set(names)) != len(names):
         raise ValueError("it has more than one column of a statistic")
@@ -149,11 +133,7 @@ def read_stats(file: pq.ParquetFile) -> dict[str, dict[str, np.ndarray]]:
 
 
 def stored_stats(path: Path) -> tuple[list[int], dict[str, dict[str, np.ndarray]]]:
-    """Return the episodes in one file of ``meta/episodes``, in its order, and their statistics as `read_stats` does.
-
-    Raises:
-        DatasetCorruptError: it cannot be read.
-    """
+    """Return the episodes in one file of ``meta/episodes``, in its order, and their statistics as `read_stats` does."""
     try:
         file = pq.ParquetFile(path)
         order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()

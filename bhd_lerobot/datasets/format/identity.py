@@ -9,18 +9,13 @@ from typing import Any
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
-from bhd_lerobot.renames import present
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
 
 
 def as_json(recording: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `recording` as it will read after a trip through JSON.
-
-    Raises:
-        ConfigError: it holds something that JSON cannot.
-    """
+    """Return `recording` as it will read after a trip through JSON."""
     try:
         return json.loads(json.dumps(dict(recording)))
     except (TypeError, ValueError) as error:
@@ -45,10 +40,6 @@ def check_identity(
         robot_type: the requested robot.
         recording: the requested description; None accepts the recorded one.
         video: the requested video settings; None accepts the recorded ones.
-
-    Raises:
-        DatasetMismatchError: with every difference: key, recorded value, requested value.
-        DatasetEditedError: it was edited after its recording.
     """
     if state.identity is None:
         raise DatasetMismatchError(
@@ -71,7 +62,7 @@ def check_identity(
     recorded["features"] = comparable(state.info["features"])
     requested["features"] = comparable(schema.features)
     if recording is not None:
-        recorded["recording"], requested["recording"] = present(state.identity["recording"]), as_json(recording)
+        recorded["recording"], requested["recording"] = _present(state.identity["recording"]), as_json(recording)
     if video is not None:
         recorded["video"], requested["video"] = state.identity["video"], as_json(video)
     found = list(differences("", recorded, requested))
@@ -112,11 +103,7 @@ def _short(value: Any) -> str:
 
 
 def local_name(root: str | Path | None) -> str:
-    """Return the `repo_id` of a dataset that was given a folder and no name: ``local/`` and the folder's name.
-
-    Raises:
-        ConfigError: no folder either.
-    """
+    """Return the `repo_id` of a dataset that was given a folder and no name: ``local/`` and the folder's name."""
     if not root:
         raise ConfigError("Neither dataset.root nor dataset.repo_id is given: name a folder, or user/name on the Hub.")
     name = re.sub(r"[^\w.-]", "_", Path(root).expanduser().resolve().name).strip("-.") or "dataset"
@@ -130,3 +117,17 @@ def default_root(repo_id: str) -> Path:
     from huggingface_hub.constants import HF_HOME
 
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser() / repo_id
+
+
+_RENAMED = {"corrected": "dagger"}
+"""Types of brains in the metadata of version 0.1: old to new."""
+
+
+def _present(recorded: Any) -> Any:
+    """Return metadata of a recording, as plain values, with the present names of what was renamed."""
+    if isinstance(recorded, Mapping):
+        values = {key: _present(value) for key, value in recorded.items()}
+        if isinstance(values.get("type"), str):
+            values["type"] = _RENAMED.get(values["type"], values["type"])
+        return values
+    return [_present(value) for value in recorded] if isinstance(recorded, list) else recorded

@@ -47,11 +47,7 @@ class InfoError(ValueError):
 
 
 def parse_object(content: bytes) -> dict[str, Any]:
-    """Return a JSON object.
-
-    Raises:
-        InfoError: it is none.
-    """
+    """Return a JSON object."""
     try:
         values = json.loads(content.decode("utf-8"))
         json.dumps(values, ensure_ascii=False).encode()  # half a surrogate pair is JSON, and no text
@@ -65,31 +61,14 @@ def parse_object(content: bytes) -> dict[str, Any]:
 
 
 def read_info(path: Path, place: str | Path, *, features: bool = True, counts: bool = True) -> dict[str, Any]:
-    """Return the content of an `info.json`, checked and with defaults; see `checked_info`.
-
-    Raises:
-        OSError: the file cannot be read.
-        InfoError: its content is not valid.
-        DatasetError: it is of another version.
-    """
+    """Return the content of an `info.json`, checked and with defaults; see `checked_info`."""
     return checked_info(parse_object(path.read_bytes()), place, features=features, counts=counts)
 
 
 def checked_info(
     values: Mapping[str, Any], place: str | Path, *, features: bool = True, counts: bool = True
 ) -> dict[str, Any]:
-    """Return the content of an `info.json` with defaults for what may be left out.
-
-    Args:
-        values: the content.
-        place: the dataset, for the message about its version.
-        features: check every feature, too; otherwise only that they are an object.
-        counts: whether the counts are required and checked.
-
-    Raises:
-        InfoError: a value is missing or not valid.
-        DatasetError: it is of another version.
-    """
+    """Return the content of an `info.json` with defaults for what may be left out."""
     for key in _REQUIRED if counts else ("codebase_version", "features", "fps"):
         if key not in values:
             raise InfoError(f"it has no {key!r}")

@@ -91,10 +91,6 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
         path: the file.
         schema: its columns, in order; used only if there is no footer.
         shapes: the shape of a row's value in columns of nested lists, whose type does not define it.
-
-    Raises:
-        OSError: the file cannot be read at all.
-        ValueError: rows of a column may have any length, so that the ends of its pages cannot be known.
     """
     try:
         whole = pq.ParquetFile(path, page_checksum_verification=True)
@@ -119,7 +115,6 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
 
 
 def _read(file: pq.ParquetFile) -> Rescued:
-    """Return the row groups whose pages are what was written."""
     tables: list[pa.Table] = []
     problems: list[str] = []
     lost = 0
@@ -171,7 +166,6 @@ def _example(kind: pa.DataType, name: str, shapes: Mapping[str, Sequence[int]]) 
 
 
 def _walk(data: memoryview, factors: Sequence[int]) -> list[list[_Chunk]]:
-    """Return the row groups from the beginning on."""
     groups: list[list[_Chunk]] = []
     position = len(MAGIC)
     while (chunks := _group(data, position, factors)) is not None:

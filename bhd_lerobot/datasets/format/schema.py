@@ -57,9 +57,6 @@ class Schema:
 
         Args:
             features: LeRobot feature dictionaries; the default features may be among them.
-
-        Raises:
-            ConfigError: a name, dtype or shape that cannot be recorded.
         """
         own = {key: _checked(key, feature) for key, feature in features.items() if key not in DEFAULT_FEATURES}
         if not own:
@@ -96,11 +93,7 @@ class Schema:
 
 
 def _language_array(values: np.ndarray, kind: pa.ListType) -> pa.ListArray:
-    """Return the rows of every frame as Arrow's nested arrays, which Arrow itself cannot make with JSON inside.
-
-    Raises:
-        FrameError: a row does not hold what LeRobot's rows hold, or a tool call.
-    """
+    """Return the rows of every frame as Arrow's nested arrays, which Arrow itself cannot make with JSON inside."""
     rows = [row for frame in values for row in frame]
     names = [kind.value_type.field(index).name for index in range(kind.value_type.num_fields)]
     for row in rows:

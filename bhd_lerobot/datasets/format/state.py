@@ -68,12 +68,13 @@ class DatasetState:
         """Camera features."""
         return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
-    def files(self) -> set[str]:
-        """Return all files of committed episodes, relative to the root."""
-        names = {layout.data_file(slot_of(row, "data")) for row in self.rows}
-        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in self.rows}
+    def files(self, episodes: Iterable[int] | None = None) -> set[str]:
+        """Return all files of some committed episodes, or of all, relative to the root."""
+        rows = self.rows if episodes is None else [self.rows[episode] for episode in episodes]
+        names = {layout.data_file(slot_of(row, "data")) for row in rows}
+        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in rows}
         for key in self.video_keys:
-            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in self.rows}
+            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in rows}
         return names
 
 
@@ -142,20 +143,11 @@ def no_dataset(root: Path) -> DatasetError:
     return DatasetError(message + hint)
 
 
-def load_state(root: Path, *, videos: bool = True, counted: bool = True) -> DatasetState:
+def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
 
-    Args:
-        root: the dataset.
-        videos: whether videos must be there, too.
-        counted: whether ``info.json`` must count the frames that the episodes have.
-
-    Reads file footers, not their pages: a damaged value inside a file is found by
-    `bhd_lerobot.datasets.recovery.repair.repair`.
-
-    Raises:
-        DatasetError: `root` is not a dataset, or a link in it leads out of it.
-        DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
+    File footers are read, not pages: `bhd_lerobot.datasets.recovery.repair.repair` finds damage inside a file. With
+    `files` off, data and videos need not be there; with `counted` off, ``info.json`` may count other frames.
     """
     complete_interrupted(root)
     if not (root / layout.INFO).is_file():
@@ -174,16 +166,13 @@ def load_state(root: Path, *, videos: bool = True, counted: bool = True) -> Data
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
-        _check_files(state, videos, counted)
+        if files:
+            _check_files(state, videos, counted)
     return state
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object.
-
-    Raises:
-        DatasetCorruptError: there is none.
-    """
+    """Return a JSON object."""
     try:
         return parse_object(path.read_bytes())
     except (OSError, InfoError) as error:
@@ -191,11 +180,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_identity(root: Path) -> dict[str, Any] | None:
-    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, or does not describe a recording.
-    """
+    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset."""
     path = root / layout.IDENTITY
     if not path.exists():
         return None
@@ -207,12 +192,7 @@ def read_identity(root: Path) -> dict[str, Any] | None:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, or a value is missing or not valid.
-        DatasetError: it is of another version.
-    """
+    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`."""
     path = root / layout.INFO
     try:
         return read_info(path, root)
@@ -221,11 +201,7 @@ def load_info(root: Path) -> dict[str, Any]:
 
 
 def numbered_tasks(path: Path) -> dict[int, str]:
-    """Return the instructions by their numbers, in the order of the file.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or has a number twice or none.
-    """
+    """Return the instructions by their numbers, in the order of the file."""
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
@@ -241,11 +217,7 @@ def numbered_tasks(path: Path) -> dict[int, str]:
 
 
 def read_tasks(path: Path) -> list[str]:
-    """Return the instructions in the order of their numbers.
-
-    Raises:
-        DatasetCorruptError: the file cannot be read, or its numbers are not those of a list.
-    """
+    """Return the instructions in the order of their numbers."""
     tasks = numbered_tasks(path)
     if tasks.keys() != set(range(len(tasks))):
         raise corrupt(path, f"its numbers are not 0 to {len(tasks) - 1}, each once")
@@ -289,11 +261,7 @@ def _read_rows(state: DatasetState) -> None:
 
 
 def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Return a data file, or some of its columns.
-
-    Raises:
-        DatasetCorruptError: it cannot be read, a page is not what was written, or a number is missing.
-    """
+    """Return a data file, or some of its columns."""
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
     except UNREADABLE as error:

@@ -30,10 +30,6 @@ def column_stats(columns: Mapping[str, np.ndarray], *, finite: bool = True) -> d
 
     Returns:
         Statistics as float64 arrays of shape (d,); `count` is the number of frames.
-
-    Raises:
-        FrameError: a value of an ``observation*`` or ``action*`` column is not finite: no policy could be normalised
-            with it. Other columns may hold such values; their statistics are those of the finite ones.
     """
     # Columns of one precision are stacked and sorted together: numpy sorts rows of floats with vector instructions,
     # and a call per column would cost more than the sorting.

@@ -110,10 +110,6 @@ def is_being_written(root: Path) -> bool:
 
 
 def check_not_empty(summary: DatasetSummary) -> None:
-    """Check that there is an episode.
-
-    Raises:
-        DatasetError: there is none.
-    """
+    """Check that there is an episode."""
     if not summary.episodes:
         raise DatasetError(f"{summary.root} is empty: it has no episodes.")

@@ -14,13 +14,7 @@ _DEEPEST = 32  # nested structs; Parquet's own have fewer than ten
 
 @dataclass
 class Field:
-    """A value and its wire type: bool, int, float, bytes, list of values, or dictionary of fields by number.
-
-    Attributes:
-        kind: the wire type.
-        value: the value.
-        element: wire type of the elements of a list.
-    """
+    """A value and its wire type: bool, int, float, bytes, list of values, or dictionary of fields by number."""
 
     kind: int
     value: Any
@@ -43,15 +37,10 @@ class Reader:
     """
 
     def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
-        """Start at `position`."""
         self._data, self.position = data, position
 
     def struct(self, depth: int = 0) -> Struct:
-        """Return the next struct.
-
-        Raises:
-            ValueError: what is there is none, or it is cut off.
-        """
+        """Return the next struct."""
         if depth > _DEEPEST:
             raise ValueError("structs are nested too deeply")
         fields: Struct = {}

@@ -45,11 +45,7 @@ class VideoSettings:
     queue_size: int = 16
 
     def check(self) -> None:
-        """Check that this machine can encode so.
-
-        Raises:
-            ConfigError: the encoder is not available, or a count is not positive.
-        """
+        """Check that this machine can encode so."""
         import av  # here and below: a dataset without cameras does not need ffmpeg at all
 
         if self.vcodec not in av.codecs_available or not _is_encoder(self.vcodec):
@@ -146,12 +142,7 @@ class CameraEncoder:
         self._thread.start()
 
     def add(self, image: np.ndarray) -> None:
-        """Queue a copy of one image of shape (H, W, 3), uint8.
-
-        Raises:
-            FrameError: wrong shape or type.
-            OSError: the encoder failed earlier.
-        """
+        """Queue a copy of one image of shape (H, W, 3), uint8."""
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != (*self._size, 3):
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise FrameError(f"An image of camera {self.path.stem!r} must be uint8 {(*self._size, 3)}; got {got}.")
@@ -159,11 +150,7 @@ class CameraEncoder:
         self.frames += 1
 
     def finish(self) -> np.ndarray:
-        """Encode what is queued, close the file and return the histograms, shape (T, 3, 256).
-
-        Raises:
-            OSError: the file could not be written completely.
-        """
+        """Encode what is queued, close the file and return the histograms, shape (T, 3, 256)."""
         self._put(None)
         self._thread.join()
         self._raise_error()
@@ -231,11 +218,7 @@ class EncodedVideo:
         self._histograms = histograms
 
     def finish(self) -> np.ndarray:
-        """Check the file and return the histograms.
-
-        Raises:
-            OSError: the file holds another number of images.
-        """
+        """Check the file and return the histograms."""
         if count_frames(self.path) != self.frames:
             raise OSError(f"{self.path.name} holds another number of frames than the {self.frames} that belong to it")
         return self._histograms
@@ -245,11 +228,7 @@ class EncodedVideo:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames a video file holds, by reading all of it but decoding nothing.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return how many frames a video file holds, by reading all of it but decoding nothing."""
     import av
 
     try:

@@ -22,11 +22,6 @@ def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int 
         parts: a file and its spans, in the order of the new video. All files have the same `stream_signature`.
         target: the new video.
         fps: frames per second of all of them.
-
-    Raises:
-        DatasetCorruptError: a video cannot be read, or has fewer frames than a span needs.
-        UnsupportedDatasetError: a span does not begin with a key frame.
-        OSError: the new video cannot be written.
     """
     import av
 

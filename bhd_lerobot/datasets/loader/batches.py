@@ -23,12 +23,10 @@ class Loader:
     """
 
     def __init__(self, dataset: Any, order: BatchOrder, device: torch.device | str | None = None) -> None:
-        """Prepare the first epoch."""
         self.dataset, self.order = dataset, order
         self.device = None if device is None else torch.device(device)
 
     def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
         return len(self.order)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -85,7 +83,6 @@ class LeRobotLoader(Loader):
     def __init__(
         self, dataset: Any, order: BatchOrder, device: torch.device | str | None = None, num_workers: int = 0
     ) -> None:
-        """Start `num_workers` processes that decode, on the first batch."""
         super().__init__(dataset, order, device)
         from bhd_lerobot.stock import lerobot_collate_fn
 

@@ -11,16 +11,7 @@ from bhd_lerobot.errors import DatasetError, quoted
 
 
 def check(dataset: Any, keys: Collection[str]) -> None:
-    """Check that a policy can learn from a dataset: it has the features, all values are finite, and can be normalised.
-
-    Args:
-        dataset: a `TableDataset` or `LeRobotDataset`.
-        keys: features that the policy reads or predicts.
-
-    Raises:
-        DatasetError: the dataset is empty, lacks a feature, or has a value that is not finite; or a standard deviation
-            is stored as 0 though its feature changes. The message names episode, frame and feature.
-    """
+    """Check that a policy can learn from a dataset: its features are there, finite, and can be normalised."""
     meta = dataset.meta
     if not dataset.num_frames:
         raise DatasetError(f"{meta.root} has no frame, so there is nothing to learn. Record some with bhd-record.")
@@ -46,14 +37,7 @@ def check(dataset: Any, keys: Collection[str]) -> None:
 
 
 def beyond(dataset: Any, key: str, low: str, high: str) -> float:
-    """Return the largest share of frames in which a number of a feature lies beyond two of its statistics, 0 to 1.
-
-    Args:
-        dataset: a `TableDataset` or `LeRobotDataset`.
-        key: the feature.
-        low: the lower statistic, such as `q01`.
-        high: the upper one.
-    """
+    """Return the largest share of frames in which a number of a feature lies beyond two of its statistics, 0 to 1."""
     stats = (dataset.meta.stats or {}).get(key, {})
     if low not in stats or high not in stats:
         return 0.0

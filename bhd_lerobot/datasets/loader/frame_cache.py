@@ -82,13 +82,7 @@ def check_memory(
     budget_gib: float,
     keys: Collection[str] | None = None,
 ) -> None:
-    """Check that columns and decoded images fit, before anything is read.
-
-    Raises:
-        DatasetError: a budget that is not positive.
-        UnsupportedDatasetError: a depth camera.
-        MemoryBudgetError: they do not fit.
-    """
+    """Check that columns and decoded images fit, before anything is read."""
     if not budget_gib > 0:
         raise DatasetError(f"The budget of the loader must be positive; got {budget_gib} GiB.")
     depth = [key for key in cameras if key in meta.depth_keys]
@@ -136,11 +130,6 @@ class FrameCache:
             cameras: camera features.
             tolerance_s: by how much a frame may miss its time [s].
             backend: LeRobot's video decoder whose pixels are wanted.
-
-        Raises:
-            DatasetError: a frame is missing in a video.
-            DatasetCorruptError: a file cannot be decoded.
-            MemoryBudgetError: memory ran out.
         """
         self._table, self._tolerance, self._backend = table, tolerance_s, backend
         self._stored = [key for key in cameras if key in table.images]

@@ -24,13 +24,6 @@ class Gatherer:
     """What all subsets of a dataset share: how to gather rows, worked out once."""
 
     def __init__(self, table: FrameTable, frames: FrameCache, deltas: Mapping[str, tuple[int, ...]]) -> None:
-        """Stack the columns.
-
-        Args:
-            table: the columns.
-            frames: the decoded images.
-            deltas: key -> window, in frames relative to the sample.
-        """
         self._table, self._frames = table, frames
         self._deltas = dict(deltas)
         self._windows = {window: np.asarray(window, dtype=np.int64) for window in deltas.values()}
@@ -94,11 +87,7 @@ def delta_indices(
     tolerance_s: float,
     keep: Collection[str] | None = None,
 ) -> dict[str, tuple[int, ...]]:
-    """Return delta_timestamps in frames.
-
-    Raises:
-        DatasetError: a key that the dataset does not have or that is not kept, or a time between two frames.
-    """
+    """Return delta_timestamps in frames."""
     result = {}
     for key, times in (delta_timestamps or {}).items():
         if key not in meta.features:

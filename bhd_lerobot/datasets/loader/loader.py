@@ -181,11 +181,7 @@ def _lerobot_dataset(
 
 
 def _check_positions(dataset: Any, episodes: Sequence[int], reason: str) -> None:
-    """Check that LeRobot's dataset finds the frames of a window: by their rows in the files, or by their numbers.
-
-    Raises:
-        DatasetError: it would serve frames of other episodes.
-    """
+    """Check that LeRobot's dataset finds the frames of a window: by their rows in the files, or by their numbers."""
     first, end = (np.asarray(dataset.meta.episodes[f"dataset_{one}_index"])[episodes] for one in ("from", "to"))
     wanted = np.concatenate([np.arange(*span) for span in zip(first, end, strict=True)])
     index = dataset.hf_dataset.data.column("index").to_numpy()
@@ -228,11 +224,7 @@ def _per_task(task_index: Tensor, limit: int) -> Tensor:
 
 
 def expert_stats(meta: Any) -> None:
-    """Put the statistics of what the expert would have done in place of those of what was done.
-
-    Raises:
-        DatasetError: that was not recorded.
-    """
+    """Put the statistics of what the expert would have done in place of those of what was done."""
     if EXPERT_ACTION not in meta.features:
         raise DatasetError(
             f"{meta.root} has no column {EXPERT_ACTION!r}: what an expert would have done was not recorded. Record it "

@@ -48,9 +48,6 @@ class BatchOrder:
             weights: relative frequency of each of `samples`, shape (M,), not negative; needs `shuffle`.
             rank: this process among `world_size`.
             world_size: processes that train together.
-
-        Raises:
-            ConfigError: no sample or no batch is left, or weights that cannot be used.
         """
         self.batch_size, self.seed, self.shuffle, self.drop_last = batch_size, seed, shuffle, drop_last
         self.rank, self.world_size = rank, world_size
@@ -82,7 +79,6 @@ class BatchOrder:
         return samples
 
     def __len__(self) -> int:
-        """Return the number of batches that this rank has in a full epoch."""
         everyone = self.batch_size * self.world_size
         return len(self.samples) // everyone if self.drop_last else math.ceil(len(self.samples) / everyone)
 
@@ -91,11 +87,7 @@ class BatchOrder:
         return self.follow(iter)
 
     def follow(self, fetch: Callable[[Iterator[Tensor]], Iterator[T]]) -> Iterator[T]:
-        """Return what `fetch` makes of the batches of the epoch; the state counts what came out, not what went in.
-
-        Args:
-            fetch: gets the indices of all batches, and yields one result for each, in the same order.
-        """
+        """Return what `fetch` makes of the batches of the epoch; the state counts what came out, not what went in."""
         if self._running:
             self._epoch, self._position = self._epoch + 1, 0
         self._running = True
@@ -106,11 +98,7 @@ class BatchOrder:
         return {"epoch": self._epoch, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state that `state_dict` returned; the next iteration starts there.
-
-        Raises:
-            ConfigError: the position does not exist.
-        """
+        """Go on from a state that `state_dict` returned; the next iteration starts there."""
         epoch, position = int(state["epoch"]), int(state["position"])
         if epoch < 0 or not 0 <= position <= len(self.samples):
             raise ConfigError(

@@ -70,11 +70,6 @@ class EpisodeFilter:
     exclude_late: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: an unknown outcome or a score out of range.
-        """
         names = [self.outcome] if isinstance(self.outcome, str) else list(self.outcome)
         if not names:
             raise ConfigError(f"No outcome is given. Valid: all, {', '.join(OUTCOMES)}.")
@@ -98,9 +93,6 @@ class EpisodeFilter:
         Args:
             meta: the dataset.
             episodes: candidates; None means all.
-
-        Raises:
-            DatasetError: none is left, or another program recorded the dataset and did not store what is asked for.
         """
         candidates = checked_episodes(meta, episodes)
         wanted = candidates
@@ -147,9 +139,6 @@ def split_episodes(
         eval_split: share that is held out, from 0 to below 1.
         hold_out: `episode` for this rule. `instruction` for LeRobot's, which counts each instruction by itself and
             holds out at least one episode of every one.
-
-    Raises:
-        DatasetError: nothing is left to train on.
     """
     candidates = checked_episodes(meta, None) if episodes is None else [int(episode) for episode in episodes]
     if eval_split == 0:
@@ -200,9 +189,6 @@ def frame_weights(
 
     Returns:
         Shape (N,), float32, in the order of the samples; None if all are drawn equally often.
-
-    Raises:
-        DatasetError: the dataset does not say where somebody intervened.
     """
     if intervention == learner == 1:
         return None

@@ -29,10 +29,6 @@ def local_metadata(
         revision: version on the Hub, if it has to be downloaded.
         episodes: the episodes whose files are wanted; None wants all.
         select: chooses the episodes by the metadata, for example those of an outcome; only their files are downloaded.
-
-    Raises:
-        ConfigError: a revision is named of a dataset that is on this machine, where nobody knows which it is.
-        DatasetError: it is not on this machine, and downloading it failed.
     """
     from lerobot.utils.constants import HF_LEROBOT_HOME
 

@@ -24,11 +24,7 @@ _TEXT = "string"
 
 
 def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
-    """Return LeRobot's metadata of a dataset on this machine; nothing is downloaded.
-
-    Raises:
-        DatasetError: there is no dataset at `root`, or it has no episode.
-    """
+    """Return LeRobot's metadata of a dataset on this machine; nothing is downloaded."""
     root = Path(root)
     complete_interrupted(root)
     if not (root / layout.INFO).is_file():
@@ -44,9 +40,6 @@ def checked(meta: "LeRobotDatasetMetadata") -> "LeRobotDatasetMetadata":
     """Return LeRobot's metadata if no name in them leads out of the dataset, with all rows by their numbers.
 
     LeRobot takes row i for instruction i, and for episode i.
-
-    Raises:
-        DatasetCorruptError: a name does, or an episode or instruction is missing.
     """
     templates = {"data_path": meta.data_path, "video_path": meta.video_path}
     if wrong := wrong_info({"features": meta.features, **templates}):
@@ -118,10 +111,6 @@ class FrameTable:
             episodes: indices of the episodes to read; None reads all.
             keys: features to read besides LeRobot's index columns; None reads all. Videos are skipped.
             sources: features whose values are read from another column of the same shape, by name.
-
-        Raises:
-            DatasetError: no dataset, no frame, an unknown feature or episode.
-            DatasetCorruptError: a file is missing, unreadable, or contradicts the metadata.
         """
         meta = open_metadata(meta_or_root) if isinstance(meta_or_root, str | Path) else meta_or_root
         wanted = checked_episodes(meta, episodes)
@@ -136,7 +125,6 @@ class FrameTable:
         return cls(meta, _read(meta, wanted, stored, sources or {}), stored)
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.first)
 
     @property
@@ -145,22 +133,14 @@ class FrameTable:
         return sum(column.nbytes for column in self.columns.values())
 
     def rows(self, episode: int) -> slice:
-        """Return the rows of an episode.
-
-        Raises:
-            DatasetError: it is not in the table.
-        """
+        """Return the rows of an episode."""
         if episode not in self._position:
             raise DatasetError(f"{self.meta.root}: episode {episode} is not among {_short(self.episodes)}.")
         start = int(self.starts[self._position[episode]])
         return slice(start, start + int(self.lengths[self._position[episode]]))
 
     def episode(self, episode: int) -> dict[str, Tensor]:
-        """Return the columns of one episode, each of shape (T, ...), over the memory of the table.
-
-        Raises:
-            DatasetError: it is not in the table.
-        """
+        """Return the columns of one episode, each of shape (T, ...), over the memory of the table."""
         rows = self.rows(episode)
         return {key: column[rows] for key, column in self.columns.items()}
 
@@ -187,11 +167,7 @@ class FrameTable:
 
 
 def checked_episodes(meta: Any, episodes: Sequence[int] | None) -> list[int]:
-    """Return the wanted episodes, sorted and each once.
-
-    Raises:
-        DatasetError: the dataset has no frame, none is wanted, or one does not exist.
-    """
+    """Return the wanted episodes, sorted and each once."""
     total = meta.total_episodes
     if not total or not meta.total_frames or meta.episodes is None:
         raise DatasetError(f"{meta.root} has no episode, so there is nothing to load. Record some with bhd-record.")

@@ -160,11 +160,9 @@ class TableDataset:
         return part
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return self.num_frames
 
     def __getitem__(self, index: int | slice) -> Batch | list[Batch]:
-        """Return one sample, or those of a slice."""
         if isinstance(index, slice):
             return [self._sample(i) for i in range(*index.indices(len(self)))]
         return self._sample(int(index))

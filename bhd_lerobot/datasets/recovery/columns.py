@@ -47,11 +47,7 @@ def lost_cameras(root: Path, info: Mapping[str, Any]) -> list[str]:
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """Return an `info.json` that describes the columns.
-
-    Raises:
-        DatasetCorruptError: it does not; the reason is in its cause, or else in its message.
-    """
+    """Return an `info.json` that describes the columns."""
     try:
         return meta_info.read_info(path, path, counts=False)
     except (OSError, meta_info.InfoError, DatasetError) as error:

@@ -27,9 +27,6 @@ class EpisodeRows:
         metadata_types: Arrow types of our columns, by name without prefix.
         extra_types: Arrow types of columns of other programs.
         torn: names without prefix of our columns in files that cannot be read.
-
-    Args:
-        root: the corrupted dataset.
     """
 
     def __init__(self, root: Path) -> None:

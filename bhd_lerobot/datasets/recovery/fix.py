@@ -36,15 +36,6 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     """Repair what can be repaired, if everything that it follows from is valid; return a line for each thing.
 
     A kill at any moment leaves either the old dataset or the new one.
-
-    Args:
-        root: the dataset.
-        findings: what `check_dataset` found there.
-
-    Raises:
-        DatasetLockedError: it is being recorded.
-        DatasetCorruptError: a file cannot be read; nothing was changed.
-        DatasetWriteError: the disk refuses; the dataset is as it was.
     """
     root = Path(root)
     wanted = [finding for finding in findings if is_fixable(finding)]
@@ -72,10 +63,6 @@ def rebuild(state: DatasetState, disk: Disk, lock: RootLock, *, order: bool = Fa
         lock: of the dataset.
         order: whether files, rows and instructions are put in the order of their numbers, and the frames numbered.
         stats: whether the statistics of all episodes are computed.
-
-    Raises:
-        DatasetCorruptError: a file cannot be read.
-        OSError: a file cannot be written; the dataset is then as it was.
     """
     root, counted, done = state.root, load_info(state.root)["total_frames"], []
     info = {**state.info, "total_frames": state.num_frames}
@@ -127,7 +114,6 @@ def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]
 
 
 def _tables(state: DatasetState) -> Iterator[pa.Table]:
-    """Yield the frames of every episode."""
     for slot, rows in ordered_slots(state.rows, "data").items():
         frames = frames_of(state.root / layout.data_file(slot), rows)
         yield from (frames[row["episode_index"]] for row in rows)

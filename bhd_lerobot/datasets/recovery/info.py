@@ -23,16 +23,8 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
 
     What was there before goes to a folder beside the dataset.
 
-    Args:
-        root: the dataset.
-        donor: another recording with the same robot and cameras, or its `meta/info.json`.
-        disk: how to write.
-
     Returns:
         What was done, in a line, and where what was there before is now, if anything was.
-
-    Raises:
-        ConfigError: the dataset's own can be read and fits, or the other's cannot or does not; nothing was changed.
     """
     donor = donor / layout.INFO if donor.is_dir() else donor
     path = root / layout.INFO

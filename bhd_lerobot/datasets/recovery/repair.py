@@ -204,16 +204,8 @@ def _check_readable(state: DatasetState) -> None:
 def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
     """Bring the disk to what ``info.json`` says; the caller holds the lock.
 
-    Args:
-        root: the dataset.
-        disk: how to write.
-        keep_staging: leave files of episodes that are still being recorded.
-
     Returns:
         The committed state, and what was done.
-
-    Raises:
-        DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
     """
     check_fetched(root)
     remove_abandoned(real(root))

@@ -66,11 +66,9 @@ class RepairReport:
         return _losses(self.findings)
 
     def __bool__(self) -> bool:
-        """Whether anything was repaired."""
         return bool(self.completed or self.dropped)
 
     def __str__(self) -> str:
-        """Return the report for a terminal."""
         empty = "" if self.episodes else ": it is empty"
         lines = [f"{self.root}: {counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}{empty}"]
         lines += [f"  completed: {item}" for item in self.completed]
@@ -89,20 +87,6 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
     """Recover every whole episode.
 
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
-
-    Args:
-        root: the corrupted dataset.
-        disk: how to write.
-        lock: of the dataset.
-        wrong: what was found to be wrong, for the error if nothing is left.
-        is_ours: whether our recorder alone wrote it.
-
-    Raises:
-        DatasetCorruptError: no whole episode is left, or ``info.json`` is gone, which says what the columns are;
-            nothing was changed.
-        DatasetLockedError: a process has files of the dataset open, so perhaps records it.
-        DatasetError: a file cannot be read at the moment, and may be whole.
-        DatasetWriteError: the disk refuses; the corrupted dataset is as it was.
     """
     check_unused(root)
     check_readable(root)
@@ -248,11 +232,7 @@ def shapes_of(info: dict[str, Any]) -> dict[str, Sequence[int]]:
 
 
 def schema_of(root: Path, info: dict[str, Any]) -> pa.Schema:
-    """Return the columns of the data files, as `info.json` describes them.
-
-    Raises:
-        DatasetCorruptError: it does not.
-    """
+    """Return the columns of the data files, as `info.json` describes them."""
     from bhd_lerobot.stock import get_hf_features_from_features
 
     try:
@@ -293,11 +273,7 @@ _BLOCK = 1 << 20
 
 
 def check_unused(root: Path) -> None:
-    """Check that no other process has a file below `root` open: LeRobot takes no lock.
-
-    Raises:
-        DatasetLockedError: one has.
-    """
+    """Check that no other process has a file below `root` open: LeRobot takes no lock."""
     own, place = str(os.getpid()), root.resolve()
     for process in Path("/proc").glob("[0-9]*"):
         if process.name == own:
@@ -318,9 +294,6 @@ def check_readable(root: Path) -> None:
     """Check that every byte can be read below `root`.
 
     A file that cannot be read at the moment may be whole: without it, its episodes would be lost for nothing.
-
-    Raises:
-        DatasetError: it refuses, or a link leads out of the dataset.
     """
     check_links(root)
 

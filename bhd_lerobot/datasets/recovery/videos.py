@@ -127,11 +127,6 @@ class Videos:
     Where a row of ``meta/episodes`` is left, it says where the episode is. Episodes without one come after those with
     one, in videos of their own; these hold whole episodes in the order of their numbers, one after the other, so their
     lengths say where each is. Where that does not come out even, no episode gets a video that may be another's.
-
-    Args:
-        root: the corrupted dataset.
-        info: content of its ``info.json``.
-        rows: readable rows of ``meta/episodes``, by the number of the episode.
     """
 
     def __init__(self, root: Path, info: dict[str, Any], rows: Mapping[int, Row]) -> None:
@@ -142,13 +137,7 @@ class Videos:
         self._whole_copies: dict[Path, Path] = {}
 
     def assign(self, found: Sequence[FoundEpisode], findings: Findings, *, is_torn: bool) -> list[FoundEpisode]:
-        """Find the video of every episode, and return the episodes whose videos are complete.
-
-        Args:
-            found: episodes whose frames are whole, in order.
-            findings: losses are added to it.
-            is_torn: whether frames are missing behind them: then a video may show more than they need.
-        """
+        """Find the video of every episode, and return the episodes whose videos are complete."""
         for episode in found:
             episode.has_row = self._rows.get(episode.number, {}).get("length") == episode.table.num_rows
         found, certain = self._without_repeated(found, findings)

@@ -1,5 +1,6 @@
 """A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot expects."""
 
+import glob
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +11,7 @@ from bhd_lerobot.datasets.remote.listing import (
     Item,
     RemoteFile,
     check_repo_id,
-    largest_first,
     listed,
-    refuse_damaged,
-    run_all,
 )
 from bhd_lerobot.datasets.remote.local import LocalDataset
 from bhd_lerobot.datasets.storage import layout
@@ -33,11 +31,13 @@ class HubDataset:
     Attributes:
         name: `user/name`.
         folder: None: it does not lie on this machine.
+        has_checksums: yes: the Hub makes them from the contents.
         revision: branch, tag or commit; None for what stock LeRobot takes.
         commit: hash of the commit that `files` listed; None before, and if there is no repository yet.
     """
 
     folder: Path | None = None
+    has_checksums = True
 
     def __init__(
         self,
@@ -48,18 +48,6 @@ class HubDataset:
         tag: str | None = None,
         create: bool = False,
     ) -> None:
-        """Name it; nothing is requested yet.
-
-        Args:
-            repo_id: `user/name`.
-            revision: branch, tag or commit to read; the branch to write.
-            private: whether a repository that is made is private; None leaves it to the Hub.
-            tag: a further tag that a push sets.
-            create: make the repository and the branch where they do not exist, for a push.
-
-        Raises:
-            ConfigError: it is no name.
-        """
         self.name, self.revision = check_repo_id(repo_id), revision
         self.commit: str | None = None
         self._private, self._tag, self._create = private, tag, create
@@ -93,22 +81,15 @@ class HubDataset:
             found = hf_hub_download(self.name, path, repo_type="dataset", revision=self.commit, local_dir=folder)
             return Path(found).read_bytes()
 
-    def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
-        """Return nothing: the Hub makes its checksums from the contents, so they need no verification."""
-        return {}
-
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Download files of the listed commit, and compare them with their checksums."""
-        from huggingface_hub import hf_hub_download
+        """Download files of the listed commit."""
+        from huggingface_hub import snapshot_download
 
-        def fetch_one(path: str) -> None:
-            # What `snapshot_download` does, but each file is verified while others are on their way. By the commit's
-            # hash: with a name, the client would fall back to what it has if the Hub cannot be reached.
-            hf_hub_download(self.name, path, repo_type="dataset", revision=self.commit, local_dir=folder)
-            refuse_damaged(folder / path, self._listed[path], self.name, path)
-
+        others = self._listed.keys() - set(paths)
+        wanted = ("allow_patterns", paths) if len(paths) < len(others) else ("ignore_patterns", others)
+        options: dict[str, Any] = {wanted[0]: [glob.escape(path) for path in wanted[1]], "local_dir": folder}
         with hub_errors(self.name, "download", revision=self.revision):
-            run_all(fetch_one, largest_first(paths, self._listed))
+            snapshot_download(self.name, repo_type="dataset", revision=self.commit, **options)
 
     def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
         """Upload files and remove others in one commit, and set the tags."""
@@ -141,7 +122,6 @@ class HubDataset:
         return VERSION_TAG if VERSION_TAG in self._tags() else MAIN
 
     def _tags(self) -> dict[str, str]:
-        """Return the commits of the tags."""
         refs = self._api.list_repo_refs(self.name, repo_type="dataset")
         return {tag.name: tag.target_commit for tag in refs.tags}
 

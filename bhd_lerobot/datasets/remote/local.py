@@ -23,14 +23,7 @@ _TEMPORARY = ("images",)  # LeRobot's own, of frames whose video is not encoded 
 
 @dataclass(frozen=True)
 class LocalDataset:
-    """A valid dataset on this machine.
-
-    Attributes:
-        root: its folder.
-        state: what is in it.
-        items: the files that belong to it, in order of their paths; a `README.md` of the user's among them.
-        left_out: files in it that belong to no episode, and are not copied.
-    """
+    """A valid dataset on this machine; what is `left_out` belongs to no episode, and is not copied."""
 
     root: Path
     state: DatasetState
@@ -44,11 +37,7 @@ class LocalDataset:
         return next(item for item in self.items if item.path == layout.INFO)
 
     def check_unchanged(self) -> None:
-        """Check that nothing was written since the dataset was opened.
-
-        Raises:
-            DatasetError: names the files that were.
-        """
+        """Check that nothing was written since the dataset was opened."""
         now = _stamps(self.root)
         changed = {name for name in now.keys() | self._stamps.keys() if now.get(name) != self._stamps.get(name)}
         if changed:
@@ -60,12 +49,7 @@ class LocalDataset:
 
 @contextmanager
 def open_local(root: Path) -> Iterator[LocalDataset]:
-    """Open a dataset for copying, and keep other programs of ours from writing it meanwhile.
-
-    Raises:
-        DatasetError: it is being written, is not finalised, is a part only, or has no episode.
-        DatasetCorruptError: a file is missing or cannot be read.
-    """
+    """Open a dataset for copying, and keep other programs of ours from writing it meanwhile."""
     if not root.is_dir():
         raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
     try:

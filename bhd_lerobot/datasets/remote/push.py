@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,9 @@ from bhd_lerobot.datasets.remote.listing import (
     Remote,
     RemoteFile,
     is_recorded,
+    matching,
     parse_info,
     refuse_overlap,
-    run_all,
     total,
 )
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
@@ -33,12 +33,7 @@ _SIGNATURE = re.compile(r"\n<!-- bhd-card ([0-9a-f]{64}) -->\n\Z")
 
 @dataclass(frozen=True)
 class Card:
-    """A generated card.
-
-    Attributes:
-        text: Markdown, signed by `sign`.
-        image: a PNG file's bytes; None if there is none.
-    """
+    """A generated card: Markdown, signed by `sign`, and a PNG file's bytes if it shows an image."""
 
     text: str
     image: bytes | None = None
@@ -50,17 +45,9 @@ type MakeCard = Callable[[DatasetState, bool], Card]
 
 @dataclass(frozen=True)
 class PushReport:
-    """What a push did.
+    """What a push did: files that were sent, there already (`kept`), removed there, and not sent (`left_out`).
 
-    Attributes:
-        name: where the dataset lies now.
-        episodes: episodes it holds.
-        sent: files that were sent.
-        sent_bytes: their bytes.
-        kept: files that were there already.
-        deleted: files that belonged to no episode any more and were removed there.
-        left_out: files on this machine that belong to no episode and were not sent.
-        kept_card: whether a card there that was not generated is left as it is.
+    `kept_card` says whether a card there that was not generated is left as it is.
     """
 
     name: str
@@ -79,24 +66,10 @@ def push(
     *,
     make_card: MakeCard | None = None,
     replace: bool = False,
-    verify: bool = False,
 ) -> PushReport:
     """Make a remote dataset the same as the one on this machine, which is not changed.
 
     A `README.md` in the folder is its card. Without one a card is generated, unless there is one that was not.
-
-    Args:
-        root: the dataset.
-        remote: where to.
-        make_card: generates a card; None generates none.
-        replace: overwrite a dataset at the remote place that is another one, or has more episodes.
-        verify: read what lies at the remote place and compare that, instead of what is listed about it.
-
-    Raises:
-        DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
-        ConfigError: both are the same folder.
-        DatasetError: the dataset is not complete and finalised, is in use, or was changed meanwhile.
-        TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
     """
     refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:
@@ -106,12 +79,10 @@ def push(
         cards, kept_card = _cards(local, remote, make_card, there)
         items = [item for item in local.items if item.path not in (CARD, PREVIEW)] + cards
         try:
-            if verify:
-                sizes = {item.path: item.size for item in items}
-                there |= remote.verified([path for path, file in there.items() if file.size == sizes.get(path)])
-            changed = _changed(items, there)
+            same = matching({item.path: item.content for item in items}, there) if remote.has_checksums else set()
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
+        changed = [item for item in items if item.path not in same]
         wanted = {item.path for item in items}
         ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS, MANIFEST)
         deleted = sorted(path for path in there if path not in wanted and (is_recorded(path) or path in ours))
@@ -159,24 +130,13 @@ def _cards(
 
 
 def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
-    """Refuse to overwrite what this dataset is no later version of; a store keeps no history.
-
-    Raises:
-        DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes than
-            were deleted here since; or it is no dataset of this format at all. If a push to there did not end, what was
-            there before it counts.
-    """
+    """Refuse to overwrite what this dataset is no later version of; a store keeps no history."""
     name, info = remote.name, there.get(layout.INFO)
-    if info is None:
-        name = f"{name}, before a push to it that did not end,"
-    elif info.digest is not None and info.matches(local.root / layout.INFO):
-        return  # whatever became of it there since: this dataset is what was put there
-    content = remote.read(layout.INFO)
-    if content is None and info is None:
+    if info is None or (info.digest is not None and info.matches(local.root / layout.INFO)):
         return
     remedy = "or give up what lies there with --replace."
     try:
-        found = parse_info(content, name)
+        found = parse_info(remote.read(layout.INFO), name)
     except DatasetError as error:
         raise DatasetExistsError(f"{error} Choose another place, {remedy}") from error
     if _kind(found) != _kind(local.state.info):
@@ -195,12 +155,7 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
 
 
 def _deleted_since(root: Path, there: bytes | None) -> int:
-    """Return how many episodes were deleted from a dataset since a copy of it was made.
-
-    Args:
-        root: the dataset.
-        there: the list of edits of the copy.
-    """
+    """Return how many episodes were deleted from a dataset since a copy of it was made."""
     try:
         edits, former = edits_of(root), [json.loads(line) for line in (there or b"").splitlines()]
         known = len(former) if edits[: len(former)] == former else 0
@@ -212,16 +167,3 @@ def _deleted_since(root: Path, there: bytes | None) -> int:
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:
     columns = {key: feature["dtype"] for key, feature in info["features"].items()}
     return columns, info["fps"], info.get("robot_type"), str(info["codebase_version"])[:2]
-
-
-def _changed(items: Sequence[Item], there: Mapping[str, RemoteFile]) -> list[Item]:
-    """Return the files that are not there, or whose content there is another or unknown."""
-    same: set[str] = set()
-
-    def compare(item: Item) -> None:
-        file = there.get(item.path)
-        if file is not None and file.digest is not None and file.matches(item.content):
-            same.add(item.path)
-
-    run_all(compare, items)
-    return [item for item in items if item.path not in same]

@@ -7,7 +7,7 @@ import stat
 from pathlib import Path
 
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET, is_recorded
+from bhd_lerobot.datasets.remote.listing import SUBSET, is_recorded
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import PULL, is_fixed, move_in, note_done, uninterrupted
 from bhd_lerobot.datasets.storage.disk import Disk
@@ -16,27 +16,15 @@ from bhd_lerobot.errors import DatasetError
 _MARKER = ".bhd-pull"
 """In folders beside the target that this program made, and may remove."""
 
-_OURS = {_MARKER, SUBSET, MANIFEST, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY, layout.UNREPORTED}
+_OURS = {_MARKER, SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY, layout.UNREPORTED}
 """Files of a dataset, besides those that `is_recorded` recognises."""
 
 
 class Staging:
-    """A folder beside a dataset.
-
-    Attributes:
-        folder: where files come together; they stay there if an attempt fails.
-        is_new: whether no attempt before left one.
-    """
+    """A folder beside a dataset; `is_new` says whether no attempt before left one."""
 
     def __init__(self, root: Path) -> None:
-        """Make the folder, or take up that of an attempt before.
-
-        Args:
-            root: the dataset.
-
-        Raises:
-            DatasetError: something else lies where the folder must be.
-        """
+        """Make the folder, or take up that of an attempt before."""
         self._root = root
         # Where nothing can be put beside the dataset, its staging folder is the place.
         self.folder = folder = root / PULL if is_fixed(root) else root.with_name(f".{root.name}.pull")
@@ -51,17 +39,19 @@ class Staging:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARKER).touch()
 
-    def recover(self) -> None:
-        """Undo what version 0.1 left when it was killed between two renames; the caller has locked the folder."""
-        old = self._root.with_name(f".{self._root.name}.old")
-        if (old / _MARKER).is_file() and not self._root.exists() and _is_ours(old):
-            Disk().move(old, self._root)
-            (self._root / _MARKER).unlink(missing_ok=True)
-
     def link(self, path: str) -> None:
         """Link a file of the dataset into the folder, in the place of what an attempt for another version left."""
         (self.folder / path).unlink(missing_ok=True)
         _link(self._root / path, self.folder / path)
+
+    def clear(self, kept: set[str]) -> None:
+        """Remove all files but some."""
+        for path in sorted(self.folder.rglob("*"), reverse=True):
+            if path.is_dir():
+                with contextlib.suppress(OSError):  # it is not empty
+                    path.rmdir()
+            elif path.relative_to(self.folder).as_posix() not in {*kept, _MARKER}:
+                path.unlink()
 
     def drop(self) -> None:
         """Remove the folder and all that is in it."""
@@ -71,21 +61,11 @@ class Staging:
                 self.folder.parent.rmdir()
 
     def publish(self, wanted: set[str], note: bytes | None) -> None:
-        """Let the folder become the dataset; what belongs to no dataset comes along from the one before.
-
-        Args:
-            wanted: the files that the dataset is to have.
-            note: content of `SUBSET`; no such file if None.
-        """
+        """Let the folder become the dataset; what belongs to no dataset comes along from the one before."""
         root, folder = self._root, self.folder
         if root.is_dir():
             folder.chmod(root.stat().st_mode & 0o7777)  # the permissions stay the same
-        for path in sorted(folder.rglob("*"), reverse=True):  # what an attempt for another version left
-            if path.is_dir():
-                with contextlib.suppress(OSError):  # it is not empty
-                    path.rmdir()
-            elif path.relative_to(folder).as_posix() not in {*wanted, _MARKER}:
-                path.unlink()
+        self.clear(wanted)
         if note is not None:
             (folder / SUBSET).write_bytes(note)
         with uninterrupted():
@@ -100,8 +80,7 @@ class Staging:
                     is_foreign = inside not in wanted | _OURS and not is_recorded(inside)
                     if is_foreign and (path.is_symlink() or not path.is_dir()):
                         _link(path, folder / inside)
-                gone = {"data", "videos", MANIFEST} - names
-                move_in(folder, root, Disk(), done=f"{root} had been pulled", goes=gone)
+                move_in(folder, root, Disk(), done=f"{root} had been pulled", goes={"data", "videos"} - names)
             (root / _MARKER).unlink(missing_ok=True)
 
 

@@ -12,9 +12,6 @@ from bhd_lerobot.errors import ConfigError, TransferError
 LOCAL = {"file", "local"}
 """Protocols of this machine's own folders."""
 
-_EXTRAS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs"}
-_EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
-
 _BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oci", "oss", "r2"}
 """Where the first name of a URL is that of a bucket, or of a container."""
 
@@ -30,12 +27,7 @@ def shown(url: str) -> str:
 
 
 def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple[Any, str]:
-    """Return fsspec's file system for a URL, and the path of the folder in it.
-
-    Raises:
-        ConfigError: the URL names no folder, or nothing that a dataset could lie in.
-        TransferError: what serves the protocol is not installed, or cannot be reached.
-    """
+    """Return fsspec's file system for a URL, and the path of the folder in it."""
     import fsspec  # type: ignore[import-untyped]
     from fsspec.core import url_to_fs  # type: ignore[import-untyped]
 
@@ -47,9 +39,7 @@ def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple
     try:
         fs, path = url_to_fs(url.rstrip("/"), **(storage_options or {}))
     except ImportError as error:
-        package = _EXTRAS.get(protocol, "")
-        remedy = f" Install it: pip install '{package}'" if package else ""
-        raise TransferError(f"What serves {protocol}:// is not installed ({error}).{remedy}") from error
+        raise TransferError(f"What serves {protocol}:// is not installed: {error}.") from error
     except OSError as error:  # those that connect at once: FTP, SFTP
         _drop_half_made(error)
         reason = " ".join(str(error).split()).rstrip(".")
@@ -63,11 +53,7 @@ def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple
 
 
 def check_url(url: str) -> None:
-    """Check what can be seen without asking anybody.
-
-    Raises:
-        ConfigError: a chain of file systems, no folder, no bucket, a path that is not whole, or no place for a dataset.
-    """
+    """Check what can be seen without asking anybody."""
     protocol, _, path = url.partition("://")
     name = shown(url)
     if not url.isprintable():

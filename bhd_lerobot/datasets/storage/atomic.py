@@ -55,18 +55,7 @@ class Workspace:
     """
 
     def __init__(self, place: Path, disk: Disk, lock: RootLock | None = None) -> None:
-        """Make the folder; a change that was interrupted is completed first.
-
-        Args:
-            place: a folder, or where one is going to be made.
-            disk: how to write.
-            lock: of the dataset that is there, some folders of which are going to be replaced. None if something new is
-                made.
-
-        Raises:
-            DatasetLockedError: another process makes something in this folder.
-            OSError: nothing can be written there.
-        """
+        """Make the folder; a change that was interrupted is completed first."""
         self.place = place = real(place)
         self._disk, self._is_new = disk, lock is None
         self._is_inside = lock is not None or bool(_names(place)) or is_fixed(place)
@@ -100,13 +89,6 @@ class Workspace:
         """Move the folder to its place, or its content to the places of the same names.
 
         Signals that would end the process wait until it is done.
-
-        Args:
-            done: the result, a sentence without a full stop; see `noting_what_is_done`.
-
-        Raises:
-            OSError: it failed; the place is as it was.
-            DatasetWriteError: it was decided and not completed; the next command completes it.
         """
         if self._is_inside:
             move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new)
@@ -126,23 +108,15 @@ class Workspace:
                 lock.release()
 
     def __enter__(self) -> "Workspace":
-        """Return the workspace itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove it."""
         self.close()
 
 
 @contextlib.contextmanager
 def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Workspace]:
-    """Give a workspace for something new, and publish it when the block ends well.
-
-    Args:
-        target: its place.
-        disk: how to write.
-        refuse: raises if something is at the place; called before and after the block.
-    """
+    """Give a workspace for something new, and publish it when the block ends well."""
     remove_abandoned(real(target))
     complete_interrupted(target)
     refuse()
@@ -168,10 +142,6 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         done: the result, a sentence without a full stop; see `noting_what_is_done`.
         is_new: nothing may be at these places.
         goes: names that are removed, too.
-
-    Raises:
-        OSError: it failed; the place is as it was.
-        DatasetWriteError: it was decided and not completed; the next command completes it.
     """
     work = place / WORK
     if not new.is_relative_to(work):
@@ -217,11 +187,7 @@ def is_free(place: Path) -> bool:
 
 
 def refuse_inside(target: Path, source: Path) -> None:
-    """Refuse to write into a dataset that is only read: it would be uploaded and checked with it.
-
-    Raises:
-        ConfigError: `target` lies in `source`.
-    """
+    """Refuse to write into a dataset that is only read: it would be uploaded and checked with it."""
     if real(source) in real(target).parents:
         raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
 
@@ -258,12 +224,7 @@ def is_decided(place: Path) -> bool:
 
 
 def roll_forward(place: Path, disk: Disk) -> bool:
-    """Complete a change that had been decided; return whether there was one. The caller has locked the place.
-
-    Raises:
-        DatasetCorruptError: the marker is not one of this folder.
-        OSError: the disk refuses.
-    """
+    """Complete a change that had been decided; return whether there was one. The caller has locked the place."""
     if not is_decided(place):
         return False
     plan = _read_plan(place)
@@ -288,11 +249,6 @@ def complete_interrupted(place: Path) -> bool:
 
     Returns:
         Whether there was one.
-
-    Raises:
-        DatasetLockedError: the process lives.
-        DatasetCorruptError: it is a change of another folder.
-        DatasetWriteError: it cannot be completed.
     """
     if not is_decided(place):
         return False
@@ -340,11 +296,7 @@ class _Plan:
 
 
 def _read_plan(place: Path) -> _Plan:
-    """Read the marker. It may come from a copied dataset, so it is valid only in the folder in which it was written.
-
-    Raises:
-        DatasetCorruptError: it is the marker of another folder.
-    """
+    """Read the marker. It may come from a copied dataset, so it is valid only in the folder in which it was written."""
     staging = place / layout.STAGING
     if any(path.is_symlink() for path in (staging, *(place / WORK / name for name in ("", "ready", "new", "old")))):
         raise _foreign_marker(place)
@@ -402,7 +354,6 @@ def _is_there(path: Path, inode: int | None) -> bool:
 
 
 def _unused(path: Path) -> Path:
-    """Return a path that does not exist."""
     number = 1
     while os.path.lexists(path):
         path, number = path.with_name(f"{path.name.partition('~')[0]}~{number}"), number + 1
@@ -420,11 +371,7 @@ def _write_invalid_info(place: Path, disk: Disk) -> None:
 
 
 def _check_movable(place: Path, names: Collection[str], is_new: bool) -> None:
-    """Check that a change can be carried out, before it is decided.
-
-    Raises:
-        OSError: it cannot.
-    """
+    """Check that a change can be carried out, before it is decided."""
     mounts = _mounts()
     for name in names:
         path = place / name

@@ -47,7 +47,6 @@ class Disk:
     """
 
     def __init__(self, fsync: bool = False) -> None:
-        """Remember the flushing policy."""
         self.fsync = fsync
 
     def make_folder(self, path: Path) -> None:
@@ -98,11 +97,7 @@ class Disk:
         self.move(part, path)
 
     def swap(self, first: Path, second: Path) -> None:
-        """Swap two folders atomically.
-
-        Raises:
-            OSError: this kernel or file system cannot do that, among others.
-        """
+        """Swap two folders atomically."""
         _before_step("swap", second)
         function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
         if function is None:
@@ -166,13 +161,7 @@ def to_json(content: Mapping[str, Any]) -> bytes:
 
 @contextlib.contextmanager
 def write_errors(action: str, root: Path, consequence: str) -> Iterator[None]:
-    """Turn an operating-system error into a `DatasetWriteError` with the failed action and the state of the dataset.
-
-    Args:
-        action: what was being done, for example ``"save episode 3"``.
-        root: the dataset.
-        consequence: one sentence on the state of the dataset now.
-    """
+    """Turn an operating-system error into a `DatasetWriteError` with the failed action and the state of the dataset."""
     try:
         yield
     except OSError as error:
@@ -191,16 +180,6 @@ class RootLock:
     """
 
     def __init__(self, root: Path, shown_as: Path | None = None, *, is_choice: bool = False) -> None:
-        """Take the lock.
-
-        Args:
-            root: an existing folder.
-            shown_as: the path to name in an error, if `root` is a temporary one.
-            is_choice: whether the error proposes another root, too.
-
-        Raises:
-            DatasetLockedError: another process records, repairs or edits it.
-        """
         self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
         self._handle: int | None = None
         self.acquire()

@@ -57,11 +57,7 @@ def video_file(key: str, slot: Slot) -> str:
 
 
 def slot_in(path: Path) -> Slot:
-    """Return the numbers in the name of a file of this layout.
-
-    Raises:
-        ValueError: it has another name.
-    """
+    """Return the numbers in the name of a file of this layout."""
     slot = int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
     if CHUNK_FILE.format(chunk_index=slot[0], file_index=slot[1]) != f"{path.parent.name}/{path.stem}":
         raise ValueError(f"{path.parent.name}/{path.stem} is not the name of a chunk and a file")

@@ -19,11 +19,7 @@ _FIELD = re.compile(r"\{\w+(?::0?\d{1,2}d)?\}")
 
 
 def wrong_name(name: object) -> str:
-    """Return why a name from a file cannot be a part of a path; nothing if it can.
-
-    Args:
-        name: a feature's key, a file's name, or whatever else becomes one part of a path.
-    """
+    """Return why a name from a file cannot be a part of a path; nothing if it can."""
     if not isinstance(name, str):
         return f"{name!r} is no text"
     if name in ("", ".", "..") or "/" in name or "\\" in name:
@@ -43,11 +39,7 @@ def wrong_path(path: object) -> str:
 
 
 def wrong_info(info: Mapping[str, Any]) -> str:
-    """Return which name in an `info.json` leads out of the dataset; nothing if none does.
-
-    Args:
-        info: its content, of which the features' keys and the templates of paths become names of files.
-    """
+    """Return which name in an `info.json` leads out of the dataset; nothing if none does."""
     for key in info.get("features") or ():
         if why := wrong_name(key):
             return f"a feature's name {why}"
@@ -68,13 +60,6 @@ def check_inside(root: Path, path: Path) -> Path:
 
     These places are the folder `blobs` of the Hub's cache, if the dataset is a snapshot in that cache, and the folders
     that the environment variable `BHD_LINKED_FOLDERS` lists.
-
-    Args:
-        root: the dataset.
-        path: the file, which need not exist.
-
-    Raises:
-        DatasetError: a link leads elsewhere; names both, and the remedy.
     """
     try:
         # Unlike Path.resolve, it accepts a link to itself; opening that fails later with a message.
@@ -91,15 +76,7 @@ def check_inside(root: Path, path: Path) -> Path:
 
 
 def check_links(root: Path) -> None:
-    """Check that no link among the files of a dataset leads out of it.
-
-    Args:
-        root: the dataset. Searched are `meta`, `data`, `videos`, and the folders of videos that LeRobot has not encoded
-            yet, `images` and `tmp…`.
-
-    Raises:
-        DatasetError: one does.
-    """
+    """Check that no link among the files of a dataset leads out of it."""
     pending = [*(root / name for name in ("meta", "data", "videos", "images")), *root.glob("tmp*")]
     seen: set[Path] = set()  # a link to a folder above would never end
     while pending:

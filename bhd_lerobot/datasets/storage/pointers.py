@@ -39,11 +39,7 @@ def not_fetched(root: Path, paths: Iterable[Path]) -> NotFetchedError | None:
 
 
 def check_fetched(root: Path) -> None:
-    """Check that no file of a dataset is a pointer.
-
-    Raises:
-        NotFetchedError: some are.
-    """
+    """Check that no file of a dataset is a pointer."""
     files = (path for name in ("meta", "data", "videos") for path in sorted((root / name).rglob("*")))
     if error := not_fetched(root, files):
         raise error

@@ -27,15 +27,7 @@ _MARKS, _FEW = 500, 60  # marks at most, and so many are few
 
 
 def draw_timing(report: TimingReport, path: Path) -> None:
-    """Draw the timing of an episode, or of all episodes one after the other.
-
-    Args:
-        report: what is drawn.
-        path: where the image goes; its suffix decides the format.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Draw the timing of an episode, or of all episodes one after the other."""
     if report.simulated:
         figure = Figure(figsize=(12, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2.1, 1))
@@ -64,7 +56,6 @@ def _heading(report: TimingReport) -> str:
 
 
 def _draw_all_series(report: TimingReport, panels: dict[str, Axes]) -> None:
-    """Draw what was measured of every frame, each column in its panel."""
     columns, tolerated = report.total.columns, report.total.summary.tolerated
     late = np.flatnonzero(columns[keys.LATE])
     for key, axes in panels.items():
@@ -79,7 +70,6 @@ def _draw_all_series(report: TimingReport, panels: dict[str, Axes]) -> None:
 
 
 def _draw_series(axes: Axes, values: NDArray, late: NDArray[np.intp], *, label: str, limit: float | None) -> None:
-    """Draw a time of every frame in milliseconds, its limit, and the late frames."""
     scaled = 1e3 * np.asarray(values, np.float64)
     axes.set_title(label, fontsize=10, loc="left")
     axes.grid(alpha=0.25)
@@ -109,7 +99,6 @@ def _thinned(values: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _draw_intervals(axes: Axes, report: TimingReport) -> None:
-    """Draw how far apart observations are."""
     intervals, wanted = 1e3 * report.total.intervals, 1e3 / report.fps
     axes.set_title("time between observations [ms]", fontsize=10, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
@@ -133,7 +122,6 @@ def _draw_intervals(axes: Axes, report: TimingReport) -> None:
 
 
 def _draw_numbers(axes: Axes, report: TimingReport) -> None:
-    """Write what no curve shows."""
     axes.set_axis_off()
     total, frame = report.total.summary, quantiles(report.total.intervals)
     lines = (

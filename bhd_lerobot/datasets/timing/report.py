@@ -129,11 +129,7 @@ class TimingReport:
 
 
 def timing_of(episode: EpisodeSummary) -> TimingSummary | None:
-    """Return the timing summary that was stored with an episode; None if there is none.
-
-    Raises:
-        DatasetError: what is stored is no timing summary.
-    """
+    """Return the timing summary that was stored with an episode; None if there is none."""
     if "timing" not in episode.metadata:
         return None
     try:
@@ -161,12 +157,7 @@ def _grants_of(episode: EpisodeSummary) -> tuple[dict[str, Any], ...]:
 
 
 def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
-    """Return the timing of one episode of a dataset, or of all.
-
-    Raises:
-        DatasetError: there is no such dataset or episode, or nothing was stored about its timing.
-        DatasetCorruptError: a file cannot be read.
-    """
+    """Return the timing of one episode of a dataset, or of all."""
     info = dataset_info(root)
     columns = read_columns(root, _COLUMNS, episode)
     chosen = info.episodes if episode is None else (info.episodes[episode],)

@@ -97,12 +97,7 @@ def _episodes(report: TimingReport, width: int) -> str:
 
 
 def aligned(columns: Sequence[tuple[str, list[str]]], left: Collection[str] = ()) -> str:
-    """Return a table as plain lines, numbers to the right: rich takes the greater part of a millisecond for a row.
-
-    Args:
-        columns: of each the heading and the cells.
-        left: headings of columns of words.
-    """
+    """Return a table as plain lines, numbers to the right: rich takes the greater part of a millisecond for a row."""
     height = max(heading.count("\n") for heading, _ in columns) + 1
     parts, forms = [], []
     for heading, cells in columns:
@@ -113,12 +108,7 @@ def aligned(columns: Sequence[tuple[str, list[str]]], left: Collection[str] = ()
 
 
 def fitting(columns: Sequence[tuple[str, list[str]]], width: int) -> list[tuple[str, list[str]]]:
-    """Return the first columns of a table, as many as fit: a column is never cut off.
-
-    Args:
-        columns: of each the heading and the cells.
-        width: characters in a line.
-    """
+    """Return the first columns of a table, as many as fit: a column is never cut off."""
     room, shown = width - 1, []
     for heading, cells in columns:
         room -= 3 + max(len(text) for text in [*heading.splitlines(), *cells])

@@ -37,14 +37,7 @@ CHECKS = {
 
 @dataclass(frozen=True)
 class DatasetCheck:
-    """What a check found.
-
-    Attributes:
-        root: the dataset.
-        episodes: how many it has.
-        frames: how many were read.
-        findings: all findings, the worst first.
-    """
+    """What a check found."""
 
     root: Path
     episodes: int

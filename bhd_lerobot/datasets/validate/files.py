@@ -103,15 +103,7 @@ class Files:
 
 
 def read_files(root: Path, findings: Findings) -> Files:
-    """Read the small files, and check them.
-
-    Args:
-        root: the dataset.
-        findings: what is found is added to it.
-
-    Raises:
-        DatasetError: there is no dataset that could be checked.
-    """
+    """Read the small files, and check them."""
     files = Files(root, _read_info(root), is_ours=(root / layout.IDENTITY).is_file())
     _check_features(files, findings)
     _read_tasks(files, findings)

@@ -42,7 +42,6 @@ class Finding:
     remedy: str = ""
 
     def __str__(self) -> str:
-        """Return place and fact on one line."""
         return f"{self.where}: {self.what}"
 
 

@@ -27,11 +27,7 @@ class _Column:
 
 
 class FrozenCheck:
-    """The check for numbers that stand still, over all files.
-
-    Args:
-        features: of the dataset.
-    """
+    """The check for numbers that stand still, over all files."""
 
     def __init__(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         self._features = features

@@ -22,13 +22,6 @@ def check_numbers(
 ) -> NDArray[np.intp] | None:
     """Check the numbers of the frames of a data file, and the instructions that `meta/episodes` names.
 
-    Args:
-        path: the file.
-        table: its columns, at least the numbers; a missing one is not judged.
-        rows: its episodes, ascending.
-        tasks: all instructions in the order of their numbers; none if they are unknown.
-        findings: what is found is added to it.
-
     Returns:
         The rows of the file in the order of their numbers; None if it does not hold these frames.
     """
@@ -75,14 +68,7 @@ def _check_instructions(
 
 
 def check_order(root: Path, slots: Sequence[layout.Slot], described: Sequence[int], findings: Findings) -> None:
-    """Check the order of files, and of the rows of `meta/episodes`.
-
-    Args:
-        root: the dataset.
-        slots: the data file of each episode, in the order of the episodes.
-        described: the numbers of the episodes, in the order in which LeRobot reads their rows.
-        findings: what is found is added to it.
-    """
+    """Check the order of files, and of the rows of `meta/episodes`."""
     if wrong := wrong_order(slots):
         what = f"{wrong}; LeRobot takes the rows of all files, in the order of their names, for the frames in order"
         findings.error("order", "data", what, SORTS)

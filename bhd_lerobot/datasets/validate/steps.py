@@ -24,17 +24,12 @@ class _Steps:
     episodes: set[int] = field(default_factory=set)
 
     def __str__(self) -> str:
-        """Return how often, and where first."""
         often = "once" if self.count == 1 else f"{self.count} times in {len(self.episodes)} episodes"
         return f"{often}, {'in' if self.count == 1 else 'first in'} episode {self.episode}, frame {self.frame}"
 
 
 class StepCheck:
-    """The check of steps, over all files.
-
-    Args:
-        features: of the dataset.
-    """
+    """The check of steps, over all files."""
 
     def __init__(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         self._features = features

@@ -36,16 +36,7 @@ _LATE_SHARE = 0.01
 
 
 class ValueCheck:
-    """The check of all numbers.
-
-    Attributes:
-        frames: how many were read.
-
-    Args:
-        files: what the small files say.
-        findings: what is found is added to it.
-        limits: of numbers by feature and name; only these are compared.
-    """
+    """The check of all numbers."""
 
     def __init__(self, files: Files, findings: Findings, limits: Limits | None = None) -> None:
         self.frames = 0

@@ -52,16 +52,11 @@ class Committer:
     """
 
     def __init__(self, schema: Schema, disk: Disk, video: VideoSettings) -> None:
-        """Remember how to write."""
         self._schema, self._disk, self._video = schema, disk, video
         self._features_text: tuple[dict[str, Any], str] | None = None
 
     def commit(self, state: DatasetState, content: EpisodeContent) -> DatasetState:
-        """Write an episode and return the state after it; `state` itself is not changed.
-
-        Raises:
-            OSError: the disk refused a step.
-        """
+        """Write an episode and return the state after it; `state` itself is not changed."""
         root, length = state.root, len(next(iter(content.columns.values())))
         staging = root / layout.STAGING / "save"
         self._disk.make_folder(staging)

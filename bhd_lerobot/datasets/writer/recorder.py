@@ -304,11 +304,7 @@ class DatasetRecorder:
 
 
 def _check_last(state: DatasetState) -> None:
-    """Check that the files of the last episode are the last ones: those behind them are the next episode's.
-
-    Raises:
-        DatasetCorruptError: there are others behind them.
-    """
+    """Check that the files of the last episode are the last ones: those behind them are the next episode's."""
     for kind in ("data", "meta/episodes", *(f"videos/{key}" for key in state.video_keys)):
         slots = [slot_of(row, kind) for row in state.rows]
         if slots and max(slots) != slots[-1]:

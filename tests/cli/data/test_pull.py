@@ -1,4 +1,4 @@
-"""bhd-data pull: what is reported about some episodes and about places without checksums, and how odd metadata end."""
+"""bhd-data pull: what is reported about some episodes, and how odd metadata end."""
 
 import shlex
 from pathlib import Path
@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.datasets.remote.listing import MANIFEST
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.training.config import BhdTrainConfig
@@ -37,14 +36,14 @@ def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tm
     assert not [one for one in tmp_path.iterdir() if "c" in one.name]
 
 
-def test_the_command_that_is_suggested_is_one_that_works(lesson: Path, tmp_path: Path, capsys) -> None:
-    """With the user's own values, also where the place has no name that is one on the Hub."""
+def test_the_command_that_is_suggested_is_one_that_works(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+    """With the user's own values."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    url, target = f"file://{tmp_path}/shelf", tmp_path / "my copy"
-    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
+    target = tmp_path / "my copy"
+    assert main.main(["push", str(lesson), "me/d", "--no_card"]) == 0
     capsys.readouterr()
-    assert main.main(["pull", url, f"--root={target}", "--episodes=1,3-4"]) == 0
+    assert main.main(["pull", "me/d", f"--root={target}", "--episodes=1,3-4"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{target}: 3 episodes of 6: 1,3-4"
     assert "hold all 6. Name yours where you load them" in lines[-2]
@@ -54,19 +53,6 @@ def test_the_command_that_is_suggested_is_one_that_works(lesson: Path, tmp_path:
     assert (Path(dataset.root), dataset.episodes) == (target, [1, 3, 4])
     loaded = LeRobotDataset(dataset.repo_id, root=dataset.root, episodes=dataset.episodes)
     assert loaded.num_episodes == 3
-
-
-def test_files_compared_by_size_only_are_reported(lesson: Path, tmp_path: Path, capsys) -> None:
-    url = f"file://{tmp_path}/shelf"
-    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
-    (tmp_path / "shelf" / MANIFEST).unlink()
-    pull = ["pull", url, f"--root={tmp_path / 'e'}"]
-    assert main.main(pull) == 0
-    assert "by size" not in capsys.readouterr().out
-    assert main.main(pull) == 0
-    assert f"compared by size only, because no checksums are listed at {url}; --verify" in capsys.readouterr().out
-    assert main.main([*pull, "--verify"]) == 0
-    assert "by size" not in capsys.readouterr().out
 
 
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"

@@ -1,10 +1,8 @@
 """Merging, keeping, deleting and splitting: laws about what is in the result, whatever is killed or full."""
 
-import errno
 import json
 import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +14,8 @@ from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep, merge, split
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.recovery.fix import fix
-from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import (
@@ -28,12 +25,10 @@ from bhd_lerobot.errors import (
     DatasetExistsError,
     DatasetLockedError,
     DatasetMismatchError,
-    DatasetWriteError,
     UnsupportedDatasetError,
 )
-from tests.datasets import kill_jobs, support
-from tests.datasets.edit_support import NUMBERS, assert_valid, content, record, steps_of
-from tests.forks import Fork
+from tests.datasets import support
+from tests.datasets.edit_support import NUMBERS, assert_valid, content, record
 
 
 @pytest.fixture(scope="module")
@@ -151,39 +146,6 @@ def test_edits_are_logged(tmp_path: Path) -> None:
     assert [edit["edit"] for edit in edits_of(tmp_path / "one")] == ["merge", "delete", "keep"]
     assert edits_of(tmp_path / "one")[1]["episodes"] == [2]
     assert edits_of(roots[0]) == []
-
-
-def test_a_kill_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
-    origin = record(tmp_path / "origin", [0, 1, 2, 3])
-    old = content(origin)
-    new = [old[0], old[2], old[3]]
-    steps = steps_of(lambda: delete(shutil.copytree(origin, tmp_path / "count"), [1]))
-    seen = set()
-    for step in range(0, steps, 6):  # all of them: `delete` in tests/datasets/sweeps
-        root = shutil.copytree(origin, tmp_path / f"d{step}")
-        assert Fork(kill_jobs.delete, root, [1], step).wait() == -signal.SIGKILL
-        repair(root)
-        assert content(root) in (old, new)
-        seen.add(len(content(root)))
-        assert not (root / layout.STAGING).exists()
-    assert seen == {3, 4}  # the kills came before and after the decision
-
-
-def test_a_full_disk_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = record(tmp_path / "d", [0, 1, 2])
-    before = content(root)
-
-    def full(self: Disk, path: Path, data: bytes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-    for action in (lambda: delete(root, [0]), lambda: keep(root, [0], tmp_path / "kept")):
-        with monkeypatch.context() as patched:
-            patched.setattr(Disk, "write", full)
-            with pytest.raises(DatasetWriteError, match="No space left on device"):
-                action()
-        assert content(root) == before
-        assert not (root / layout.STAGING).exists()
-        assert not (tmp_path / "kept").exists()
 
 
 def test_episodes_of_another_shape_do_not_merge(plain: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.recovery.repair import repair, settle
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
-from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
 from tests.datasets import corruption_jobs
 from tests.datasets.edit_support import Episode, assert_valid, content
 from tests.forks import Fork
@@ -309,23 +309,6 @@ def test_a_camera_without_any_video_is_named(recorded: Recorded, tmp_path: Path)
     changed_info(root, root / "meta/info.json", camera)
     with pytest.raises(DatasetCorruptError, match=r"describes observation\.images\.rear, of which there is no video"):
         repair(root)
-
-
-def test_a_full_disk_leaves_the_dataset_as_it_was(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = recorded(tmp_path / "d", "none", 2, "saved")
-    before = {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
-
-    def full(self: Disk, path: Path, data: bytes) -> None:
-        raise OSError(28, "No space left on device", str(path))
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Disk, "write", full)
-        with pytest.raises(DatasetWriteError, match="No space left"):
-            repair(root)
-    assert {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
-    assert repair(root).episodes == 2
 
 
 def test_a_recording_that_goes_on_is_left_alone(recorded: Recorded, tmp_path: Path) -> None:

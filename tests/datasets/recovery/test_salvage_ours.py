@@ -17,7 +17,6 @@ from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.recovery import salvage as guard
 from bhd_lerobot.datasets.recovery.repair import repair
-from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
@@ -38,10 +37,6 @@ def copied(source: Path, target: Path) -> Path:
     return Path(shutil.copytree(source, target))
 
 
-def snapshot(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def cut(size: int) -> Callable[[Path], None]:
     return lambda path: os.truncate(path, path.stat().st_size - size)
 
@@ -59,7 +54,7 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         cut(size)(root / DATA)
         with pytest.raises(ConfigError, match="Leave --info out"):
             repair(root, recorded)
-        before = snapshot(root)
+        before = support.snapshot(root)
         remedies = [finding.remedy for finding in check_dataset(root).findings if finding.where == DATA]
         assert remedies
         assert all("bhd-data repair" in remedy for remedy in remedies)
@@ -69,7 +64,7 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         assert f"What was wrong: {root / DATA} is corrupt" in str(report)
         assert "in which no episode is whole" in str(report)
         assert report.aside is not None
-        assert snapshot(report.aside) == before
+        assert support.snapshot(report.aside) == before
         assert content(root) == content(recorded)
         assert_valid(root)
         assert not repair(root)
@@ -192,7 +187,7 @@ def test_files_that_cannot_be_read_now_are_not_given_up(
         if not is_ours:
             (root / "meta/bhd.json").unlink()
         cut(500)(root / DATA)
-        before = snapshot(root)
+        before = support.snapshot(root)
 
         def refuse(path: Path, *args: Any, **options: Any) -> Any:
             if Path(path).suffix == ".mp4":
@@ -203,50 +198,18 @@ def test_files_that_cannot_be_read_now_are_not_given_up(
             patched.setattr(guard, "open", refuse, raising=False)
             with pytest.raises(DatasetError, match=r"\.mp4 cannot be read: Permission denied.*Nothing was changed"):
                 repair(root)
-        assert snapshot(root) == before
+        assert support.snapshot(root) == before
         assert repair(root).episodes == 4
-
-
-def test_a_kill_at_any_step_leaves_a_recoverable_dataset(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Killed(BaseException):
-        """Ends the process."""
-
-    step, done, wanted = 0, False, content(recorded)
-    while not done:
-        root = copied(recorded, tmp_path / f"d{step}")
-        cut(500)(root / DATA)
-        before = (root / DATA).read_bytes()
-        seen: list[str] = []
-
-        def before_step(action: str, path: Path, seen: list[str] = seen, last: int = step) -> None:
-            seen.append(action)
-            if len(seen) == last + 1:
-                raise Killed
-
-        with monkeypatch.context() as patched:
-            patched.setattr(disk, "_before_step", before_step)
-            done = True
-            try:
-                repair(root)
-            except Killed:
-                done = False
-        repair(root)
-        assert content(root) == wanted, step
-        assert any(path.read_bytes() == before for path in tmp_path.glob(f"d{step}.damaged-*/{DATA}")), step
-        assert not (root / ".bhd").exists()
-        step += 7
 
 
 def test_a_damaged_identity_is_not_replaced(recorded: Path, tmp_path: Path) -> None:
     root = copied(recorded, tmp_path / "d")
     cut(500)(root / DATA)
     (root / "meta/bhd.json").write_text("{")
-    before = snapshot(root)
+    before = support.snapshot(root)
     with pytest.raises(DatasetCorruptError, match=r"bhd\.json is corrupt"):
         repair(root)
-    assert snapshot(root) == before
+    assert support.snapshot(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
@@ -325,7 +288,7 @@ def test_an_invalid_info_is_refused(recorded: Path, tmp_path: Path) -> None:
     info = json.loads((root / "meta/info.json").read_text())
     for change in ({"features": {"a": 1}}, {"features": {"a": {}}}, {"fps": 0}, {"codebase_version": None}):
         (root / "meta/info.json").write_text(json.dumps(info | change))
-        before = snapshot(root)
+        before = support.snapshot(root)
         with pytest.raises(DatasetError, match=r"info\.json|format"):
             repair(root)
-        assert snapshot(root) == before
+        assert support.snapshot(root) == before

@@ -19,7 +19,8 @@ from bhd_lerobot.errors import (
     DatasetLockedError,
 )
 from tests.datasets import support
-from tests.hub_server.fixtures import content, send, stored
+from tests.datasets.support import snapshot as content
+from tests.hub_server.fixtures import send, stored
 from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]
@@ -130,14 +131,6 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_p
     assert b"anew" in stored(hub)["README.md"]
 
 
-def test_an_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> None:
-    (root / "preview.png").write_bytes(b"mine")
-    send(root, make_card=made())
-    assert stored(hub)["preview.png"] == b"mine"
-    assert b"True" in stored(hub)["README.md"]
-    assert not send(root, make_card=made()).sent
-
-
 def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
     hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,15 +176,12 @@ def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_p
     assert stored(hub)["same.txt"] == b"mine"
 
 
-def test_the_list_of_files_of_a_url_is_not_sent(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    """A folder that was pushed to as a URL is a dataset as well."""
+def test_the_checksums_of_version_0_2_are_not_copied_and_go(hub: HubServer, root: Path, tmp_path: Path) -> None:
     shelf = tmp_path / "shelf"
     push(root, StoreDataset(f"file://{shelf}"))
-    assert (shelf / MANIFEST).is_file()
+    (shelf / MANIFEST).write_text("{}")
     assert MANIFEST not in send(shelf).sent
     assert stored(hub) == content(root)
-    # One that an earlier version sent goes, and does not come along.
-    hub.dataset("me/d").files()[MANIFEST] = hub.dataset("me/d").files()[layout.INFO]
-    pull(HubDataset("me/d"), tmp_path / "e")
+    pull(StoreDataset(f"file://{shelf}"), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
-    assert send(root).deleted == [MANIFEST]
+    assert push(root, StoreDataset(f"file://{shelf}")).deleted == [MANIFEST]

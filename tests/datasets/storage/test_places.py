@@ -123,7 +123,7 @@ def test_filter_writes_to_its_output_only(root: Path, tmp_path: Path) -> None:
 class Listing:
     """A remote place that lists what a stranger wants."""
 
-    name, folder = "there", None
+    name, folder, has_checksums = "there", None, True
 
     def __init__(self, paths: list[str]) -> None:
         self._paths = paths
@@ -142,6 +142,12 @@ def test_file_names_of_a_remote_place_are_checked(tmp_path: Path) -> None:
 def test_a_pull_refuses_a_staging_folder_of_another_user(tmp_path: Path) -> None:
     """In a folder that is everybody's, as /tmp, its name can be foreseen, and what is in it could change later."""
     staging = tmp_path / ".d.pull"
+    staging.mkdir()
+    (staging / "thesis.txt").write_text("years")  # of this user, but of no pull
+    with pytest.raises(DatasetError, match=r"\.d\.pull is in the way"):
+        pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
+    (staging / "thesis.txt").unlink()
+    staging.rmdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / ".bhd-pull").touch()
     staging.symlink_to("elsewhere")

@@ -224,7 +224,7 @@ OPERATIONS = (
     Operation(
         "pull in the place of another",
         _afar_and_here,
-        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "d 1"), "--replace", "--verify"],
+        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "d 1"), "--replace"],
         "d 1",
         places=(*ANYWHERE, "fixed"),
     ),

@@ -21,6 +21,7 @@ from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding,
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
 from tests.datasets.loader import support as loader_support
+from tests.datasets.support import snapshot
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
 STATE = ["a.pos", "b.pos", "tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"]
@@ -89,10 +90,6 @@ def copy(root: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(root, tmp_path / "copy"))
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def data_file(root: Path) -> Path:
     return next((root / "data").rglob("*.parquet"))
 
@@ -120,12 +117,12 @@ def bad(found: DatasetCheck) -> list[Finding]:
 
 
 def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
-    before = contents(valid)
+    before = snapshot(valid)
     found = check_dataset(valid, limits)
     assert bad(found) == []
     assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
     assert [finding.what for finding in found.findings if finding.check == "outcome"] == ["success 6"]
-    assert contents(valid) == before
+    assert snapshot(valid) == before
 
 
 def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:

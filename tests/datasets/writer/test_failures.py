@@ -27,10 +27,6 @@ from bhd_lerobot.errors import (
 from tests.datasets import support
 
 
-def snapshot(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def make(root: Path, episodes: int = 2, *, video: bool = False) -> Path:
     with support.create(root, video=video) as recorder:
         for _ in range(episodes):
@@ -226,7 +222,7 @@ def test_a_failed_finalize_gives_the_lock_back_and_can_be_followed_by_more(tmp_p
 
 def test_a_dataset_that_does_not_fit_is_not_resumed(tmp_path: Path) -> None:
     root = make(tmp_path / "d", video=True)
-    before = snapshot(root)
+    before = support.snapshot(root)
 
     def attempt(**changes: object) -> None:
         options = {"fps": 10, "features": support.VIDEO_FEATURES, "robot_type": "toy", "recording": {"seed": 1}}
@@ -247,7 +243,7 @@ def test_a_dataset_that_does_not_fit_is_not_resumed(tmp_path: Path) -> None:
     for words, changes in cases.items():
         with pytest.raises(DatasetMismatchError, match=words):
             attempt(**changes)
-    assert snapshot(root) == before
+    assert support.snapshot(root) == before
 
 
 def test_a_dataset_of_another_program_is_read_but_not_resumed(tmp_path: Path) -> None:
@@ -292,14 +288,14 @@ def test_a_corrupt_file_is_named_and_nothing_is_overwritten(tmp_path: Path) -> N
     for name, damage in DAMAGES:
         origin = (root / name).read_bytes()
         damage(root / name)
-        before = snapshot(root)
+        before = support.snapshot(root)
         calls = [lambda: support.resume(root, video=True), lambda: dataset_info(root), lambda: repair(root)]
         # What `repair` recovers is in test_salvage_ours.py.
         for call in calls[: 2 if (name, damage) in RECOVERABLE else 3]:
             with pytest.raises(DatasetCorruptError, match="Restore this file") as caught:
                 call()
             assert name.split("/chunk", maxsplit=1)[0] in str(caught.value)
-        assert snapshot(root) == before
+        assert support.snapshot(root) == before
         (root / name).write_bytes(origin)
 
 
