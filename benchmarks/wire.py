@@ -405,7 +405,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--n", type=int, nargs="+", default=[1, 64], help="simulations, in the second table")
     options = parser.parse_args(arguments)
-    console = Console()
+    console = Console(width=120)
     table = Table(title="What was written to the plants")
     for column in (
         "actions",
