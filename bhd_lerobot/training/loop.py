@@ -116,14 +116,7 @@ class TrainingLoop:
     """
 
     def __init__(self, learner: Learner, loader: Any, options: LoopOptions, hooks: Hooks) -> None:
-        """Prepare it at step 0.
-
-        Args:
-            learner: what learns.
-            loader: iterable over the batches of an epoch, with `state_dict` and `load_state_dict`.
-            options: when what happens.
-            hooks: what is called then.
-        """
+        """Prepare it at step 0."""
         self.learner, self.loader, self.options, self.hooks = learner, loader, options, hooks
         self.step = 0
         self.interrupted = False
@@ -140,11 +133,7 @@ class TrainingLoop:
         }
 
     def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
-        """Go on after `step` steps.
-
-        Raises:
-            BhdError: the dataset or the selection is not the one of the state.
-        """
+        """Go on after `step` steps."""
         if state.get("frames", self.options.frames) != self.options.frames:
             raise BhdError(
                 f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "
@@ -163,12 +152,7 @@ class TrainingLoop:
             self.loader.load_state_dict(state["loader"])
 
     def run(self) -> None:
-        """Train to the end, or until asked to stop; then a checkpoint of the last step exists.
-
-        Raises:
-            DivergedError: the loss is not finite; nothing was saved since.
-            BhdError: a checkpoint cannot be written.
-        """
+        """Train to the end, or until asked to stop; then a checkpoint of the last step exists."""
         batches = self._batches()
         self._window.started = time.perf_counter()
         while self.step < self.options.steps and not self.interrupted:
@@ -236,11 +220,7 @@ class TrainingLoop:
         return row
 
     def _check(self) -> None:
-        """Look for a loss that is not finite; where that was done at once, there is none.
-
-        Raises:
-            DivergedError: names the first one.
-        """
+        """Look for a loss that is not finite; where that was done at once, there is none."""
         if not self._window.results:
             return
         losses = torch.stack([result.loss for result in self._window.results])

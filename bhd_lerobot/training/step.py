@@ -88,11 +88,7 @@ class Learner:
         return self._preprocessor(batch)
 
     def step(self, batch: Batch) -> StepResult:
-        """Learn from a batch that `prepare` returned.
-
-        Raises:
-            NonFiniteLossError: on a CPU, where looking costs nothing; elsewhere whoever reads the losses has to look.
-        """
+        """Learn from a batch that `prepare` returned."""
         with nullcontext() if self._is_plain else self._accelerator.autocast():
             loss, outputs = self.policy.forward(batch)
         if self._checks_at_once and not bool(torch.isfinite(loss)):
@@ -116,10 +112,6 @@ class Learner:
 
         Dropout is off, and what a policy draws, it draws from `seed`: the same in every evaluation, and the training
         goes on as if there had been none.
-
-        Args:
-            batches: of the dataset; of this process, if there are several.
-            seed: of the policy's noise.
         """
         device = self._accelerator.device
         total, count = torch.zeros((), dtype=torch.float64, device=device), 0

@@ -69,11 +69,7 @@ class CnnConfig(MlpConfig):
     )
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
         for name in ("image_dim", "sectors"):
             if getattr(self, name) < 1:
@@ -109,11 +105,7 @@ class CnnConfig(MlpConfig):
         return self.image_dim + self.sectors
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find odometry and ranges by their names, and read neither as numbers; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
+        """Find odometry and ranges by their names, and read neither as numbers; LeRobot's `make_policy` calls it."""
         names = list((features.get(OBS_STATE) or {}).get("names") or [])
         if missing := [name for name in ODOMETRY if name not in names]:
             raise ConfigError(
@@ -134,11 +126,7 @@ class CnnConfig(MlpConfig):
         self.ignored_columns = sorted(unread)
 
     def validate_features(self) -> None:
-        """Keep the inputs that it reads, and refuse what it cannot be built for.
-
-        Raises:
-            ConfigError: image, odometry, ranges or action are missing.
-        """
+        """Keep the inputs that it reads, and refuse what it cannot be built for."""
         known = self.input_features or {}
         cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
         if self.image_key not in cameras:

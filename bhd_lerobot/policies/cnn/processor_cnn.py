@@ -59,12 +59,7 @@ def make_bhd_cnn_pre_post_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's pipelines, with the step that keeps odometry and ranges in their units.
-
-    Args:
-        config: of the policy, which `make_policy` has completed.
-        dataset_stats: mean and standard deviation of every feature.
-    """
+    """Return LeRobot's pipelines, with the step that keeps odometry and ranges in their units."""
     stats = floored(dataset_stats, config.min_std)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
     own = OdometryProcessorStep(config.odometry_columns, config.range_columns)

@@ -82,9 +82,6 @@ class GoalExpert:
     Before it begins, an arm with objects around it comes to rest and gets out of what it is among: it opens the gripper
     and goes straight up; what it holds, if that is what the task is about, it raises. From an odd posture, and where
     the expert's first goal has no way, it goes home first. An expert that has given up begins again from there.
-
-    Args:
-        brain: the expert.
     """
 
     def __init__(self, brain: GoalBrain) -> None:
@@ -132,12 +129,7 @@ class GoalExpert:
         return [turn.doing or text for turn, text in zip(self._turns, self.brain.subtasks(), strict=True)]
 
     def act(self, seen: Observation, driving: NDArray[np.bool_]) -> dict[int, list[BrainCommand]]:
-        """Return the new goals, by simulation.
-
-        Args:
-            seen: what the robots see.
-            driving: where the expert drives, shape (n,).
-        """
+        """Return the new goals, by simulation."""
         commands: dict[int, list[BrainCommand]] = {}
         results: dict[int, list[CommandResult]] = {}
         active = driving.copy()

@@ -60,11 +60,7 @@ class _FrameCounter:
 
 
 class PatienceWatch(_FrameCounter):
-    """The learner has had its time.
-
-    Args:
-        frames: how many frames its turn may last.
-    """
+    """The learner has driven for `frames` frames."""
 
     cause = "time is up"
 
@@ -79,15 +75,7 @@ class PatienceWatch(_FrameCounter):
 
 
 class StallWatch:
-    """The robot gets nowhere: no joint turns, or the base stays where it is.
-
-    Args:
-        frames: for so many frames.
-        robot: the robot, whose body is known.
-
-    Raises:
-        ConfigError: it does not observe where it is.
-    """
+    """The robot gets nowhere for `frames` frames: no joint turns, or the base stays where it is."""
 
     cause = "no progress"
 
@@ -125,16 +113,7 @@ class StallWatch:
 
 
 class DisagreementWatch(_FrameCounter):
-    """The learner wants something else than the expert would do.
-
-    Args:
-        share: by more than this share of an action's range,
-        frames: for so many frames in a row.
-        robot: the robot.
-
-    Raises:
-        ConfigError: the range of an action is not known.
-    """
+    """For `frames` frames in a row the learner differs from the expert by more than this share of an action's range."""
 
     cause = "disagreement"
 
@@ -251,11 +230,7 @@ class ArmCollisionWatch:
 
 
 def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
-    """Return what watches a robot for collisions.
-
-    Raises:
-        ConfigError: its shape is not known.
-    """
+    """Return what watches a robot for collisions."""
     match robot.body:
         case MobileBase(lidar=lidar) as base if lidar is not None:
             return BaseCollisionWatch(horizon_s, robot, base)

@@ -38,12 +38,7 @@ class RulePlanner:
     """Plans for instructions that `parse` understands and that fit exactly one object on the table."""
 
     def plan(self, instruction: str, scene: Sequence[SceneObject]) -> Plan:
-        """Return the plan for an instruction.
-
-        Raises:
-            NothingFitsError: no object fits.
-            InstructionError: it is not understood, or more than one object fits.
-        """
+        """Return the plan for an instruction."""
         objects = list(check_request(instruction, scene).values())
         request = parse(instruction)
         found = fitting(request.what, objects)
@@ -73,11 +68,7 @@ class _Token:
 
 
 def parse(instruction: str) -> Request:
-    """Return what an instruction asks for.
-
-    Raises:
-        InstructionError: not every word is known, or together they do not ask for one action with one object.
-    """
+    """Return what an instruction asks for."""
     if len(instruction) > MAX_LENGTH:
         raise InstructionError(
             f"The instruction has {len(instruction)} characters; at most {MAX_LENGTH} are understood."

@@ -64,12 +64,6 @@ class LearnedBrain:
 
     Every simulation has its own chunk, history and random numbers, which follow from its episode's seed; those that
     need a new chunk in the same frame share a forward pass.
-
-    Args:
-        config: the parameters.
-
-    Raises:
-        ConfigError: the checkpoint cannot be used; the message says why.
     """
 
     name = "learned"
@@ -107,20 +101,13 @@ class LearnedBrain:
 
         Where there is no such folder, it says `ANY_ROBOT`: a configuration may be read before its policy is trained,
         and reading it asks nobody on the network. Making the brain then fails, or fetches the policy.
-
-        Raises:
-            ConfigError: there is a folder, and no checkpoint that can be used.
         """
         if not Path(config.path).expanduser().is_dir():
             return ANY_ROBOT
         return PolicyContract.load(config.path).robot_type or ANY_ROBOT
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Check that these are the features, the rate and the cameras that the policy was trained on.
-
-        Raises:
-            ConfigError: they are not; the message names both sides.
-        """
+        """Check that these are the features, the rate and the cameras that the policy was trained on."""
         who = f"The policy {self.config.path!r}"
         inputs = self.loaded.inputs
         has_environment = _ENVIRONMENT in inputs
@@ -168,12 +155,7 @@ class LearnedBrain:
         self.inference.reset(ids, seeds, n, instructions)
 
     def act(self, observation: Observation) -> "NDArray[np.float64] | Chunk | None":
-        """Return the actions, shape (n, actions); with `stream`, chunks, and None between two of them.
-
-        Raises:
-            ConfigError: an image that the policy looks at is missing or has another shape.
-            ActionError: the policy gave a value that is not finite.
-        """
+        """Return the actions, shape (n, actions); with `stream`, chunks, and None between two of them."""
         n = len(self._next)
         running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
         ids = running[self._next[running] >= self.inference.steps]
@@ -242,11 +224,7 @@ class LearnedBrain:
         return rows
 
     def _check_cameras(self, cameras: Mapping[str, tuple[int, ...]]) -> None:
-        """Check that the cameras that the policy looks at are there, and their images are of the shape that it knows.
-
-        Raises:
-            ConfigError: they are not; the message names both sides and the remedy.
-        """
+        """Check that the cameras that the policy looks at are there, with images of the shape that it knows."""
         for key, camera in self.loaded.cameras.items():
             shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
             if camera not in cameras:

@@ -51,9 +51,6 @@ def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:
         path: that folder; a checkpoint's or a training run's folder, then its last checkpoint; or the name of a model
             on the Hub, `user/name`.
         revision: branch, tag or commit of a model on the Hub; its main branch if None.
-
-    Raises:
-        ConfigError: there is none, or it is not complete; the message says what was looked for.
     """
     text, folder = str(path), Path(path).expanduser()
     if folder.is_dir():

@@ -58,11 +58,7 @@ class ScanConfig:
         return self.transform != "none" or bool(self.channels)
 
     def check(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         if self.transform not in SCAN_TRANSFORMS:
             raise ConfigError(unknown_name("policy.scan.transform", self.transform, SCAN_TRANSFORMS))
         for name in ("scale", "minimum"):
@@ -85,15 +81,7 @@ def _names(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:
 
 
 def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the columns of `observation.state` whose names match a pattern.
-
-    Args:
-        patterns: of `policy.ignore`.
-        names: of all columns.
-
-    Raises:
-        ConfigError: a pattern matches none.
-    """
+    """Return the columns of `observation.state` whose names match a pattern."""
     for pattern in patterns:
         if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
             some = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
@@ -102,15 +90,7 @@ def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]
 
 
 def check_residual(config: Any, width: int) -> None:
-    """Refuse `residual` where it is not known which columns it means.
-
-    Args:
-        config: with `residual`, `residual_columns` and `action_feature`.
-        width: numbers of `observation.state`.
-
-    Raises:
-        ConfigError: it cannot be honoured.
-    """
+    """Refuse `residual` where it is not known which columns it means."""
     columns, actions = config.residual_columns, int(config.action_feature.shape[0])
     if config.residual and (len(columns) != actions or max(columns, default=-1) >= width):
         raise ConfigError(
@@ -227,11 +207,7 @@ class MlpConfig(PreTrainedConfig):
     input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
         positive = dict.fromkeys(("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps", "modes"), 1)
         for name, least in {**positive, "yaw_harmonics": 0}.items():
@@ -323,11 +299,7 @@ class MlpConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: there are none.
-        """
+        """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it."""
         names = _names(features, OBS_STATE)
         if self.yaw_harmonics and not self.quaternions:
             self.state_quaternions = quaternion_columns(names)
@@ -353,11 +325,7 @@ class MlpConfig(PreTrainedConfig):
         self.scan.start, self.scan.beams = columns[0], len(columns)
 
     def validate_features(self) -> None:
-        """Keep the inputs that it reads, and refuse what it cannot be built for.
-
-        Raises:
-            ConfigError: there is no input or no action, or the beams lie outside the state.
-        """
+        """Keep the inputs that it reads, and refuse what it cannot be built for."""
         known: dict[str, PolicyFeature] = self.input_features or {}
         kept = {key: feature for key, feature in known.items() if key in (OBS_STATE, OBS_ENV_STATE, self.image_key)}
         self.input_features = kept

@@ -80,12 +80,7 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
 
 
 def in_order(rows: Tensor, fields: tuple[int, ...] | list[int]) -> Tensor:
-    """Return objects, shape (…, count, size): what is meant first, then the nearest to it, what is not there last.
-
-    Args:
-        rows: the objects, in the same shape.
-        fields: where `FIELDS` are among the numbers of an object.
-    """
+    """Return objects, shape (…, count, size): what is meant first, then the nearest to it, what is not there last."""
     present, target, x, y, *_ = fields
     is_meant = (rows[..., target] > 0.5) & (rows[..., present] > 0.5)
     place = rows[..., [x, y]]

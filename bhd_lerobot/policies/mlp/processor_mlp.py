@@ -24,15 +24,7 @@ def make_bhd_mlp_pre_post_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return the pipelines that normalise observations and give actions their units back.
-
-    Args:
-        config: of the policy, which `make_policy` has completed.
-        dataset_stats: mean and standard deviation of every feature.
-
-    Raises:
-        ConfigError: the configuration treats beams and does not know yet where they are.
-    """
+    """Return the pipelines that normalise observations and give actions their units back."""
     stats = floored(dataset_stats, config.min_std)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
     before = [steps.rename_observations, steps.add_batch_dim, steps.to_device]

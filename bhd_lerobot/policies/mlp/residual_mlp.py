@@ -56,16 +56,7 @@ class Residual(nn.Module):
 
 
 def residual_columns(patterns: Sequence[str], actions: Sequence[str], observed: Sequence[str]) -> list[int]:
-    """Return of each action the column of the observation that has its name, if its name matches; else -1.
-
-    Args:
-        patterns: of `policy.residual`.
-        actions: names of the actions.
-        observed: names of the numbers of `observation.state`.
-
-    Raises:
-        ConfigError: a pattern matches no action that is observed, too.
-    """
+    """Return of each action the column of the observation that has its name, if its name matches; else -1."""
     places = {name: place for place, name in enumerate(observed)}
     both = [name for name in actions if name in places]
     for pattern in patterns:

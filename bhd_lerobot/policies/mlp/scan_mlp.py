@@ -57,13 +57,7 @@ def transformed(ranges: Tensor, config: ScanConfig) -> Tensor:
 
 
 class ScanEncoder(nn.Module):
-    """Convolutions over a closed circle of beams: turning the robot turns what they see.
-
-    Args:
-        config: channels, kernel size and stride.
-        n_obs_steps: scans, which are the input channels.
-        activation: class of the activation behind each convolution.
-    """
+    """Convolutions over a closed circle of beams: turning the robot turns what they see."""
 
     def __init__(self, config: ScanConfig, n_obs_steps: int, activation: type[nn.Module]) -> None:
         super().__init__()

@@ -43,11 +43,7 @@ class AvoidanceConfig(BrainConfig):
 
 
 class AvoidanceBrain(ConfiguredBrain):
-    """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop.
-
-    Args:
-        config: the parameters; the articles' if None.
-    """
+    """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop."""
 
     name = "avoidance"
     robot_kind = "base"

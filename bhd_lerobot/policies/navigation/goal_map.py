@@ -31,11 +31,7 @@ _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 class GoalMap:
-    """Maps of n robots.
-
-    Args:
-        n: how many.
-    """
+    """Maps of n robots."""
 
     def __init__(self, n: int) -> None:
         self._seen = np.zeros((n, _SIDE, _SIDE), np.bool_)

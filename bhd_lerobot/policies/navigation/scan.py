@@ -27,9 +27,6 @@ class ScanReader:
         names: the observation's features.
         who: name of the brain, for messages.
         limits: a reading outside them is not valid [m]; a beam without a return reads exactly the upper one.
-
-    Raises:
-        ConfigError: there is no scan, or one of too few beams.
     """
 
     def __init__(self, names: Sequence[str], who: str, limits: tuple[float, float]) -> None:

@@ -75,9 +75,6 @@ class Projection:
             high: largest [m].
             margin: what is added on every side, as a share of the image's width.
             multiple: its width and height are multiples of this [px].
-
-        Raises:
-            ValueError: the box is not seen.
         """
         corners = self.pixels(np.array(list(itertools.product(*zip(low, high, strict=True)))))
         margin *= self.width

@@ -83,11 +83,7 @@ class PerceptionConfig(PreTrainedConfig):
     output_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
         for name, count in (("camera_position", 3), ("camera_target", 3), ("area", 4)):
             values = getattr(self, name)
@@ -138,11 +134,7 @@ class PerceptionConfig(PreTrainedConfig):
 
     @property
     def region(self) -> Region:
-        """The part of the image in which objects may be.
-
-        Raises:
-            ConfigError: the camera sees nothing of the area.
-        """
+        """The part of the image in which objects may be."""
         x0, y0, x1, y1 = self.area
         try:
             return self.projection.region((x0, y0, 0.0), (x1, y1, self.object_height), self.margin, 2 * STRIDE)
@@ -180,11 +172,7 @@ class PerceptionConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are, and keep that as output; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: it does not.
-        """
+        """Check that the dataset says where objects are, and keep that as output; LeRobot's `make_policy` calls it."""
         names = (features.get(OBS_ENV_STATE) or {}).get("names") or []
         if tuple(names) != LABELS:
             raise ConfigError(
@@ -197,11 +185,7 @@ class PerceptionConfig(PreTrainedConfig):
         self.output_features = {**(self.output_features or {}), OBS_ENV_STATE: labels}
 
     def known_features(self) -> dict[str, PolicyFeature]:
-        """Return all features, among which the image is.
-
-        Raises:
-            ConfigError: it is not.
-        """
+        """Return all features, among which the image is."""
         known = {**(self.input_features or {}), **(self.output_features or {})}
         cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
         if self.image_key not in cameras:
@@ -212,11 +196,7 @@ class PerceptionConfig(PreTrainedConfig):
         return known
 
     def validate_features(self) -> None:
-        """Keep the image as input and the labels as output.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
+        """Keep the image as input and the labels as output."""
         known = self.known_features()
         if OBS_ENV_STATE not in known or tuple(known[OBS_ENV_STATE].shape) != (len(LABELS),):
             raise ConfigError(

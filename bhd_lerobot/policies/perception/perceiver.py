@@ -76,12 +76,6 @@ class Perceiver:
         dataset: what it was trained on.
         path: which checkpoint it is, without where that lies on this machine.
         weights: which weights it has.
-
-    Args:
-        options: which checkpoint, and where it runs.
-
-    Raises:
-        ConfigError: the checkpoint cannot be used; the message says why.
     """
 
     def __init__(self, options: PerceptionOptions) -> None:
@@ -102,9 +96,6 @@ class Perceiver:
 
         Args:
             cameras: image shapes (height, width, channels) [px] by camera name.
-
-        Raises:
-            ConfigError: they are not; the message names both sides and the remedy.
         """
         width, height = self.image_size
         if self.camera not in cameras:
@@ -126,10 +117,6 @@ class Perceiver:
         Args:
             images: by camera, shape (n, height, width, 3), RGB.
             sim: the robot.
-
-        Raises:
-            ConfigError: there is no such camera, or its images have another size.
-            PerceptionError: the image shows nothing at all.
         """
         import torch
 

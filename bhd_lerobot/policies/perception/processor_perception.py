@@ -15,12 +15,7 @@ def make_bhd_perception_pre_post_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's pipelines with the mapping to nothing.
-
-    Args:
-        config: of the policy.
-        dataset_stats: statistics of every feature.
-    """
+    """Return LeRobot's pipelines with the mapping to nothing."""
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     before = [steps.rename_observations, steps.add_batch_dim, steps.to_device, steps.normalize]
     return make_policy_processor_pipelines(before, [steps.unnormalize, steps.to_cpu])

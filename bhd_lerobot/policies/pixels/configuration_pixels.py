@@ -76,11 +76,7 @@ class PixelsConfig(PerceptionConfig):
     optimizer_grad_clip_norm: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
         for name in ("chunk_size", "n_action_steps", "longest_instruction", "text_dim", "n_cells", "n_heads"):
             if getattr(self, name) < 1:
@@ -117,11 +113,7 @@ class PixelsConfig(PerceptionConfig):
         return list(range(self.chunk_size))
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are, and find what is to be ignored by its name.
-
-        Raises:
-            ConfigError: it does not, or there is no such name.
-        """
+        """Check that the dataset says where objects are, and find what is to be ignored by its name."""
         super().set_dataset_feature_metadata(features)
         names, actions = (list((features.get(key) or {}).get("names") or []) for key in (OBS_STATE, ACTION))
         if self.ignore and not self.ignored_columns:
@@ -132,11 +124,7 @@ class PixelsConfig(PerceptionConfig):
             self.tool_columns = [names.index(name) for name in TOOL]
 
     def validate_features(self) -> None:
-        """Keep image and state as inputs, actions and, to learn from, labels as outputs.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
+        """Keep image and state as inputs, actions and, to learn from, labels as outputs."""
         known = self.known_features()
         for key in (OBS_STATE, ACTION):
             if key not in known or len(known[key].shape) != 1:

@@ -32,11 +32,7 @@ class InstructionProcessorStep(ObservationProcessorStep):
     length: int = 128
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation with the instructions, in small letters: 1 + each byte, then zeros; shape (b, length).
-
-        Raises:
-            ConfigError: there is no instruction, or a longer one.
-        """
+        """Return the observation with the instructions, in small letters: 1 + each byte, then zeros; (b, length)."""
         task = (self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
         if task is None:
             raise ConfigError("bhd_pixels acts on an instruction, and the batch has none (`task`).")
@@ -74,12 +70,7 @@ def make_bhd_pixels_pre_post_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's pipelines, with the step that writes instructions as bytes.
-
-    Args:
-        config: of the policy.
-        dataset_stats: mean and standard deviation of every feature.
-    """
+    """Return LeRobot's pipelines, with the step that writes instructions as bytes."""
     stats = floored(dataset_stats, config.min_std)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
     before = [steps.rename_observations, steps.add_batch_dim, InstructionProcessorStep(config.longest_instruction)]

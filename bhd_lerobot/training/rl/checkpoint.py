@@ -24,17 +24,7 @@ def folder_of(output_dir: Path, step: int) -> Path:
 
 
 def save(output_dir: Path, parts: RlParts, learner: Any, run: dict[str, Any]) -> Path:
-    """Write a checkpoint, point `last` at it, and return its folder.
-
-    Args:
-        output_dir: the run's folder.
-        parts: the policy, whose weights are the learner's, and what belongs to it.
-        learner: the `WarmedUpPPO`.
-        run: state of the run, JSON values.
-
-    Raises:
-        BhdError: it cannot be written; those before it are intact.
-    """
+    """Write a checkpoint, point `last` at it, and return its folder."""
     from stable_baselines3.common.save_util import save_to_zip_file
 
     final = folder_of(output_dir, learner.num_timesteps)
@@ -49,13 +39,7 @@ def save(output_dir: Path, parts: RlParts, learner: Any, run: dict[str, Any]) ->
 
 
 def export(folder: Path, parts: RlParts, log_std: torch.Tensor) -> None:
-    """Write the policy in LeRobot's form: configuration, weights, processors, and the contract.
-
-    Args:
-        folder: where it goes.
-        parts: the policy and what belongs to it.
-        log_std: the learner's exploration noise, shape (actions,).
-    """
+    """Write the policy in LeRobot's form: configuration, weights, processors, and the contract."""
     folder.mkdir(parents=True, exist_ok=True)
     if parts.actor.log_std is not None:
         with torch.no_grad():
@@ -67,11 +51,7 @@ def export(folder: Path, parts: RlParts, log_std: torch.Tensor) -> None:
 
 
 def read_run(output_dir: Path) -> dict[str, Any]:
-    """Return the state of a run in its last checkpoint.
-
-    Raises:
-        ConfigError: there is none, or it is of version 0.1.
-    """
+    """Return the state of a run in its last checkpoint."""
     state = _last(output_dir) / TRAINING_STATE_DIR
     try:
         run = json.loads((state / RUN).read_text(encoding="utf-8"))
@@ -86,11 +66,7 @@ def read_run(output_dir: Path) -> dict[str, Any]:
 
 
 def load(output_dir: Path, learner: Any) -> None:
-    """Load the last checkpoint of a run into a learner.
-
-    Raises:
-        ConfigError: there is none that fits.
-    """
+    """Load the last checkpoint of a run into a learner."""
     folder = _last(output_dir)
     try:
         learner.set_parameters(str(folder / TRAINING_STATE_DIR / LEARNER), device="cpu")  # tensors only, no pickle

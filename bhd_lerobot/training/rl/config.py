@@ -105,11 +105,7 @@ class RlPolicyConfig:
     privileged_critic: bool = False
 
     def actor(self) -> MlpConfig:
-        """Return the configuration of an actor that begins from nothing.
-
-        Raises:
-            ConfigError: a value that a `bhd_mlp` cannot have.
-        """
+        """Return the configuration of an actor that begins from nothing."""
         return MlpConfig(
             n_obs_steps=self.n_obs_steps,
             obs_stride=self.obs_stride,
@@ -262,11 +258,7 @@ class RlConfig:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         self._check_names()
         self._check_numbers()
         _ = self.policy.actor()
@@ -324,14 +316,7 @@ class RlConfig:
 
 
 def parse_rl(arguments: Sequence[str]) -> RlConfig:
-    """Return what a command line asks for.
-
-    Args:
-        arguments: `--config_path=FILE` and overrides; to resume, FILE may be the run's folder.
-
-    Raises:
-        ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
-    """
+    """Return what a command line asks for."""
     prefix = f"--{configuration.CONFIG_PATH}="
     found = [
         f"{prefix}{config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument

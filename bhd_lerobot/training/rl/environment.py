@@ -91,10 +91,6 @@ class RlVecEnv(BhdSb3VecEnv):
     A vector is what the actor sees, `stack.size` numbers, and behind that, if it is privileged, what only the critic
     sees. `infos[i]["episode"]` holds the task's own return, not the learner's.
 
-    Attributes:
-        stack: what the network sees.
-        shaping: what the learner gets.
-
     Args:
         env: with autoreset mode DISABLED.
         parts: the policy, whose inputs and outputs these are.

@@ -22,14 +22,6 @@ class FeatureStack:
 
     Normalisation and features are computed by the policy and its processors, so that what is learned here is what runs
     elsewhere; only a convolution over beams, which is learned, is left to the learner.
-
-    Attributes:
-        size: width of a vector.
-
-    Args:
-        front: a `MlpPolicy` without `scan.channels`: its `features` are used.
-        before: its preprocessor.
-        n: robots.
     """
 
     def __init__(self, front: Any, before: Any, n: int) -> None:
@@ -44,12 +36,7 @@ class FeatureStack:
         self._head = 0
 
     def restart(self, ids: NDArray[np.intp], rows: Rows) -> None:
-        """Begin episodes: nothing was before their first frame but that frame.
-
-        Args:
-            ids: the robots.
-            rows: what all robots see, each of shape (n, width).
-        """
+        """Begin episodes: nothing was before their first frame but that frame."""
         for key in self._keys:
             self._history[key][:, ids] = rows[key][ids]
 

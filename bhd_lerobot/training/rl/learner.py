@@ -36,12 +36,7 @@ _NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
 
 
 class ActorHead(nn.Module):
-    """From a feature vector, whose beams are not convolved yet, to the last hidden layer of a `bhd_mlp`.
-
-    Args:
-        policy: the `bhd_mlp`; its modules are shared, not copied.
-        size: how many numbers of a vector it sees, the first ones.
-    """
+    """From a feature vector, whose beams are not convolved yet, to the last hidden layer of a `bhd_mlp`."""
 
     def __init__(self, policy: MlpPolicy, size: int) -> None:
         super().__init__()
@@ -62,14 +57,7 @@ class ActorHead(nn.Module):
 
 
 class Networks(nn.Module):
-    """The hidden layers of actor and critic, in the form that `ActorCriticPolicy` asks for.
-
-    Args:
-        policy: the actor.
-        actor_size: how many numbers of a vector the actor sees, the first ones.
-        size: width of a vector, all of which the critic sees.
-        critic_dims: widths of the critic's hidden layers.
-    """
+    """The hidden layers of actor and critic, in the form that `ActorCriticPolicy` asks for."""
 
     def __init__(self, policy: MlpPolicy, actor_size: int, size: int, critic_dims: list[int]) -> None:
         super().__init__()
@@ -97,11 +85,7 @@ class Networks(nn.Module):
 
 
 class ActionHead(nn.Module):
-    """From the last hidden layer of a `bhd_mlp` with a chunk of one action to that action, of the likeliest mode.
-
-    Args:
-        policy: the `bhd_mlp`; its last layer is shared, not copied.
-    """
+    """From the last hidden layer of a `bhd_mlp` with a chunk of one action to that action, of the likeliest mode."""
 
     def __init__(self, policy: MlpPolicy) -> None:
         super().__init__()
@@ -115,9 +99,6 @@ class ActionHead(nn.Module):
 
 class MlpActorCritic(ActorCriticPolicy):
     """A `bhd_mlp` as actor, and a critic of its own.
-
-    Attributes:
-        actor: the `bhd_mlp`, which shares its parameters with this.
 
     Args:
         observation_space: vectors of an `RlVecEnv`.
@@ -176,13 +157,7 @@ class MlpActorCritic(ActorCriticPolicy):
 
 
 class WarmedUpPPO(PPO):
-    """PPO of stable-baselines3, whose actor can be frozen at first.
-
-    Args:
-        args: see `stable_baselines3.PPO`.
-        critic_warmup: environment steps in which the actor is frozen.
-        kwargs: see `stable_baselines3.PPO`.
-    """
+    """PPO of stable-baselines3, whose actor can be frozen at first."""
 
     policy: MlpActorCritic
 
@@ -199,13 +174,7 @@ class WarmedUpPPO(PPO):
 
 
 def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO:
-    """Return PPO on an actor.
-
-    Args:
-        config: of the run.
-        parts: the actor and what belongs to it.
-        env: the environments.
-    """
+    """Return PPO on an actor."""
     options = asdict(config.ppo)
     lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
     options["batch_size"] = min(options["batch_size"], options["n_steps"] * env.num_envs)
@@ -233,14 +202,7 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO
 
 
 def learn(learner: WarmedUpPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
-    """Learn until a number of environment steps is done, or until it is over.
-
-    Args:
-        learner: what learns.
-        steps: environment steps in all.
-        updated: called with the learner and what it measured, after each update.
-        is_over: asked after each frame.
-    """
+    """Learn until a number of environment steps is done, or until it is over."""
     watcher = _Watcher(updated, is_over)
     learner.learn(
         max(0, steps - learner.num_timesteps), callback=watcher, log_interval=_NEVER, reset_num_timesteps=False

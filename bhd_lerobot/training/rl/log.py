@@ -26,14 +26,7 @@ SHOWN = (
 
 
 def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, Mapping[str, float]] | None) -> None:
-    """Draw return, success and score over environment steps and over minutes.
-
-    Args:
-        rows: rows of a metrics file.
-        path: where the image goes.
-        heading: what stands above it.
-        rule: name and level of the rule on the validation episodes, by the keys `val_return` and so on.
-    """
+    """Draw return, success and score over environment steps and over minutes."""
     figure = Figure(figsize=(11, 8.4), layout="constrained")
     figure.suptitle(heading, fontsize=11)
     axes = figure.subplots(len(_CURVES), 2, sharey="row", sharex="col", squeeze=False)
@@ -63,14 +56,6 @@ def recent(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[
     """Return the points of a curve of training: means over the last episodes that had ended by then.
 
     In one update few episodes end, and those that end between the others' are the failures.
-
-    Args:
-        rows: rows of a metrics file; those in which episodes ended say how many, and the mean over these.
-        time: key of the points' abscissae.
-        key: of what is shown.
-
-    Returns:
-        abscissae and ordinates; None if no episode has ended.
     """
     ended = [(row[time], row["episodes"], row[key]) for row in rows if row.get(key) is not None]
     values = []

@@ -53,16 +53,7 @@ class RlParts:
 
 
 def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] = ()) -> RlParts:
-    """Return the actor and what belongs to it.
-
-    Args:
-        config: of the run.
-        env: the environments.
-        episodes: what the observations' scale is estimated from; a short random run if there are none.
-
-    Raises:
-        ConfigError: the checkpoint cannot be started from.
-    """
+    """Return the actor and what belongs to it."""
     simulation, task = env.stage.simulation, env.stage.task
     contract = PolicyContract(
         robot_type=config.robot.type,

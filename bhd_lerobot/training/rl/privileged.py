@@ -10,9 +10,6 @@ from bhd_lerobot.envs.stage import Stage
 def privileged_state(stage: Stage) -> NDArray[np.float32]:
     """Return what the simulator, the task and the cerebellum know beyond the observation, shape (n, k).
 
-    Args:
-        stage: the simulations.
-
     Returns:
         Of each simulation `Simulation.privileged_state`, `Task.privileged_state`, and whether the cerebellum kept the
         robot from an obstacle in the last frame: the flag CLEARANCE, which the collision monitor sets.

@@ -57,11 +57,7 @@ class RlResult:
 
 
 def require_sb3() -> None:
-    """Raise unless stable-baselines3 is installed.
-
-    Raises:
-        ConfigError: it is not; the message says how to install it.
-    """
+    """Raise unless stable-baselines3 is installed."""
     try:
         import stable_baselines3  # noqa: F401
     except ImportError as error:
@@ -71,15 +67,7 @@ def require_sb3() -> None:
 
 
 def train(config: RlConfig, console: Console | None = None) -> RlResult:
-    """Learn what a configuration asks for.
-
-    Args:
-        config: the configuration.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or training failed. Checkpoints saved before are intact.
-    """
+    """Learn what a configuration asks for."""
     require_sb3()
     folder = _run_folder(config)
     threads = torch.get_num_threads()
@@ -100,11 +88,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
 
 
 def _run_folder(config: RlConfig) -> Path:
-    """Return the run's folder, made if it was not there; without `output_dir`, a new one, which the configuration gets.
-
-    Raises:
-        ConfigError: it is there and not to be resumed, or to be resumed and not there, or cannot be written.
-    """
+    """Return the run's folder, made if it was not there; without `output_dir`, a new one."""
     if config.output_dir is None:
         config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
     folder = Path(config.output_dir).expanduser()

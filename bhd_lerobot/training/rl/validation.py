@@ -45,11 +45,7 @@ class Level:
 
 
 class Validation:
-    """Runs brains on the validation episodes.
-
-    Args:
-        config: of the run.
-    """
+    """Runs brains on the validation episodes."""
 
     def __init__(self, config: RlConfig) -> None:
         own = config.validation
