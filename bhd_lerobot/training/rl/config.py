@@ -39,8 +39,6 @@ _LEAST = {
     "validation.freq": 1,
     "validation.n_episodes": 1,
     "validation.n_envs": 1,
-    "validation.confirm": 0,
-    "validation.candidates": 1,
     "validation.seed": 0,
     "critic_warmup": 0,
     "seed": 0,
@@ -106,20 +104,8 @@ class RlPolicyConfig:
 
     def actor(self) -> MlpConfig:
         """Return the configuration of an actor that begins from nothing."""
-        return MlpConfig(
-            n_obs_steps=self.n_obs_steps,
-            obs_stride=self.obs_stride,
-            chunk_size=1,
-            n_action_steps=1,
-            hidden_dims=list(self.hidden_dims),
-            activation=self.activation,
-            layer_norm=self.layer_norm,
-            feature_clip=self.feature_clip,
-            gaussian=True,
-            scan=copy.deepcopy(self.scan),
-            device="cpu",
-            push_to_hub=False,
-        )
+        own = {name: value for name, value in copy.deepcopy(vars(self)).items() if "critic" not in name}
+        return MlpConfig(**own, chunk_size=1, n_action_steps=1, gaussian=True, device="cpu", push_to_hub=False)
 
 
 @dataclass
@@ -185,9 +171,7 @@ class RewardConfig:
 class ValidationConfig:
     """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
 
-    The best checkpoint is chosen among all that were saved, the policy that the run started with included. It is the
-    one that was best on the way; or, as the best of many is best by chance, too, the best of a few on further episodes,
-    which those few drive at the end.
+    The best checkpoint is the one that was best on them, the policy that the run started with included.
 
     Attributes:
         freq: environment steps between two validations.
@@ -195,8 +179,6 @@ class ValidationConfig:
         n_envs: how many run side by side.
         seed: run seed of these episodes, of the split `train`; another than the training's.
         select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``; of equals, the score.
-        confirm: further episodes that decide at the end between the best candidates; none if 0.
-        candidates: how many checkpoints drive them, those that were best on the way; the start does besides.
         rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
     """
 
@@ -205,8 +187,6 @@ class ValidationConfig:
     n_envs: int = 64
     seed: int = 777_001
     select: str = "score"
-    confirm: int = 0
-    candidates: int = 2
     rule: BrainConfig | None = None
 
 
@@ -224,8 +204,8 @@ class RlConfig:
         reward: what the learner gets.
         validation: how it is judged on the way.
         steps: environment steps, all environments together.
-        max_minutes: end after this time [min] even if `steps` are not done, but for the last validation; nothing: after
-            `steps` only.
+        max_minutes: end after this time [min], counted from the start of the command, even if `steps` are not done, but
+            for the last validation; nothing: after `steps` only.
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor; of a chunk, the first action counts.
         see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A
             clone must not see its own speed, because it would repeat it; who learns from what comes of it may.

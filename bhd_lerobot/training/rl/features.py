@@ -46,12 +46,11 @@ class FeatureStack:
         for key in self._keys:
             self._history[key][self._head] = rows[key]
 
-    def features(self, ids: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
-        """Return the vectors of some robots, all if None, shape (n, size)."""
+    def features(self) -> NDArray[np.float32]:
+        """Return the vectors, shape (n, size)."""
         batch = {}
         for key in self._keys:
             picked = self._history[key][(self._head - self._back) % self._length]
-            picked = picked if ids is None else picked[:, ids]
             values = picked[0] if self._single else picked.swapaxes(0, 1)
             batch[key] = torch.from_numpy(np.ascontiguousarray(values))
         with torch.inference_mode():

@@ -17,8 +17,6 @@ SHOWN = (
     ("score", "score"),
     ("val_success", "validation success"),
     ("val_score", "validation score"),
-    ("confirmed_success", "confirmed success"),
-    ("confirmed_score", "confirmed score"),
     ("kl", "kl"),
     ("std", "std"),
     ("frames_per_s", "frames/s"),
