@@ -20,7 +20,7 @@ from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
-from bhd_lerobot.policies.mlp.processor_mlp import floored
+from bhd_lerobot.policies.trained_steps import floored
 from bhd_lerobot.stock import (
     LeRobotDatasetMetadata,
     dataset_to_policy_features,

@@ -74,8 +74,8 @@ class LanguageBrain(PickBrain):
 
     With `config.perception` it uses nothing that the task tells. It looks once before it moves; that the camera lives
     it sees by the arm, which has moved before the tool goes down; and after a grasp that failed it goes home and looks
-    again. What it is not sure enough of, it does not touch. `planner` turns instructions into plans, by rules if None: a
-    language model goes here.
+    again. What it is not sure enough of, it does not touch. `planner` turns instructions into plans, by rules if None:
+    a language model goes here.
     """
 
     name = "language"

@@ -77,7 +77,7 @@ class MlpActorCritic(ActorCriticPolicy):
     def __init__(self, *args: Any, actor: MlpPolicy, actor_size: int, fresh: bool, **kwargs: Any) -> None:
         # nn.Module wants to be initialised before it gets modules, and SB3 builds the networks while it does so.
         self._ingredients: tuple[MlpPolicy, int, bool] = (actor, actor_size, fresh)
-        super().__init__(*args, ortho_init=False, **kwargs)
+        super().__init__(*args, **{**kwargs, "ortho_init": False})
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """Return the parameters of the actor, its exploration noise included."""

@@ -24,9 +24,9 @@ from bhd_lerobot.policies.mlp.objects_mlp import (
     relative_features,
     relative_size,
 )
-from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
+from bhd_lerobot.policies.trained import residual_columns
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from tests.cases import each_case
 

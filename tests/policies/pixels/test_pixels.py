@@ -300,7 +300,7 @@ def test_an_instruction_is_needed_and_never_cut_off() -> None:
     [
         ({"chunk_size": 0}, "policy.chunk_size is 0; it must be at least 1"),
         ({"n_action_steps": 5}, "n_action_steps is 5, but only policy.chunk_size = 4"),
-        ({"hidden_dims": [0]}, "every width must be at least 1"),
+        ({"hidden_dims": [0]}, r"policy.hidden_dims is \[0\]; it must be at least 1"),
         ({"pointing_weight": -1.0}, "policy.pointing_weight is -1.0"),
         ({"ignored_columns": [14]}, r"policy.ignored_columns is \[14\]"),
         ({"ignored_columns": []}, "matches no number of observation.state"),
