@@ -37,14 +37,7 @@ class TrainedStep(ObservationProcessorStep):
 
 
 def make_pipelines(config: TrainedConfig, stats: Stats | None, *own: TrainedStep, first: Any = ()) -> Pipelines:
-    """Return LeRobot's pipelines, with steps before the observation is normalised.
-
-    Args:
-        config: of the policy, which `make_policy` has completed.
-        stats: mean and standard deviation of every feature.
-        own: steps on the policy's device.
-        first: steps before the observation is moved there.
-    """
+    """Return LeRobot's pipelines, with steps of ours before normalisation, the `first` before the move to the device."""
     least = getattr(config, "min_std", None)
     stats = stats if least is None else floored(stats, least)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)

@@ -92,15 +92,8 @@ def open_data(
 ) -> TrainingData:
     """Load the dataset.
 
-    Args:
-        config: what is asked for, with `dataset.episodes` as `select_episodes` left it.
-        policy: the policy's configuration, with its features.
-        meta: of the dataset.
-        device: where batches are needed.
-        rank: this process among `world_size`.
-        world_size: processes that train together.
-        report: gets the reason why LeRobot's own loader is used, if it is, and warnings.
-        by_own_statistics: whether the policy is normalised by the statistics of this dataset.
+    `device`: where batches are needed. `report`: gets the reason why LeRobot's own loader is used, if it is, and
+    warnings. `by_own_statistics`: whether the policy is normalised by the statistics of this dataset.
     """
     dataset = config.dataset
     keep = kept_features(meta, policy, config.rename_map)

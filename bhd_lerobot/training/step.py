@@ -54,14 +54,9 @@ class Learner:
     ) -> None:
         """Keep what a step needs.
 
-        Args:
-            policy: a LeRobot policy.
-            optimizer: its optimizer.
-            scheduler: of the learning rate, or None.
-            accelerator: accelerate's; with several processes or mixed precision it prepares the others.
-            preprocessor: from a batch of the dataset to the policy's input.
-            grad_clip_norm: largest norm of the gradient; not clipped if 0 or less.
-            camera_keys: images in a batch, which come as 8 bit.
+        `scheduler`: of the learning rate, or None. `accelerator`: accelerate's; with several processes or mixed
+        precision it prepares the others. `grad_clip_norm`: largest norm of the gradient; not clipped if 0 or less.
+        `camera_keys`: images in a batch, which come as 8 bit.
         """
         self.unwrapped = policy
         # For one process in full precision, accelerate's wrappers change nothing and take longer than a small network.

@@ -142,13 +142,7 @@ class DisagreementWatch(_FrameCounter):
 
 
 class BaseCollisionWatch:
-    """What the learner wants would drive the base into what its scan shows.
-
-    Args:
-        horizon_s: within this time [s].
-        robot: the robot.
-        body: its body, with a lidar.
-    """
+    """What the learner wants would drive the base within `horizon_s` [s] into what its scan shows."""
 
     cause = "about to collide"
 
@@ -188,9 +182,7 @@ class BaseCollisionWatch:
 class ArmCollisionWatch:
     """The arm could not come to rest any more before it touches the table or itself.
 
-    Args:
-        robot: the robot; if its actions are not joint positions, only what the arm does now counts.
-        body: its body.
+    If the robot's actions are not joint positions, only what the arm does now counts.
     """
 
     cause = "about to collide"

@@ -208,11 +208,7 @@ def instructions_for(
 
     There are none if no known words distinguish the object from another one.
 
-    Args:
-        scene: what is on the table, in any order.
-        target: index of the object.
-        language: ``"en"`` or ``"zh"``; None: both.
-        goal: `Skill.HOLD` or `Skill.HAND_OVER`; None: both.
+    The language is ``"en"`` or ``"zh"``, the goal `Skill.HOLD` or `Skill.HAND_OVER`; None: both.
     """
     objects = {thing.index: thing for thing in scene}
     if target not in objects:

@@ -26,13 +26,8 @@ def weights_digest(folder: Path) -> str:
 def recorded_path(given: str, folder: Path) -> str:
     """Return what datasets and results call a policy: nothing of where it lies on this machine.
 
-    Args:
-        given: how it was named.
-        folder: where `find_checkpoint` found it.
-
-    Returns:
-        ``RUN/checkpoints/STEP`` of a training run, the name of any other folder, or the name on the Hub. However a
-        folder is named, this is the same; which weights are in it, `weights_digest` says.
+    That is ``RUN/checkpoints/STEP`` of a training run, the name of any other folder, or the name on the Hub. However a
+    folder is named, this is the same; which weights are in it, `weights_digest` says.
     """
     if not Path(given).expanduser().is_dir():
         return given

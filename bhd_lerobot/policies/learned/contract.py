@@ -119,14 +119,7 @@ class PolicyContract:
     ) -> None:
         """Check that the policy fits what it is to drive. What is None, here or in the contract, is not checked.
 
-        Args:
-            observation_names: names of the robot's floats, in order.
-            action_names: names of the action's floats, in order.
-            fps: frames a second [Hz].
-            environment_names: names of what the task tells, in order.
-            robot_type: the robot.
-            cameras: image shapes (height, width, channels) [px] by name; more cameras than the policy knows are fine.
-            who: what the message calls the policy.
+        Cameras are image shapes (height, width, channels) [px] by name; more than the policy knows are fine.
         """
         if None not in (robot_type, self.robot_type) and robot_type != self.robot_type:
             raise ConfigError(

@@ -59,14 +59,7 @@ class Inference(Protocol):
 
 
 def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> Inference:
-    """Return what drives simulations with a policy.
-
-    Args:
-        loaded: the policy.
-        sample: draw actions from a Gaussian policy instead of taking its mean.
-        exact: infer for every simulation by itself, so that its actions are the same bits beside any others.
-        threads: threads for torch on the CPU; if None, one for small networks and torch's own choice for others.
-    """
+    """Return what drives simulations with a policy; `sample`, `exact` and `threads` are those of `LearnedBrainConfig`."""
     if sample and not getattr(loaded.config, "gaussian", False):
         raise ConfigError("brain.sample is true, but this policy has no distribution (bhd_mlp with gaussian=true has).")
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
@@ -266,14 +259,7 @@ class StockInference:
 
 
 def image_tensor(pixels: Tensor) -> Tensor:
-    """Return images as LeRobot's evaluation makes them.
-
-    Args:
-        pixels: uint8, shape (…, height, width, channels).
-
-    Returns:
-        float32 in [0, 1], shape (…, channels, height, width)
-    """
+    """Return images, uint8, shape (…, height, width, channels), as float32 in [0, 1], channels first."""
     last = pixels.ndim - 1
     order = (*range(last - 2), last, last - 2, last - 1)
     return pixels.permute(order).contiguous().type(torch.float32) / 255

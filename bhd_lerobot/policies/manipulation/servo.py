@@ -119,17 +119,7 @@ class _ServoBrain(ConfiguredBrain):
         self._gripper = int(find_columns(robot.observation_names, [_GRIPPER], self.name, "observation")[0])
 
     def _towards(self, observation: Observation, target: Array, lead: Array, opening: Array) -> Array:
-        """Return actions that lead to tool poses.
-
-        Args:
-            observation: what the robots see.
-            target: tool poses, shape (n, 7).
-            lead: largest distance [m] from where the tool is, shape (n,).
-            opening: of the gripper [m], shape (n,).
-
-        Returns:
-            Shape (n, 8).
-        """
+        """Return actions, shape (n, 8), that lead to tool poses, shape (n, 7), by at most `lead` [m] from the tool."""
         now = observation.state[:, self._tool]
         way = target[:, :3] - now[:, :3]
         share = np.minimum(_GAIN, lead / np.maximum(np.linalg.norm(way, axis=1), 1e-9))
@@ -240,11 +230,8 @@ class PickServoBrain(_ServoBrain):
     def _plan(self, target: SeenObject, others: Sequence[SeenObject], yaw: float) -> Grasp | None:
         """Return the grasp of an object; the widest that there is room for.
 
-        Args:
-            target: the object.
-            others: what else stands there.
-            yaw: of the line through the fingers now [rad]: counted from there, a choice between two ways gets clearer
-                while the tool turns.
+        `yaw`: of the line through the fingers now [rad]: counted from there, a choice between two ways gets clearer
+        while the tool turns.
         """
         wider, grasp = self.config.wider_m, None
         for extra, least in ((wider, wider), (wider, 0.0), (0.0, 0.0)) if wider else ((0.0, 0.0),):

@@ -185,10 +185,8 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
         """Return normalised actions, shape (batch, chunk_size, actions).
 
-        Args:
-            batch: observations as in `features`.
-            noise: of a standard normal distribution, in the result's shape: act on the sample that it makes, instead of
-                the mean.
+        `noise`: of a standard normal distribution, in the result's shape: act on the sample that it makes, instead of
+        the mean.
         """
         self.eval()
         mean = self._chunk(self.features(batch), batch)

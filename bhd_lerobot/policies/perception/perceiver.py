@@ -114,9 +114,7 @@ class Perceiver:
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
         """Return the objects that one robot's camera shows, the surest first.
 
-        Args:
-            images: by camera, shape (n, height, width, 3), RGB.
-            sim: the robot.
+        `images`: by camera, shape (n, height, width, 3), RGB.
         """
         import torch
 
