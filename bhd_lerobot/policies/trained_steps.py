@@ -37,7 +37,7 @@ class TrainedStep(ObservationProcessorStep):
 
 
 def make_pipelines(config: TrainedConfig, stats: Stats | None, *own: TrainedStep, first: Any = ()) -> Pipelines:
-    """Return LeRobot's pipelines, with steps of ours before normalisation, the `first` before the move to the device."""
+    """Return LeRobot's pipelines, with steps of ours before normalisation, the `first` before the device."""
     least = getattr(config, "min_std", None)
     stats = stats if least is None else floored(stats, least)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)

@@ -32,7 +32,8 @@ class Watch(Protocol):
     """What it finds, in words."""
 
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """Begin the learner's turn in some of n simulations."""
+        """Begin the learner's turn in some of n simulations; what remembers nothing does nothing."""
+        return None
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Return where the learner needs help, shape (n,).
@@ -141,7 +142,7 @@ class DisagreementWatch(_FrameCounter):
         return np.asarray(self._frames >= self._most)
 
 
-class BaseCollisionWatch:
+class BaseCollisionWatch(Watch):
     """What the learner wants would drive the base within `horizon_s` [s] into what its scan shows."""
 
     cause = "about to collide"
@@ -153,9 +154,6 @@ class BaseCollisionWatch:
         self._limit = np.array(body.limits.velocity)
         self._footprint, self._no_return = Footprint.of(body), body.lidar.range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
-
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """It remembers nothing."""
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the robot's outline on its way with what the scan shows."""
@@ -179,7 +177,7 @@ class BaseCollisionWatch:
         return danger
 
 
-class ArmCollisionWatch:
+class ArmCollisionWatch(Watch):
     """The arm could not come to rest any more before it touches the table or itself.
 
     If the robot's actions are not joint positions, only what the arm does now counts.
@@ -198,9 +196,6 @@ class ArmCollisionWatch:
         self._speed, self._change = np.array(limits.velocity[:dof]), np.array(limits.acceleration[:dof])
         self._delay = self._change / np.array(limits.jerk[:dof])
         self._least = body.chain.min_distance
-
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """It remembers nothing."""
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the postures on the way to rest with the table and with each other."""

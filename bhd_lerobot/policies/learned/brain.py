@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 
@@ -59,7 +59,7 @@ class LearnedBrainConfig(BrainConfig):
                 raise ConfigError(f"brain.{name} is {value}; it must be at least 1.")
 
 
-class LearnedBrain:
+class LearnedBrain(ConfiguredBrain):
     """Drives n simulations, whose episodes need not be in step, with one policy.
 
     Every simulation has its own chunk, history and random numbers, which follow from its episode's seed; those that
@@ -68,7 +68,6 @@ class LearnedBrain:
 
     name = "learned"
     robot_kind = ANY_ROBOT
-    has_plan = False
 
     def __init__(self, config: LearnedBrainConfig) -> None:
         from bhd_lerobot.policies.learned.inference import expected_frames, make_inference
@@ -171,14 +170,6 @@ class LearnedBrain:
         self._next[running] += 1
         self._frame[running] += 1
         return self._actions.copy()
-
-    def subtasks(self) -> Sequence[str]:
-        """It has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """It has no plan."""
-        return {}
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters, and which weights they are."""

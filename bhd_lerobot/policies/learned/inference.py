@@ -59,7 +59,7 @@ class Inference(Protocol):
 
 
 def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> Inference:
-    """Return what drives simulations with a policy; `sample`, `exact` and `threads` are those of `LearnedBrainConfig`."""
+    """Return what drives simulations with a policy; the options are those of `LearnedBrainConfig`."""
     if sample and not getattr(loaded.config, "gaussian", False):
         raise ConfigError("brain.sample is true, but this policy has no distribution (bhd_mlp with gaussian=true has).")
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:

@@ -90,7 +90,7 @@ class GoalMap:
         return np.where(known, left * np.float32(_UNIT), np.hypot(x, y).astype(np.float32) + np.float32(_FAR * _UNIT))
 
     def plan(self, sim: int, x: float, y: float) -> bool:
-        """Find the ways to the goal in one map; return whether there is one from the robot's place, in its frame [m]."""
+        """Find the ways to the goal in one map; return whether there is one from the robot's place [m]."""
         self.news[sim] = 0
         self.blocked[sim] = False
         self._way[sim] = False

@@ -28,24 +28,18 @@ _CHOICES = {
 }
 # Not among them: that an expert drives ends nothing, and of a failure without a cause only a person says so.
 _EVENTS = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION, Event.FAILURE))
-_LEAST = {
-    "steps": 1,
-    "env.n_envs": 1,
-    "env.threads": 1,
-    "threads": 1,
-    "ppo.n_steps": 2,
-    "ppo.batch_size": 2,
-    "ppo.n_epochs": 1,
-    "validation.freq": 1,
-    "validation.n_episodes": 1,
-    "validation.n_envs": 1,
-    "validation.seed": 0,
-    "critic_warmup": 0,
-    "seed": 0,
-    "policy.critic_dims": 1,
-}
 # What numbers must be, and which of them.
 _RANGES = (
+    (
+        "at least 1",
+        lambda number: number >= 1,
+        (
+            *("steps", "threads", "env.n_envs", "env.threads", "ppo.n_epochs", "policy.critic_dims"),
+            *("validation.freq", "validation.n_episodes", "validation.n_envs"),
+        ),
+    ),
+    ("at least 2", lambda number: number >= 2, ("ppo.n_steps", "ppo.batch_size")),
+    ("at least 0", lambda number: number >= 0, ("seed", "validation.seed", "critic_warmup")),
     ("between 0 and 1", lambda number: 0 <= number <= 1, ("ppo.gamma", "ppo.gae_lambda")),
     (
         "positive and finite",
@@ -57,7 +51,7 @@ _RANGES = (
         lambda number: 0 <= number < math.inf,
         ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad"),
     ),
-    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame")),
+    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame", "reward.events")),
 )
 
 
@@ -280,19 +274,14 @@ class RlConfig:
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
 
     def _check_numbers(self) -> None:
-        for name, least in _LEAST.items():
-            value = attrgetter(name)(self)
-            for number in value if isinstance(value, list) else [value]:
-                if number is not None and number < least:
-                    raise ConfigError(f"{name} is {number}; it must be at least {least}.")
         for what, is_valid, names in _RANGES:
             for name in names:
-                number = attrgetter(name)(self)
-                if number is not None and not is_valid(number):
-                    raise ConfigError(f"{name} is {number}; it must be {what}.")
-        for event, number in self.reward.events.items():
-            if not math.isfinite(number):
-                raise ConfigError(f"reward.events.{event} is {number}; it must be a finite number.")
+                value = attrgetter(name)(self)
+                several = value if isinstance(value, dict) else dict.fromkeys([""], value)
+                for key, one in several.items():
+                    for number in one if isinstance(one, list) else [one]:
+                        if number is not None and not is_valid(number):
+                            raise ConfigError(f"{name}{key and '.'}{key} is {number}; it must be {what}.")
 
 
 def parse_rl(arguments: Sequence[str]) -> RlConfig:
