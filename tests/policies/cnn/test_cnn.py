@@ -1,7 +1,6 @@
 """`bhd_cnn`: it sees ranges, keeps in mind where things are, and reads no range finder."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,15 +54,6 @@ def raw(rows: int = 6, images: int = IMAGES, seed: int = 0) -> dict[str, Tensor]
 
 def batch(made: CnnConfig, samples: dict[str, Tensor]) -> dict[str, Tensor]:
     return make_pre_post_processors(made)[0]({key: values.clone() for key, values in samples.items()})
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    yield
-    torch.set_num_threads(before)
 
 
 # --- inputs -----------------------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """`bhd_mlp`: its inputs, its losses, weights in and out, and what it refuses."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -58,14 +57,6 @@ def batch(made: MlpConfig, rows: int = 5, seed: int = 0) -> dict[str, Tensor]:
     result[ACTION] = torch.randn(rows, made.chunk_size, 2, generator=generator)
     result["action_is_pad"] = torch.zeros(rows, made.chunk_size, dtype=torch.bool)
     return result
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 # --- inputs -----------------------------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """`bhd_pixels`: it looks where the instruction points, once, and needs no truth to act."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -56,15 +55,6 @@ def present(samples: dict[str, Tensor], frame: int = 0) -> dict[str, Tensor]:
     """Return what a robot would show: one frame, and no truth."""
     shown = {key: values[:, frame] for key, values in samples.items() if key in (IMAGE, OBS_STATE)}
     return {**shown, OBS_LANGUAGE_TOKENS: samples[OBS_LANGUAGE_TOKENS]}
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    yield
-    torch.set_num_threads(before)
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
