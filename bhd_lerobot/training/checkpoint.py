@@ -22,16 +22,7 @@ LOOP_STATE = "bhd_loop.json"
 
 @dataclass
 class TrainingParts:
-    """What a checkpoint consists of.
-
-    Attributes:
-        policy: a LeRobot policy, not wrapped for several processes.
-        optimizer: its optimizer.
-        scheduler: of the learning rate; None if there is none.
-        preprocessor: from a batch to the policy's input.
-        postprocessor: from the policy's output to an action.
-        contract: what the policy is trained on.
-    """
+    """What a checkpoint consists of."""
 
     policy: Any
     optimizer: Any

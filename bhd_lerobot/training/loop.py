@@ -55,10 +55,8 @@ class Hooks:
 
     Attributes:
         held_out: makes an iterator over the held-out batches; None if there are none.
-        log: takes a row of metrics.
         save: takes the step and the state of the loop, and writes a checkpoint; None if none is wanted.
         evaluate: takes the step, returns metrics of an evaluation in an environment; None if there is none.
-        progress: takes the step.
         should_stop: whether to end after this step.
         mean: over all processes, of numbers in a tensor.
     """
@@ -83,7 +81,6 @@ class Window:
         data_s: time that went into getting batches [s].
         update_s: time that went into learning from them [s].
         other_s: time that went into what is neither, such as checkpoints [s].
-        started: when it began, in this process.
     """
 
     results: list[StepResult] = field(default_factory=list)
@@ -108,12 +105,7 @@ class Window:
 
 
 class TrainingLoop:
-    """Steps from where it is to the end.
-
-    Attributes:
-        step: steps that were done.
-        interrupted: whether it ended because it was asked to.
-    """
+    """Steps from where it is to the end."""
 
     def __init__(self, learner: Learner, loader: Any, options: LoopOptions, hooks: Hooks) -> None:
         """Prepare it at step 0."""

@@ -24,12 +24,7 @@ from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, 
 
 
 class RunOutput:
-    """Writes a run's folder. Of several processes only the main one does; in the others nothing happens.
-
-    Attributes:
-        folder: the run's folder.
-        checkpoint: the last checkpoint; None if there is none.
-    """
+    """Writes a run's folder. Of several processes only the main one does; in the others nothing happens."""
 
     def __init__(
         self, config: BhdTrainConfig, parts: TrainingParts, step: int, *, is_main: bool = True, processes: int = 1

@@ -33,13 +33,7 @@ class NonFiniteLossError(ArithmeticError):
 
 
 class Learner:
-    """A policy with its optimizer.
-
-    Attributes:
-        policy: as accelerate prepared it.
-        optimizer: likewise.
-        scheduler: of the learning rate, likewise; None if there is none.
-    """
+    """A policy with its optimizer."""
 
     def __init__(
         self,

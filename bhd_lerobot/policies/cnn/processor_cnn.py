@@ -19,14 +19,9 @@ OBS_RANGES = "observation.bhd_ranges"
 @ProcessorStepRegistry.register(name="bhd_odometry_processor")
 @dataclass
 class OdometryProcessorStep(TrainedStep):
-    """Copies odometry and ranges before the normaliser changes them.
+    """Copies odometry and ranges before the normaliser changes them."""
 
-    Attributes:
-        odometry: columns of `observation.state`.
-        ranges: likewise.
-    """
-
-    odometry: list[int] = field(default_factory=list)
+    odometry: list[int] = field(default_factory=list)  # columns of `observation.state`, as are the ranges
     ranges: list[int] = field(default_factory=list)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:

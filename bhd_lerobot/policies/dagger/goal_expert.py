@@ -44,20 +44,13 @@ class _Turn:
     """How far the expert is in one simulation.
 
     Attributes:
-        number: of its turns in this episode.
         own: what is to be done before it begins, in order.
         pending: name of the goal of ours that is under way.
         raw: that of the expert's last goal, as the expert calls it.
         is_first: whether that is the first since it began.
         is_new: whether the turn has just begun, or begins again.
         is_holding: whether it holds what the task is about, and waits for that to be enough.
-        stops: how often it had to come to rest.
-        homes: how often it was brought home.
         idle: frames in which it had nothing to do.
-        count: number of the last goal of ours.
-        doing: what is being done before it begins.
-        seed: the expert's, of the episode.
-        instruction: the episode's.
     """
 
     number: int = 0

@@ -21,13 +21,7 @@ SKILLS = {
 
 @dataclass(frozen=True)
 class Request:
-    """What an instruction asks for.
-
-    Attributes:
-        goal: the last skill: `Skill.HOLD` or `Skill.HAND_OVER`.
-        what: what it says about the object.
-        language: the language that it is in.
-    """
+    """What an instruction asks for."""
 
     goal: Skill
     what: Description

@@ -32,8 +32,6 @@ class LoadedPolicy:
     """A policy, ready to act.
 
     Attributes:
-        folder: where it was loaded from.
-        policy: the network, in evaluation mode.
         before: what turns a batch of observations into its input.
         after: what gives its actions their units back.
         inputs: keys of the observations that it takes, under the names that they have before `before`.

@@ -19,14 +19,9 @@ OBS_SCAN = "observation.bhd_scan"
 @ProcessorStepRegistry.register(name="bhd_scan_processor")
 @dataclass
 class ScanProcessorStep(TrainedStep):
-    """Copies the ranges to `OBS_SCAN` before the normaliser changes them.
+    """Copies the ranges to `OBS_SCAN` before the normaliser changes them."""
 
-    Attributes:
-        start: column of the first beam in `observation.state`.
-        beams: how many there are.
-    """
-
-    start: int = 0
+    start: int = 0  # column of the first beam in `observation.state`
     beams: int = 0
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:

@@ -68,15 +68,7 @@ class PerceivedObject(SeenObject):
 
 
 class Perceiver:
-    """Finds objects in images.
-
-    Attributes:
-        camera: name of the camera that it looks through.
-        image_size: width and height of its images [px].
-        dataset: what it was trained on.
-        path: which checkpoint it is, without where that lies on this machine.
-        weights: which weights it has.
-    """
+    """Finds objects in images."""
 
     def __init__(self, options: PerceptionOptions) -> None:
         from bhd_lerobot.policies.learned.policy import load_perception

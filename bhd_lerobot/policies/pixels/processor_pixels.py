@@ -18,13 +18,9 @@ from bhd_lerobot.policies.trained_steps import Pipelines, Stats, TrainedStep, ma
 @ProcessorStepRegistry.register(name="bhd_instruction_processor")
 @dataclass
 class InstructionProcessorStep(TrainedStep):
-    """Writes instructions as bytes: every language, no vocabulary, nothing to download.
+    """Writes instructions as bytes: every language, no vocabulary, nothing to download."""
 
-    Attributes:
-        length: bytes of the longest instruction, in UTF-8.
-    """
-
-    length: int = 128
+    length: int = 128  # bytes, in UTF-8
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the observation with the instructions, in small letters: 1 + each byte, then zeros; (b, length)."""

@@ -101,16 +101,7 @@ class AggregationConfig:
 
 @dataclass(frozen=True)
 class Stages:
-    """What the configurations of the programs say.
-
-    Attributes:
-        expert: the type of the expert's brain.
-        brain: all of the expert's brain, as plain values.
-        robot: the type of its robot.
-        fps: frames a second [Hz].
-        has_advice: whether the expert's action is recorded in every frame.
-        steps: of a training.
-    """
+    """What the configurations of the programs say."""
 
     expert: str
     brain: dict[str, Any]

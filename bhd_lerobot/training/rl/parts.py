@@ -38,9 +38,6 @@ class RlParts:
     Attributes:
         actor: the policy, with a chunk of one action and a Gaussian around it.
         front: the same without convolutions, for its features only.
-        before: its preprocessor.
-        after: its postprocessor.
-        contract: what it is trained on.
         fresh: whether its weights are still to be initialised.
     """
 
