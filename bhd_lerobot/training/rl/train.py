@@ -20,6 +20,7 @@ import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.policies.learned.inference import use_threads
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training.checkpoint import clean, point
@@ -68,11 +69,8 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     """Learn what a configuration asks for."""
     require_sb3()
     folder = _run_folder(config)
-    threads = torch.get_num_threads()
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     try:
-        with closing(Validation(config)) as validation, stop_on_signals() as stop:
+        with use_threads(config.threads), closing(Validation(config)) as validation, stop_on_signals() as stop:
             return _Run(config, folder, console or Console(stderr=True), validation, stop).go()
     except OSError as error:
         raise BhdError(
@@ -80,7 +78,6 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
             f"Make room, and go on with --resume=true --config_path={quoted(folder)}."
         ) from error
     finally:
-        torch.set_num_threads(threads)
         if not config.resume:
             with suppress(OSError):  # a run that failed before it wrote anything can be started again
                 folder.rmdir()
