@@ -13,4 +13,6 @@ __all__ = [
     "navigation",
     "perception",
     "pixels",
+    "trained",
+    "trained_steps",
 ]

@@ -43,11 +43,7 @@ class RandomConfig(BrainConfig):
 
 
 class NoopBrain(ConfiguredBrain):
-    """Holds: speeds are 0, and positions are those that the episode began with.
-
-    Args:
-        config: nothing.
-    """
+    """Holds: speeds are 0, and positions are those that the episode began with."""
 
     name = "noop"
     robot_kind = ANY_ROBOT
@@ -62,11 +58,7 @@ class NoopBrain(ConfiguredBrain):
         self._width = 0
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the positions among the observations.
-
-        Raises:
-            ConfigError: an action is neither a speed nor a position that is observed.
-        """
+        """Find the positions among the observations."""
         held = [name for name in robot.action_names if not name.endswith(_SPEED)]
         odd = [name for name in held if not name.endswith(_POSITION)]
         if odd:
@@ -92,11 +84,7 @@ class NoopBrain(ConfiguredBrain):
 
 
 class RandomBrain(NoopBrain):
-    """Goes from one random action to the next, within the limits of the robot's body.
-
-    Args:
-        config: the parameters.
-    """
+    """Goes from one random action to the next, within the limits of the robot's body."""
 
     name = "random"
     config: RandomConfig
@@ -111,11 +99,7 @@ class RandomBrain(NoopBrain):
         self._frame = np.zeros(0, np.int64)
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the range of every action.
-
-        Raises:
-            ConfigError: these are not the actions of a body that it knows.
-        """
+        """Find the range of every action."""
         super().bind(robot)
         self._period = max(1, round(self.config.period_s * robot.fps))
         limits = None if robot.body is None else robot.body.limits

@@ -57,12 +57,7 @@ class BlankedConfig(BrainConfig):
 
 
 class BlankedBrain:
-    """Passes everything on to a brain but its instruction or its images.
-
-    Args:
-        config: what is blanked.
-        brain: what `config.brain` describes.
-    """
+    """Passes everything on to a brain but its instruction or its images."""
 
     name = "blanked"
     robot_kind = ANY_ROBOT
@@ -89,11 +84,7 @@ class BlankedBrain:
         self._brain.bind(robot)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
-        """Start episodes.
-
-        Raises:
-            ConfigError: there is one simulation only, and what is exchanged is that of the next.
-        """
+        """Start episodes."""
         if self.config.exchange and n == 1:
             raise ConfigError(
                 "brain.exchange is true and there is one simulation: no other episode runs beside it. "

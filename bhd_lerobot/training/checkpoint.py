@@ -22,16 +22,7 @@ LOOP_STATE = "bhd_loop.json"
 
 @dataclass
 class TrainingParts:
-    """What a checkpoint consists of.
-
-    Attributes:
-        policy: a LeRobot policy, not wrapped for several processes.
-        optimizer: its optimizer.
-        scheduler: of the learning rate; None if there is none.
-        preprocessor: from a batch to the policy's input.
-        postprocessor: from the policy's output to an action.
-        contract: what the policy is trained on.
-    """
+    """What a checkpoint consists of."""
 
     policy: Any
     optimizer: Any
@@ -42,18 +33,7 @@ class TrainingParts:
 
 
 def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str, Any], processes: int = 1) -> Path:
-    """Write a checkpoint, point `last` at it, and return its folder.
-
-    Args:
-        config: of the run.
-        step: training steps that were done.
-        parts: what is saved.
-        loop: state of the loop, JSON values.
-        processes: number of processes that train together.
-
-    Raises:
-        BhdError: it cannot be written; those before it are intact.
-    """
+    """Write a checkpoint, point `last` at it, and return its folder."""
     assert config.output_dir is not None
     final = get_step_checkpoint_dir(Path(config.output_dir), config.steps, step)
     with writing(final) as part:
@@ -67,13 +47,6 @@ def load(checkpoint: Path, parts: TrainingParts) -> tuple[int, dict[str, Any]]:
     """Load optimizer, scheduler and random states of a checkpoint; return its step and the state of the loop.
 
     The policy's weights and the processors are loaded when they are made.
-
-    Args:
-        checkpoint: its folder.
-        parts: what is loaded into.
-
-    Raises:
-        ConfigError: it is no checkpoint that training can go on from.
     """
     try:
         step = load_training_state(checkpoint, parts.optimizer, parts.scheduler)
@@ -104,12 +77,6 @@ def writing(final: Path) -> Iterator[Path]:
     """Give a new folder for a checkpoint; when it is complete, rename it and point `last` at it.
 
     There is never half a checkpoint under a checkpoint's name.
-
-    Args:
-        final: the checkpoint's folder, named by its step.
-
-    Raises:
-        BhdError: it cannot be written; those before it are intact.
     """
     part, old = (final.with_name(f".{final.name}.{suffix}") for suffix in ("part", "old"))
     disk = Disk()

@@ -42,11 +42,7 @@ class TrainingData:
 
 
 def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
-    """Return the metadata of the dataset that is learned from, with ImageNet's statistics if those are wanted.
-
-    Raises:
-        DatasetError: there is no such dataset, it is empty, or it has no statistics.
-    """
+    """Return the metadata of the dataset that is learned from, with ImageNet's statistics if those are wanted."""
     dataset = config.dataset
     root = Path(dataset.root).expanduser() if dataset.root else None
     _refuse_empty(root or default_root(dataset.repo_id))
@@ -72,11 +68,7 @@ def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
 
 
 def select_episodes(config: BhdTrainConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Put the episodes that `selection` leaves into `dataset.episodes`, so that lerobot-train can go on with the same.
-
-    Raises:
-        DatasetError: none is left; the message says what there is.
-    """
+    """Put the episodes that `selection` leaves into `dataset.episodes`, so that lerobot-train can resume the run."""
     if not config.selection.is_everything:
         config.dataset.episodes = config.selection.filter.select(meta, config.dataset.episodes)
 
@@ -100,18 +92,8 @@ def open_data(
 ) -> TrainingData:
     """Load the dataset.
 
-    Args:
-        config: what is asked for, with `dataset.episodes` as `select_episodes` left it.
-        policy: the policy's configuration, with its features.
-        meta: of the dataset.
-        device: where batches are needed.
-        rank: this process among `world_size`.
-        world_size: processes that train together.
-        report: gets the reason why LeRobot's own loader is used, if it is, and warnings.
-        by_own_statistics: whether the policy is normalised by the statistics of this dataset.
-
-    Raises:
-        BhdError: no episode is left, a value is not finite, or the dataset cannot be read.
+    `device`: where batches are needed. `report`: gets the reason why LeRobot's own loader is used, if it is, and
+    warnings. `by_own_statistics`: whether the policy is normalised by the statistics of this dataset.
     """
     dataset = config.dataset
     keep = kept_features(meta, policy, config.rename_map)
@@ -156,14 +138,7 @@ _QUANTILES = {
 
 
 def _beyond_quantiles(dataset: Any, policy: PreTrainedConfig, key: str, name: str) -> str:
-    """Return a warning if quantiles that a policy is normalised with are not those of the data.
-
-    Args:
-        dataset: what is learned from.
-        policy: the policy's configuration.
-        key: a feature of the dataset.
-        name: what the policy calls it.
-    """
+    """Return a warning if quantiles that a policy is normalised with are not those of the data."""
     features = {**(policy.input_features or {}), **(policy.output_features or {})}
     kind = features[name].type.value if name in features else ""
     mode = policy.normalization_mapping.get(kind)

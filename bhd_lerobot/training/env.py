@@ -28,16 +28,7 @@ class EnvEvaluation:
     """Runs the environment of a training configuration."""
 
     def __init__(self, config: BhdTrainConfig, parts: TrainingParts, accelerator: Any) -> None:
-        """Prepare it.
-
-        Args:
-            config: with `env` and `eval`.
-            parts: the policy and its processors.
-            accelerator: accelerate's; only its main process evaluates.
-
-        Raises:
-            ConfigError: the environment is of another robot than the dataset.
-        """
+        """Prepare it."""
         _check_robot(config, parts.contract.robot_type)
         self._config, self._parts, self._accelerator = config, parts, accelerator
         self._env: Any = config.env

@@ -23,20 +23,10 @@ TIMING = ("data_s", "update_s", "steps_per_s", "samples_per_s", "eval_s")
 
 
 class MetricsFile:
-    """One JSON object a line, for each step that was logged; a line is complete or, after a kill, left out.
-
-    Attributes:
-        path: the file.
-        rows: what is in it.
-    """
+    """One JSON object a line, for each step that was logged; a line is complete or, after a kill, left out."""
 
     def __init__(self, path: Path, rows: Sequence[Row] = ()) -> None:
-        """Start a file.
-
-        Args:
-            path: where it goes; what is there is replaced.
-            rows: what it begins with.
-        """
+        """Start a file."""
         self.path = path
         self.rows = list(rows)
         Disk().publish(path, "".join(_line(row) for row in self.rows).encode())
@@ -70,13 +60,7 @@ def _line(row: Row) -> str:
 
 
 def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
-    """Draw loss and held-out loss over steps, and below them the learning rate.
-
-    Args:
-        rows: rows of a metrics file.
-        path: where the image goes.
-        heading: what stands above it.
-    """
+    """Draw loss and held-out loss over steps, and below them the learning rate."""
     figure = Figure(figsize=(8.5, 5.2))
     figure.subplots_adjust(
         left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13
@@ -134,14 +118,7 @@ def _parts(rows: Sequence[Row]) -> list[str]:
 
 
 class RunProgress:
-    """A bar in a terminal; elsewhere, one line for each row of metrics.
-
-    Args:
-        console: where it is printed.
-        description: what stands before the bar.
-        total: value of `completed` at the end of the run.
-        completed: its value at the start.
-    """
+    """A bar in a terminal; elsewhere, one line for each row of metrics."""
 
     def __init__(self, console: Console, description: str, total: float, completed: int = 0) -> None:
         self._console = console

@@ -55,10 +55,8 @@ class Hooks:
 
     Attributes:
         held_out: makes an iterator over the held-out batches; None if there are none.
-        log: takes a row of metrics.
         save: takes the step and the state of the loop, and writes a checkpoint; None if none is wanted.
         evaluate: takes the step, returns metrics of an evaluation in an environment; None if there is none.
-        progress: takes the step.
         should_stop: whether to end after this step.
         mean: over all processes, of numbers in a tensor.
     """
@@ -83,7 +81,6 @@ class Window:
         data_s: time that went into getting batches [s].
         update_s: time that went into learning from them [s].
         other_s: time that went into what is neither, such as checkpoints [s].
-        started: when it began, in this process.
     """
 
     results: list[StepResult] = field(default_factory=list)
@@ -108,22 +105,10 @@ class Window:
 
 
 class TrainingLoop:
-    """Steps from where it is to the end.
-
-    Attributes:
-        step: steps that were done.
-        interrupted: whether it ended because it was asked to.
-    """
+    """Steps from where it is to the end."""
 
     def __init__(self, learner: Learner, loader: Any, options: LoopOptions, hooks: Hooks) -> None:
-        """Prepare it at step 0.
-
-        Args:
-            learner: what learns.
-            loader: iterable over the batches of an epoch, with `state_dict` and `load_state_dict`.
-            options: when what happens.
-            hooks: what is called then.
-        """
+        """Prepare it at step 0."""
         self.learner, self.loader, self.options, self.hooks = learner, loader, options, hooks
         self.step = 0
         self.interrupted = False
@@ -140,11 +125,7 @@ class TrainingLoop:
         }
 
     def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
-        """Go on after `step` steps.
-
-        Raises:
-            BhdError: the dataset or the selection is not the one of the state.
-        """
+        """Go on after `step` steps."""
         if state.get("frames", self.options.frames) != self.options.frames:
             raise BhdError(
                 f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "
@@ -163,12 +144,7 @@ class TrainingLoop:
             self.loader.load_state_dict(state["loader"])
 
     def run(self) -> None:
-        """Train to the end, or until asked to stop; then a checkpoint of the last step exists.
-
-        Raises:
-            DivergedError: the loss is not finite; nothing was saved since.
-            BhdError: a checkpoint cannot be written.
-        """
+        """Train to the end, or until asked to stop; then a checkpoint of the last step exists."""
         batches = self._batches()
         self._window.started = time.perf_counter()
         while self.step < self.options.steps and not self.interrupted:
@@ -236,11 +212,7 @@ class TrainingLoop:
         return row
 
     def _check(self) -> None:
-        """Look for a loss that is not finite; where that was done at once, there is none.
-
-        Raises:
-            DivergedError: names the first one.
-        """
+        """Look for a loss that is not finite; where that was done at once, there is none."""
         if not self._window.results:
             return
         losses = torch.stack([result.loss for result in self._window.results])

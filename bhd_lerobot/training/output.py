@@ -24,28 +24,12 @@ from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, 
 
 
 class RunOutput:
-    """Writes a run's folder. Of several processes only the main one does; in the others nothing happens.
-
-    Attributes:
-        folder: the run's folder.
-        checkpoint: the last checkpoint; None if there is none.
-    """
+    """Writes a run's folder. Of several processes only the main one does; in the others nothing happens."""
 
     def __init__(
         self, config: BhdTrainConfig, parts: TrainingParts, step: int, *, is_main: bool = True, processes: int = 1
     ) -> None:
-        """Open the folder, with the metrics up to the step that a resumed run goes on from.
-
-        Args:
-            config: of the run.
-            parts: what a checkpoint consists of.
-            step: steps that were done.
-            is_main: whether this process writes.
-            processes: number of processes that train together.
-
-        Raises:
-            ConfigError: the folder cannot be written.
-        """
+        """Open the folder, with the metrics up to the step that a resumed run goes on from."""
         self.folder, self.checkpoint = Path(str(config.output_dir)), config.checkpoint_path
         policy: Any = config.policy
         if is_main and policy is not None and (policy.push_to_hub or config.save_checkpoint_to_hub):
@@ -61,11 +45,7 @@ class RunOutput:
         return [] if self._metrics is None else self._metrics.rows
 
     def log(self, row: Row) -> None:
-        """Write a row of metrics.
-
-        Raises:
-            BhdError: it cannot be written.
-        """
+        """Write a row of metrics."""
         if self._metrics is None:
             return
         try:
@@ -80,11 +60,7 @@ class RunOutput:
             self._wandb.log_dict({key: one for key, one in row.items() if key != "step"}, row["step"])
 
     def save(self, step: int, loop_state: dict[str, Any]) -> None:
-        """Write a checkpoint, and share it if that was asked for.
-
-        Raises:
-            BhdError: it cannot be written or uploaded; those before it are intact.
-        """
+        """Write a checkpoint, and share it if that was asked for."""
         if self._metrics is None:
             return
         self.checkpoint = checkpoint.save(self._config, step, self._parts, loop_state, self._processes)
@@ -110,11 +86,7 @@ class RunOutput:
             (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of an image
 
     def push(self) -> None:
-        """Upload the policy of a complete run, if that was asked for.
-
-        Raises:
-            BhdError: it was not uploaded; it is complete on this machine.
-        """
+        """Upload the policy of a complete run, if that was asked for."""
         policy: Any = self._config.policy
         if self._metrics is None or policy is None or not policy.push_to_hub:
             return

@@ -20,7 +20,7 @@ from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
-from bhd_lerobot.policies.mlp.processor_mlp import floored
+from bhd_lerobot.policies.trained_steps import floored
 from bhd_lerobot.stock import (
     LeRobotDatasetMetadata,
     dataset_to_policy_features,
@@ -48,12 +48,7 @@ def has_bfloat16() -> bool:
 
 
 def make_accelerator(config: BhdTrainConfig) -> Accelerator:
-    """Return accelerate's accelerator, set up as `lerobot-train` does.
-
-    Raises:
-        ConfigError: a way of sharing the work that this loop does not know, or mixed precision that this processor can
-            only emulate.
-    """
+    """Return accelerate's accelerator, set up as `lerobot-train` does."""
     policy: Any = config.policy
     mixed = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(getattr(policy, "dtype", None) or "")
     if not hasattr(policy, "dtype") and policy.use_amp:
@@ -87,11 +82,7 @@ _STOCK_ONLY = ("peft", "sample_weighting", "accelerator", "checkpoint_format", "
 
 
 def refuse_unsupported(config: BhdTrainConfig) -> None:
-    """Refuse what only LeRobot's own loop does.
-
-    Raises:
-        ConfigError: names the option.
-    """
+    """Refuse what only LeRobot's own loop does."""
     defaults = {one.name: one.default for one in fields(config)} | {
         one.name: one.default_factory() for one in fields(config) if one.default_factory is not MISSING
     }
@@ -103,15 +94,7 @@ def refuse_unsupported(config: BhdTrainConfig) -> None:
 
 
 def check_contract(path: str, meta: LeRobotDatasetMetadata) -> None:
-    """Check that a dataset is of what a checkpoint was trained on.
-
-    Args:
-        path: folder of the checkpoint's model.
-        meta: of the dataset.
-
-    Raises:
-        DatasetMismatchError: another robot, rate, unit, or other features; names both sides.
-    """
+    """Check that a dataset is of what a checkpoint was trained on."""
     trained, here = PolicyContract.load(path), PolicyContract.from_dataset(meta)
     cameras = {name: shape for name, shape in (here.cameras or {}).items() if name in (trained.cameras or {})}
     units = [one.units or "unknown units" for one in (trained, here)]
@@ -135,16 +118,7 @@ def check_contract(path: str, meta: LeRobotDatasetMetadata) -> None:
 
 
 def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:
-    """Check that the dataset has what the policy's configuration names.
-
-    Args:
-        policy: its configuration; without input features it takes those of the dataset.
-        meta: of the dataset.
-        rename_map: from the dataset's names to the policy's.
-
-    Raises:
-        DatasetError: a feature is missing or has another shape; names it and those that there are.
-    """
+    """Check that the dataset has what the policy's configuration names."""
     features = {rename_map.get(k, k): one for k, one in dataset_to_policy_features(meta.features).items()}
     there = ", ".join(features)
     if not any(feature.type is FeatureType.ACTION for feature in features.values()):
@@ -170,11 +144,7 @@ _DIFFERS = "several values, in recordings that were merged"
 
 
 def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset whose task told something else than the truth, for a policy that learns to say what is true.
-
-    Raises:
-        DatasetError: names the option that it was recorded with.
-    """
+    """Refuse a dataset whose task told something else than the truth, for a policy that learns to say what is true."""
     task: Any = PolicyContract.from_dataset(meta).task or {}
     given = {}
     if "report" in task:  # there was none in earlier versions
@@ -191,11 +161,7 @@ def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
 
 
 def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerator: Any = None) -> Any:
-    """Return the policy, new or from its checkpoint, on its device; all of its randomness is the seed's.
-
-    Raises:
-        BhdError: the dataset does not fit the policy, or its weights cannot be loaded.
-    """
+    """Return the policy, new or from its checkpoint, on its device; all of its randomness is the seed's."""
     policy: Any = config.policy
     check_features(policy, meta, config.rename_map)
     if getattr(policy, "learns_true_poses", False):
@@ -224,9 +190,6 @@ def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
     Args:
         policy: the policy; what it keeps from training itself stays so.
         patterns: names of parameters, or patterns of them such as ``*.bias``.
-
-    Raises:
-        ConfigError: a pattern matches none, or there is no pattern.
     """
     trained = {name: one for name, one in policy.named_parameters() if one.requires_grad}
     unknown = [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in trained)]
@@ -245,17 +208,7 @@ _NAMED = 20  # parameters that a message names
 
 
 def fit_camera(policy: Any, loader: Loader, prepare: Callable[[Batch], Batch], *, processes: int) -> str:
-    """Let a policy find out where its camera stands; return what it found, in words. The loader stays where it is.
-
-    Args:
-        policy: the policy.
-        loader: of what is learned from.
-        prepare: makes the policy's input of a batch.
-        processes: that train together.
-
-    Raises:
-        ConfigError: the policy knows no place of a camera, or too little was seen.
-    """
+    """Let a policy find out where its camera stands; return what it found, in words. The loader stays where it is."""
     if not hasattr(policy, "fit_camera"):
         raise ConfigError(
             f"fine_tune_camera is true, but a {policy.config.type!r} does not know where its camera stands; a "
@@ -274,11 +227,7 @@ _BATCHES = 64  # from which the camera's place is found, at the most
 
 
 def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:
-    """Return the optimizer and the scheduler of the learning rate, or None for that.
-
-    Raises:
-        ConfigError: a value that PyTorch refuses.
-    """
+    """Return the optimizer and the scheduler of the learning rate, or None for that."""
     try:
         return make_optimizer_and_scheduler(config, policy)
     except (ValueError, TypeError, ImportError) as error:
@@ -289,18 +238,7 @@ def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:
 def build_processors(
     config: BhdTrainConfig, policy: Any, meta: LeRobotDatasetMetadata, device: torch.device, *, keep_statistics: bool
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor as `lerobot-train` makes them.
-
-    Args:
-        config: of the run.
-        policy: the policy.
-        meta: of the dataset, with its statistics.
-        device: where the policy is.
-        keep_statistics: normalise as the checkpoint does instead of by the dataset's statistics.
-
-    Raises:
-        ConfigError: the checkpoint's processors cannot be used.
-    """
+    """Return pre- and postprocessor as `lerobot-train` makes them."""
     before, after = _build_processors(config, policy, meta, device, keep_statistics=keep_statistics)
     if hasattr(policy, "use_statistics"):  # some are part of the weights
         policy.use_statistics(next(step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)))

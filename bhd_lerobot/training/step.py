@@ -33,13 +33,7 @@ class NonFiniteLossError(ArithmeticError):
 
 
 class Learner:
-    """A policy with its optimizer.
-
-    Attributes:
-        policy: as accelerate prepared it.
-        optimizer: likewise.
-        scheduler: of the learning rate, likewise; None if there is none.
-    """
+    """A policy with its optimizer."""
 
     def __init__(
         self,
@@ -54,14 +48,9 @@ class Learner:
     ) -> None:
         """Keep what a step needs.
 
-        Args:
-            policy: a LeRobot policy.
-            optimizer: its optimizer.
-            scheduler: of the learning rate, or None.
-            accelerator: accelerate's; with several processes or mixed precision it prepares the others.
-            preprocessor: from a batch of the dataset to the policy's input.
-            grad_clip_norm: largest norm of the gradient; not clipped if 0 or less.
-            camera_keys: images in a batch, which come as 8 bit.
+        `scheduler`: of the learning rate, or None. `accelerator`: accelerate's; with several processes or mixed
+        precision it prepares the others. `grad_clip_norm`: largest norm of the gradient; not clipped if 0 or less.
+        `camera_keys`: images in a batch, which come as 8 bit.
         """
         self.unwrapped = policy
         # For one process in full precision, accelerate's wrappers change nothing and take longer than a small network.
@@ -88,11 +77,7 @@ class Learner:
         return self._preprocessor(batch)
 
     def step(self, batch: Batch) -> StepResult:
-        """Learn from a batch that `prepare` returned.
-
-        Raises:
-            NonFiniteLossError: on a CPU, where looking costs nothing; elsewhere whoever reads the losses has to look.
-        """
+        """Learn from a batch that `prepare` returned."""
         with nullcontext() if self._is_plain else self._accelerator.autocast():
             loss, outputs = self.policy.forward(batch)
         if self._checks_at_once and not bool(torch.isfinite(loss)):
@@ -116,10 +101,6 @@ class Learner:
 
         Dropout is off, and what a policy draws, it draws from `seed`: the same in every evaluation, and the training
         goes on as if there had been none.
-
-        Args:
-            batches: of the dataset; of this process, if there are several.
-            seed: of the policy's noise.
         """
         device = self._accelerator.device
         total, count = torch.zeros((), dtype=torch.float64, device=device), 0

@@ -67,15 +67,7 @@ class TrainResult:
 
 
 def train(request: Request, console: Console | None = None) -> TrainResult:
-    """Train what a command line asks for.
-
-    Args:
-        request: the configuration, and the checkpoint whose contract the dataset must fit.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or training failed. Checkpoints saved before are intact.
-    """
+    """Train what a command line asks for."""
     config = request.config
     config.validate()
     refuse_unsupported(config)

@@ -5,13 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.utils.constants import OBS_STATE
 
 from bhd_lerobot.bodies.turtlebot3 import RANGE_MAX, RANGE_MIN, SCANNER_AHEAD
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import find_scan
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.trained import names_of
 
 ODOMETRY = ("x.pos", "y.pos", "theta.pos")
 _LEAST_SIZE = 16  # [px]
@@ -69,39 +70,20 @@ class CnnConfig(MlpConfig):
     )
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
-        for name in ("image_dim", "sectors"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
-        if not self.channels or min(self.channels) < 1:
-            raise ConfigError(f"policy.channels is {self.channels}; it must name at least one width, of at least 1.")
-        if not 0 < self.field_of_view <= 360:
-            raise ConfigError(f"policy.field_of_view is {self.field_of_view}; it must be in (0, 360] [deg].")
+        self.check_numbers("at least 1", lambda number: number >= 1, "image_dim", "sectors", "channels")
+        self.check_numbers("in (0, 360] [deg]", lambda number: 0 < number <= 360, "field_of_view")
+        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, "range_weight")
+        if not self.channels:
+            raise ConfigError("policy.channels is []; it must name at least one width.")
         if not 0 < self.range_minimum < self.range_maximum < math.inf:
             raise ConfigError(
                 f"policy.range_minimum is {self.range_minimum} and policy.range_maximum is {self.range_maximum}; the "
                 "first must be positive and below the second [m]."
             )
-        if not 0 <= self.range_weight < math.inf:
-            raise ConfigError(f"policy.range_weight is {self.range_weight}; it must be 0 or positive, and finite.")
         if self.scan.is_used:
             raise ConfigError("bhd_cnn does not read a range finder; leave policy.scan out, or train a bhd_mlp.")
-
-    @property
-    def image_key(self) -> str:
-        """The image's key in datasets and batches."""
-        return f"{OBS_IMAGES}.{self.camera}"
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the image [px]."""
-        _, height, width = (self.input_features or {})[self.image_key].shape
-        return int(width), int(height)
 
     @property
     def sight_size(self) -> int:
@@ -109,12 +91,8 @@ class CnnConfig(MlpConfig):
         return self.image_dim + self.sectors
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find odometry and ranges by their names, and read neither as numbers; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
-        names = list((features.get(OBS_STATE) or {}).get("names") or [])
+        """Find odometry and ranges by their names, and read neither as numbers; LeRobot's `make_policy` calls it."""
+        names = names_of(features, OBS_STATE)
         if missing := [name for name in ODOMETRY if name not in names]:
             raise ConfigError(
                 f"bhd_cnn keeps in mind where things are by the robot's odometry, and {OBS_STATE} of this dataset has "
@@ -134,18 +112,8 @@ class CnnConfig(MlpConfig):
         self.ignored_columns = sorted(unread)
 
     def validate_features(self) -> None:
-        """Keep the inputs that it reads, and refuse what it cannot be built for.
-
-        Raises:
-            ConfigError: image, odometry, ranges or action are missing.
-        """
-        known = self.input_features or {}
-        cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
-        if self.image_key not in cameras:
-            raise ConfigError(
-                f"policy.camera is {self.camera!r}, and the dataset has no {self.image_key!r}. It has "
-                f"{', '.join(cameras) or 'no images'}. Record it with --robot.camera=true, or set --policy.camera."
-            )
+        """Keep the inputs that it reads, and refuse what it cannot be built for."""
+        self.known_features()
         super().validate_features()
         if min(self.image_size) < _LEAST_SIZE:
             width, height = self.image_size

@@ -22,12 +22,7 @@ _NEAREST = 0.1  # [m] nearer things count as this
 
 
 class CnnPolicy(MlpPolicy):
-    """The policy type ``bhd_cnn``.
-
-    Args:
-        config: its shape and its features.
-        kwargs: what LeRobot passes to every policy, as in ``bhd_mlp``.
-    """
+    """The policy type ``bhd_cnn``."""
 
     config_class = CnnConfig
     name = "bhd_cnn"

@@ -82,14 +82,6 @@ class DaggerBrain:
     The learner acts in every frame of its turns, and between them if it gets another; a rule that gives setpoints
     sees every frame, so that it knows where the robot has been. An expert that gives goals starts afresh whenever it
     takes over.
-
-    Args:
-        config: the parameters.
-        learner: what `config.learner` describes.
-        expert: what `config.expert` describes.
-
-    Raises:
-        ConfigError: the two do not fit together.
     """
 
     name = "dagger"
@@ -166,11 +158,7 @@ class DaggerBrain:
         (self._goals or self.expert).reset(ids, own, n, instructions)
 
     def act(self, observation: Observation) -> "Array | Mixed":
-        """Return what the robots are to do; `Mixed` if the expert gives goals.
-
-        Raises:
-            ActionError: the learner or the expert gives something else than setpoints.
-        """
+        """Return what the robots are to do; `Mixed` if the expert gives goals."""
         running = np.ones(len(self._driving), np.bool_) if observation.running is None else observation.running
         wanted = self._ask_learner(observation, running)
         advised = None if self._goals else _setpoints(self.expert.act(observation), self.expert.name, "expert")

@@ -44,20 +44,13 @@ class _Turn:
     """How far the expert is in one simulation.
 
     Attributes:
-        number: of its turns in this episode.
         own: what is to be done before it begins, in order.
         pending: name of the goal of ours that is under way.
         raw: that of the expert's last goal, as the expert calls it.
         is_first: whether that is the first since it began.
         is_new: whether the turn has just begun, or begins again.
         is_holding: whether it holds what the task is about, and waits for that to be enough.
-        stops: how often it had to come to rest.
-        homes: how often it was brought home.
         idle: frames in which it had nothing to do.
-        count: number of the last goal of ours.
-        doing: what is being done before it begins.
-        seed: the expert's, of the episode.
-        instruction: the episode's.
     """
 
     number: int = 0
@@ -82,9 +75,6 @@ class GoalExpert:
     Before it begins, an arm with objects around it comes to rest and gets out of what it is among: it opens the gripper
     and goes straight up; what it holds, if that is what the task is about, it raises. From an odd posture, and where
     the expert's first goal has no way, it goes home first. An expert that has given up begins again from there.
-
-    Args:
-        brain: the expert.
     """
 
     def __init__(self, brain: GoalBrain) -> None:
@@ -132,12 +122,7 @@ class GoalExpert:
         return [turn.doing or text for turn, text in zip(self._turns, self.brain.subtasks(), strict=True)]
 
     def act(self, seen: Observation, driving: NDArray[np.bool_]) -> dict[int, list[BrainCommand]]:
-        """Return the new goals, by simulation.
-
-        Args:
-            seen: what the robots see.
-            driving: where the expert drives, shape (n,).
-        """
+        """Return the new goals, by simulation."""
         commands: dict[int, list[BrainCommand]] = {}
         results: dict[int, list[CommandResult]] = {}
         active = driving.copy()

@@ -32,7 +32,8 @@ class Watch(Protocol):
     """What it finds, in words."""
 
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """Begin the learner's turn in some of n simulations."""
+        """Begin the learner's turn in some of n simulations; what remembers nothing does nothing."""
+        return None
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Return where the learner needs help, shape (n,).
@@ -60,11 +61,7 @@ class _FrameCounter:
 
 
 class PatienceWatch(_FrameCounter):
-    """The learner has had its time.
-
-    Args:
-        frames: how many frames its turn may last.
-    """
+    """The learner has driven for `frames` frames."""
 
     cause = "time is up"
 
@@ -79,15 +76,7 @@ class PatienceWatch(_FrameCounter):
 
 
 class StallWatch:
-    """The robot gets nowhere: no joint turns, or the base stays where it is.
-
-    Args:
-        frames: for so many frames.
-        robot: the robot, whose body is known.
-
-    Raises:
-        ConfigError: it does not observe where it is.
-    """
+    """The robot gets nowhere for `frames` frames: no joint turns, or the base stays where it is."""
 
     cause = "no progress"
 
@@ -125,16 +114,7 @@ class StallWatch:
 
 
 class DisagreementWatch(_FrameCounter):
-    """The learner wants something else than the expert would do.
-
-    Args:
-        share: by more than this share of an action's range,
-        frames: for so many frames in a row.
-        robot: the robot.
-
-    Raises:
-        ConfigError: the range of an action is not known.
-    """
+    """For `frames` frames in a row the learner differs from the expert by more than this share of an action's range."""
 
     cause = "disagreement"
 
@@ -162,14 +142,8 @@ class DisagreementWatch(_FrameCounter):
         return np.asarray(self._frames >= self._most)
 
 
-class BaseCollisionWatch:
-    """What the learner wants would drive the base into what its scan shows.
-
-    Args:
-        horizon_s: within this time [s].
-        robot: the robot.
-        body: its body, with a lidar.
-    """
+class BaseCollisionWatch(Watch):
+    """What the learner wants would drive the base within `horizon_s` [s] into what its scan shows."""
 
     cause = "about to collide"
 
@@ -180,9 +154,6 @@ class BaseCollisionWatch:
         self._limit = np.array(body.limits.velocity)
         self._footprint, self._no_return = Footprint.of(body), body.lidar.range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
-
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """It remembers nothing."""
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the robot's outline on its way with what the scan shows."""
@@ -206,12 +177,10 @@ class BaseCollisionWatch:
         return danger
 
 
-class ArmCollisionWatch:
+class ArmCollisionWatch(Watch):
     """The arm could not come to rest any more before it touches the table or itself.
 
-    Args:
-        robot: the robot; if its actions are not joint positions, only what the arm does now counts.
-        body: its body.
+    If the robot's actions are not joint positions, only what the arm does now counts.
     """
 
     cause = "about to collide"
@@ -227,9 +196,6 @@ class ArmCollisionWatch:
         self._speed, self._change = np.array(limits.velocity[:dof]), np.array(limits.acceleration[:dof])
         self._delay = self._change / np.array(limits.jerk[:dof])
         self._least = body.chain.min_distance
-
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """It remembers nothing."""
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the postures on the way to rest with the table and with each other."""
@@ -251,11 +217,7 @@ class ArmCollisionWatch:
 
 
 def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
-    """Return what watches a robot for collisions.
-
-    Raises:
-        ConfigError: its shape is not known.
-    """
+    """Return what watches a robot for collisions."""
     match robot.body:
         case MobileBase(lidar=lidar) as base if lidar is not None:
             return BaseCollisionWatch(horizon_s, robot, base)

@@ -21,13 +21,7 @@ SKILLS = {
 
 @dataclass(frozen=True)
 class Request:
-    """What an instruction asks for.
-
-    Attributes:
-        goal: the last skill: `Skill.HOLD` or `Skill.HAND_OVER`.
-        what: what it says about the object.
-        language: the language that it is in.
-    """
+    """What an instruction asks for."""
 
     goal: Skill
     what: Description
@@ -38,12 +32,7 @@ class RulePlanner:
     """Plans for instructions that `parse` understands and that fit exactly one object on the table."""
 
     def plan(self, instruction: str, scene: Sequence[SceneObject]) -> Plan:
-        """Return the plan for an instruction.
-
-        Raises:
-            NothingFitsError: no object fits.
-            InstructionError: it is not understood, or more than one object fits.
-        """
+        """Return the plan for an instruction."""
         objects = list(check_request(instruction, scene).values())
         request = parse(instruction)
         found = fitting(request.what, objects)
@@ -73,11 +62,7 @@ class _Token:
 
 
 def parse(instruction: str) -> Request:
-    """Return what an instruction asks for.
-
-    Raises:
-        InstructionError: not every word is known, or together they do not ask for one action with one object.
-    """
+    """Return what an instruction asks for."""
     if len(instruction) > MAX_LENGTH:
         raise InstructionError(
             f"The instruction has {len(instruction)} characters; at most {MAX_LENGTH} are understood."
@@ -217,11 +202,7 @@ def instructions_for(
 
     There are none if no known words distinguish the object from another one.
 
-    Args:
-        scene: what is on the table, in any order.
-        target: index of the object.
-        language: ``"en"`` or ``"zh"``; None: both.
-        goal: `Skill.HOLD` or `Skill.HAND_OVER`; None: both.
+    The language is ``"en"`` or ``"zh"``, the goal `Skill.HOLD` or `Skill.HAND_OVER`; None: both.
     """
     objects = {thing.index: thing for thing in scene}
     if target not in objects:

@@ -74,14 +74,8 @@ class LanguageBrain(PickBrain):
 
     With `config.perception` it uses nothing that the task tells. It looks once before it moves; that the camera lives
     it sees by the arm, which has moved before the tool goes down; and after a grasp that failed it goes home and looks
-    again. What it is not sure enough of, it does not touch.
-
-    Args:
-        config: the parameters.
-        planner: what turns instructions into plans; the rules if None. A language model goes here.
-
-    Raises:
-        ConfigError: the perception's checkpoint cannot be used.
+    again. What it is not sure enough of, it does not touch. `planner` turns instructions into plans, by rules if None:
+    a language model goes here.
     """
 
     name = "language"
@@ -104,11 +98,7 @@ class LanguageBrain(PickBrain):
         return self.perceiver is None
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the gripper, and the objects or the camera that shows them.
-
-        Raises:
-            ConfigError: one of them is missing, or the camera's images are not of the size that the perception knows.
-        """
+        """Find the gripper, and the objects or the camera that shows them."""
         super().bind(robot)
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)

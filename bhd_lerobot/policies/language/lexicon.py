@@ -60,16 +60,7 @@ Words = dict[str, tuple[Part, str]]
 
 @dataclass(frozen=True)
 class Language:
-    """Words and word order of one language.
-
-    Attributes:
-        words: part and value of each word or phrase.
-        lift: matches the parts of an instruction to pick something up.
-        give: matches the parts of an instruction to hand something over.
-        names: how to say a colour, a kind, or a relation.
-        verbs: examples of verbs, for messages.
-        example: an instruction, for messages.
-    """
+    """Words and word order of one language."""
 
     words: Words
     lift: re.Pattern[str]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 
@@ -59,22 +59,15 @@ class LearnedBrainConfig(BrainConfig):
                 raise ConfigError(f"brain.{name} is {value}; it must be at least 1.")
 
 
-class LearnedBrain:
+class LearnedBrain(ConfiguredBrain):
     """Drives n simulations, whose episodes need not be in step, with one policy.
 
     Every simulation has its own chunk, history and random numbers, which follow from its episode's seed; those that
     need a new chunk in the same frame share a forward pass.
-
-    Args:
-        config: the parameters.
-
-    Raises:
-        ConfigError: the checkpoint cannot be used; the message says why.
     """
 
     name = "learned"
     robot_kind = ANY_ROBOT
-    has_plan = False
 
     def __init__(self, config: LearnedBrainConfig) -> None:
         from bhd_lerobot.policies.learned.inference import expected_frames, make_inference
@@ -107,20 +100,13 @@ class LearnedBrain:
 
         Where there is no such folder, it says `ANY_ROBOT`: a configuration may be read before its policy is trained,
         and reading it asks nobody on the network. Making the brain then fails, or fetches the policy.
-
-        Raises:
-            ConfigError: there is a folder, and no checkpoint that can be used.
         """
         if not Path(config.path).expanduser().is_dir():
             return ANY_ROBOT
         return PolicyContract.load(config.path).robot_type or ANY_ROBOT
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Check that these are the features, the rate and the cameras that the policy was trained on.
-
-        Raises:
-            ConfigError: they are not; the message names both sides.
-        """
+        """Check that these are the features, the rate and the cameras that the policy was trained on."""
         who = f"The policy {self.config.path!r}"
         inputs = self.loaded.inputs
         has_environment = _ENVIRONMENT in inputs
@@ -168,12 +154,7 @@ class LearnedBrain:
         self.inference.reset(ids, seeds, n, instructions)
 
     def act(self, observation: Observation) -> "NDArray[np.float64] | Chunk | None":
-        """Return the actions, shape (n, actions); with `stream`, chunks, and None between two of them.
-
-        Raises:
-            ConfigError: an image that the policy looks at is missing or has another shape.
-            ActionError: the policy gave a value that is not finite.
-        """
+        """Return the actions, shape (n, actions); with `stream`, chunks, and None between two of them."""
         n = len(self._next)
         running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
         ids = running[self._next[running] >= self.inference.steps]
@@ -189,14 +170,6 @@ class LearnedBrain:
         self._next[running] += 1
         self._frame[running] += 1
         return self._actions.copy()
-
-    def subtasks(self) -> Sequence[str]:
-        """It has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """It has no plan."""
-        return {}
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters, and which weights they are."""
@@ -242,11 +215,7 @@ class LearnedBrain:
         return rows
 
     def _check_cameras(self, cameras: Mapping[str, tuple[int, ...]]) -> None:
-        """Check that the cameras that the policy looks at are there, and their images are of the shape that it knows.
-
-        Raises:
-            ConfigError: they are not; the message names both sides and the remedy.
-        """
+        """Check that the cameras that the policy looks at are there, with images of the shape that it knows."""
         for key, camera in self.loaded.cameras.items():
             shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
             if camera not in cameras:

@@ -26,13 +26,8 @@ def weights_digest(folder: Path) -> str:
 def recorded_path(given: str, folder: Path) -> str:
     """Return what datasets and results call a policy: nothing of where it lies on this machine.
 
-    Args:
-        given: how it was named.
-        folder: where `find_checkpoint` found it.
-
-    Returns:
-        ``RUN/checkpoints/STEP`` of a training run, the name of any other folder, or the name on the Hub. However a
-        folder is named, this is the same; which weights are in it, `weights_digest` says.
+    That is ``RUN/checkpoints/STEP`` of a training run, the name of any other folder, or the name on the Hub. However a
+    folder is named, this is the same; which weights are in it, `weights_digest` says.
     """
     if not Path(given).expanduser().is_dir():
         return given
@@ -51,9 +46,6 @@ def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:
         path: that folder; a checkpoint's or a training run's folder, then its last checkpoint; or the name of a model
             on the Hub, `user/name`.
         revision: branch, tag or commit of a model on the Hub; its main branch if None.
-
-    Raises:
-        ConfigError: there is none, or it is not complete; the message says what was looked for.
     """
     text, folder = str(path), Path(path).expanduser()
     if folder.is_dir():

@@ -55,15 +55,7 @@ def plugin_packages() -> set[str]:
 
 
 def check_checkpoint(folder: Path) -> None:
-    """Check that loading a checkpoint runs no code but LeRobot's, this package's and that of installed plug-ins.
-
-    Args:
-        folder: the folder with `config.json`. Processor files that are missing are not asked for.
-
-    Raises:
-        ConfigError: a file that cannot be read, a step that is not allowed, or a model whose code would be run; names
-            the file, the step, what is allowed and the remedy.
-    """
+    """Check that loading a checkpoint runs no code but LeRobot's, this package's and that of installed plug-ins."""
     config = _read(folder / CONFIG_FILE)
     kind = config.get("type")
     if kind in PreTrainedConfig.get_known_choices():

@@ -69,12 +69,7 @@ class PolicyContract:
 
     @classmethod
     def from_dataset(cls, meta: Any, trainer: str | None = None) -> Self:
-        """Return the contract of a policy that is trained on a dataset.
-
-        Args:
-            meta: a `LeRobotDatasetMetadata`.
-            trainer: the program that trains it.
-        """
+        """Return the contract of a policy that is trained on a dataset."""
         root = Path(meta.root)
         contract = cls._from_info(meta.info, root)
         known = dict(contract.dataset or {}, repo_id=meta.repo_id)
@@ -86,12 +81,6 @@ class PolicyContract:
 
         Without `bhd.json`, for example after stock `lerobot-train`, the dataset that `train_config.json` names is
         asked, if it is on this machine; what cannot be found out is None.
-
-        Args:
-            path: what `find_checkpoint` takes.
-
-        Raises:
-            ConfigError: there is no policy, or its `bhd.json` cannot be read.
         """
         folder = find_checkpoint(path)
         file = folder / CONTRACT_FILE
@@ -130,17 +119,7 @@ class PolicyContract:
     ) -> None:
         """Check that the policy fits what it is to drive. What is None, here or in the contract, is not checked.
 
-        Args:
-            observation_names: names of the robot's floats, in order.
-            action_names: names of the action's floats, in order.
-            fps: frames a second [Hz].
-            environment_names: names of what the task tells, in order.
-            robot_type: the robot.
-            cameras: image shapes (height, width, channels) [px] by name; more cameras than the policy knows are fine.
-            who: what the message calls the policy.
-
-        Raises:
-            ConfigError: something does not fit; the message names both sides and the remedy.
+        Cameras are image shapes (height, width, channels) [px] by name; more than the policy knows are fine.
         """
         if None not in (robot_type, self.robot_type) and robot_type != self.robot_type:
             raise ConfigError(

@@ -59,17 +59,7 @@ class Inference(Protocol):
 
 
 def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> Inference:
-    """Return what drives simulations with a policy.
-
-    Args:
-        loaded: the policy.
-        sample: draw actions from a Gaussian policy instead of taking its mean.
-        exact: infer for every simulation by itself, so that its actions are the same bits beside any others.
-        threads: threads for torch on the CPU; if None, one for small networks and torch's own choice for others.
-
-    Raises:
-        ConfigError: `sample` for a policy that is not Gaussian.
-    """
+    """Return what drives simulations with a policy; the options are those of `LearnedBrainConfig`."""
     if sample and not getattr(loaded.config, "gaussian", False):
         raise ConfigError("brain.sample is true, but this policy has no distribution (bhd_mlp with gaussian=true has).")
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
@@ -90,12 +80,6 @@ class BatchedInference:
     Simulations go through the network in blocks of a fixed size, because the last bits of a matrix product depend on
     how many rows it has. So an episode's actions do not depend on what is beside it; alone (n = 1), or with `exact`,
     they are the bits of LeRobot's own `select_action`.
-
-    Args:
-        loaded: the policy.
-        sample: draw from a Gaussian policy.
-        exact: blocks of one.
-        threads: for torch on the CPU; its own choice if None.
     """
 
     def __init__(self, loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> None:
@@ -202,10 +186,6 @@ class StockInference:
     Of a policy that has chunks and no `select_action`, the first `n_action_steps` of each chunk are carried out.
     The copies share the weights; only what a policy remembers is theirs. One simulation after the other, so n of them
     take n times as long as one.
-
-    Args:
-        loaded: the policy.
-        threads: for torch on the CPU; its own choice if None.
     """
 
     frames: tuple[int, ...] = (0,)
@@ -279,14 +259,7 @@ class StockInference:
 
 
 def image_tensor(pixels: Tensor) -> Tensor:
-    """Return images as LeRobot's evaluation makes them.
-
-    Args:
-        pixels: uint8, shape (…, height, width, channels).
-
-    Returns:
-        float32 in [0, 1], shape (…, channels, height, width)
-    """
+    """Return images, uint8, shape (…, height, width, channels), as float32 in [0, 1], channels first."""
     last = pixels.ndim - 1
     order = (*range(last - 2), last, last - 2, last - 1)
     return pixels.permute(order).contiguous().type(torch.float32) / 255

@@ -32,8 +32,6 @@ class LoadedPolicy:
     """A policy, ready to act.
 
     Attributes:
-        folder: where it was loaded from.
-        policy: the network, in evaluation mode.
         before: what turns a batch of observations into its input.
         after: what gives its actions their units back.
         inputs: keys of the observations that it takes, under the names that they have before `before`.
@@ -72,9 +70,6 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
         folder: a checkpoint's folder `pretrained_model`.
         device: where it runs: `cpu`, `cuda`, `cuda:1`, …
         n_action_steps: how many actions of a chunk are carried out; the checkpoint's own number if None.
-
-    Raises:
-        ConfigError: the checkpoint cannot be loaded or does not fit, with the cause and the remedy.
     """
     _check_device("brain.device", device)
     config = _config(folder, device)
@@ -92,16 +87,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
 
 
 def load_perception(folder: Path, device: str = "cpu", option: str = "brain.perception.path") -> Any:
-    """Return the `bhd_perception` of a checkpoint, in evaluation mode.
-
-    Args:
-        folder: a checkpoint's folder `pretrained_model`.
-        device: where it runs.
-        option: that named the checkpoint, for messages.
-
-    Raises:
-        ConfigError: the checkpoint cannot be loaded, or is of a policy that gives actions.
-    """
+    """Return the `bhd_perception` of a checkpoint, in evaluation mode."""
     _check_device("brain.perception.device", device)
     config = _config(folder, device)
     if config.type != "bhd_perception":

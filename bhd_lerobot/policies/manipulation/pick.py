@@ -64,11 +64,7 @@ class Work:
 
 
 class PickBrain(GoalBrain):
-    """Carries out a plan of skills with goals; its plan is to pick up the object that the task marks.
-
-    Args:
-        config: the parameters.
-    """
+    """Carries out a plan of skills with goals; its plan is to pick up the object that the task marks."""
 
     name = "pick"
 
@@ -101,11 +97,7 @@ class PickBrain(GoalBrain):
         }
 
     def _make_plan(self, sim: int, objects: Sequence[SeenObject]) -> tuple[Plan, Sequence[SeenObject]]:
-        """Return the plan for what is on the table, and what it takes the objects for.
-
-        Raises:
-            InstructionError: there is none.
-        """
+        """Return the plan for what is on the table, and what it takes the objects for."""
         for item in objects:
             if item.target:
                 skills = (Skill.LOCATE, Skill.APPROACH, Skill.GRASP, Skill.LIFT, Skill.HOLD)

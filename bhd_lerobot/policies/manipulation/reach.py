@@ -22,11 +22,7 @@ class ReachBrainConfig(GoalBrainConfig):
 
 
 class ReachBrain(GoalBrain):
-    """Gives the target pose as a goal; where no way leads there from the present posture, by way of home.
-
-    Args:
-        config: the parameters.
-    """
+    """Gives the target pose as a goal; where no way leads there from the present posture, by way of home."""
 
     name = "reach"
 

@@ -97,11 +97,7 @@ class PickServoConfig(ServoConfig):
 
 
 class _ServoBrain(ConfiguredBrain):
-    """Finds its inputs, and makes a tool pose of where the tool is to go.
-
-    Args:
-        config: the parameters.
-    """
+    """Finds its inputs, and makes a tool pose of where the tool is to go."""
 
     robot_kind = "arm"
 
@@ -112,11 +108,7 @@ class _ServoBrain(ConfiguredBrain):
         self._error = np.asarray(config.camera_error_m, np.float64)
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find tool pose and gripper, among the observations and among the actions.
-
-        Raises:
-            ConfigError: the robot does not observe its tool pose, or does not take tool poses.
-        """
+        """Find tool pose and gripper, among the observations and among the actions."""
         names = (*_TOOL, _GRIPPER)
         if tuple(robot.action_names) != names or not set(names) <= set(robot.observation_names):
             raise ConfigError(
@@ -127,17 +119,7 @@ class _ServoBrain(ConfiguredBrain):
         self._gripper = int(find_columns(robot.observation_names, [_GRIPPER], self.name, "observation")[0])
 
     def _towards(self, observation: Observation, target: Array, lead: Array, opening: Array) -> Array:
-        """Return actions that lead to tool poses.
-
-        Args:
-            observation: what the robots see.
-            target: tool poses, shape (n, 7).
-            lead: largest distance [m] from where the tool is, shape (n,).
-            opening: of the gripper [m], shape (n,).
-
-        Returns:
-            Shape (n, 8).
-        """
+        """Return actions, shape (n, 8), that lead to tool poses, shape (n, 7), by at most `lead` [m] from the tool."""
         now = observation.state[:, self._tool]
         way = target[:, :3] - now[:, :3]
         share = np.minimum(_GAIN, lead / np.maximum(np.linalg.norm(way, axis=1), 1e-9))
@@ -151,11 +133,7 @@ class _ServoBrain(ConfiguredBrain):
 
 
 class ReachServoBrain(_ServoBrain):
-    """Servos the tool to the target pose.
-
-    Args:
-        config: the parameters.
-    """
+    """Servos the tool to the target pose."""
 
     name = "reach_servo"
 
@@ -182,11 +160,7 @@ class ReachServoBrain(_ServoBrain):
 
 
 class PickServoBrain(_ServoBrain):
-    """Servos the open gripper above the object that the task is about, down around it, and up with it.
-
-    Args:
-        config: the parameters.
-    """
+    """Servos the open gripper above the object that the task is about, down around it, and up with it."""
 
     name = "pick_servo"
 
@@ -217,13 +191,7 @@ class PickServoBrain(_ServoBrain):
         return self._towards(observation, target, lead, opening)
 
     def _step(self, tool: Array, opening: float, objects: Sequence[SeenObject]) -> tuple[Pose, float, float] | None:
-        """Return where one tool is to go, in steps of which length [m], and the opening [m]; None if it cannot tell.
-
-        Args:
-            tool: its pose, shape (7,).
-            opening: of the gripper [m].
-            objects: what the task tells.
-        """
+        """Return where one tool is to go, in steps of which length [m], and the opening [m]; None if it cannot tell."""
         target = next((item for item in objects if item.target), None)
         grasp, yaw = None, _finger_line(tool)
         if target is not None:
@@ -262,11 +230,8 @@ class PickServoBrain(_ServoBrain):
     def _plan(self, target: SeenObject, others: Sequence[SeenObject], yaw: float) -> Grasp | None:
         """Return the grasp of an object; the widest that there is room for.
 
-        Args:
-            target: the object.
-            others: what else stands there.
-            yaw: of the line through the fingers now [rad]: counted from there, a choice between two ways gets clearer
-                while the tool turns.
+        `yaw`: of the line through the fingers now [rad]: counted from there, a choice between two ways gets clearer
+        while the tool turns.
         """
         wider, grasp = self.config.wider_m, None
         for extra, least in ((wider, wider), (wider, 0.0), (0.0, 0.0)) if wider else ((0.0, 0.0),):

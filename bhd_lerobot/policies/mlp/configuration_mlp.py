@@ -1,27 +1,22 @@
 """Configuration of `bhd_mlp`: numbers in, a chunk of actions out."""
 
-import fnmatch
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, TOOL, object_columns
-from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
+from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, object_columns
+from bhd_lerobot.policies.trained import TOOL, TrainedConfig, names_of
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")
 SCAN_TRANSFORMS = ("none", "inverse", "log")
 SCHEDULES = ("cosine", "constant")
-
-_SHOWN = 8  # names in a message
 
 
 @dataclass
@@ -58,11 +53,7 @@ class ScanConfig:
         return self.transform != "none" or bool(self.channels)
 
     def check(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         if self.transform not in SCAN_TRANSFORMS:
             raise ConfigError(unknown_name("policy.scan.transform", self.transform, SCAN_TRANSFORMS))
         for name in ("scale", "minimum"):
@@ -79,50 +70,9 @@ class ScanConfig:
             )
 
 
-def _names(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:
-    known = (features.get(key) or {}).get("names")
-    return list(known) if isinstance(known, list | tuple) else []
-
-
-def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the columns of `observation.state` whose names match a pattern.
-
-    Args:
-        patterns: of `policy.ignore`.
-        names: of all columns.
-
-    Raises:
-        ConfigError: a pattern matches none.
-    """
-    for pattern in patterns:
-        if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
-            some = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {some}.")
-    return [i for i, name in enumerate(names) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
-
-
-def check_residual(config: Any, width: int) -> None:
-    """Refuse `residual` where it is not known which columns it means.
-
-    Args:
-        config: with `residual`, `residual_columns` and `action_feature`.
-        width: numbers of `observation.state`.
-
-    Raises:
-        ConfigError: it cannot be honoured.
-    """
-    columns, actions = config.residual_columns, int(config.action_feature.shape[0])
-    if config.residual and (len(columns) != actions or max(columns, default=-1) >= width):
-        raise ConfigError(
-            f"policy.residual is {config.residual}, and policy.residual_columns is {columns}; it must have a column of "
-            f"{OBS_STATE}, below {width}, or -1, for each of the {actions} actions. Make the policy with the metadata "
-            "of its dataset."
-        )
-
-
 @PreTrainedConfig.register_subclass("bhd_mlp")
 @dataclass
-class MlpConfig(PreTrainedConfig):
+class MlpConfig(TrainedConfig):
     """Configuration of the policy type ``bhd_mlp``.
 
     It reads `observation.state` and `observation.environment_state` and nothing else; cameras of a dataset are left
@@ -223,27 +173,17 @@ class MlpConfig(PreTrainedConfig):
     scheduler: str = "cosine"
     scheduler_warmup_steps: int = 100
 
-    # LeRobot's class says so as well, but without types.
-    input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
-
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
-        positive = dict.fromkeys(("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps", "modes"), 1)
-        for name, least in {**positive, "yaw_harmonics": 0}.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least {least}.")
-        if self.n_action_steps > self.chunk_size:
-            raise ConfigError(
-                f"policy.n_action_steps is {self.n_action_steps}, but only policy.chunk_size = {self.chunk_size} "
-                "actions are predicted."
-            )
-        if min(self.hidden_dims, default=1) < 1:
-            raise ConfigError(f"policy.hidden_dims is {self.hidden_dims}; every width must be at least 1.")
+        positive = ("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps", "modes", "hidden_dims")
+        self.check_numbers("at least 1", lambda number: number >= 1, *positive)
+        self.check_numbers("0 or more", lambda number: number >= 0, "yaw_harmonics")
+        self.check_numbers("in [0, 1)", lambda number: 0 <= number < 1, "dropout")
+        self.check_numbers("positive, or nothing", lambda number: number > 0, "feature_clip")
+        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, "min_std")
+        self.check_numbers("positive and finite", lambda number: 0 < number < math.inf, "huber_delta")
+        self.check_chunk()
         for name, value, valid in (
             ("activation", self.activation, ACTIVATIONS),
             ("loss", self.loss, (None, *LOSSES)),
@@ -251,23 +191,10 @@ class MlpConfig(PreTrainedConfig):
         ):
             if value not in valid:
                 raise ConfigError(unknown_name(f"policy.{name}", value, [option for option in valid if option]))
-        if not 0 <= self.dropout < 1:
-            raise ConfigError(f"policy.dropout is {self.dropout}; it must be in [0, 1).")
-        if self.feature_clip is not None and not self.feature_clip > 0:
-            raise ConfigError(f"policy.feature_clip is {self.feature_clip}; it must be positive, or nothing.")
-        if not 0 <= self.min_std < math.inf:
-            raise ConfigError(f"policy.min_std is {self.min_std}; it must be 0 or positive, and finite.")
-        if not 0 < self.huber_delta < math.inf:
-            raise ConfigError(f"policy.huber_delta is {self.huber_delta}; it must be positive.")
         for name, is_set in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):
             if is_set and not self.gaussian:
                 raise ConfigError(f"policy.{name} needs a distribution; set --policy.gaussian=true.")
         self.scan.check()
-
-    @property
-    def image_key(self) -> str | None:
-        """Key of the image that it looks at; nothing, because it reads numbers."""
-        return None
 
     @property
     def sight_size(self) -> int:
@@ -296,48 +223,15 @@ class MlpConfig(PreTrainedConfig):
             return None
         return [-back * self.obs_stride for back in reversed(range(self.n_obs_steps))]
 
-    @property
-    def action_delta_indices(self) -> list[int]:
-        """Which actions it predicts, the present frame's being 0."""
-        return list(range(self.chunk_size))
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        """Return AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        """Return the schedule of the learning rate."""
-        if self.scheduler == "constant":
-            return None
-        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
-
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: there are none.
-        """
-        names = _names(features, OBS_STATE)
+        """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it."""
+        self.find_columns(features)
+        names = names_of(features, OBS_STATE)
         if self.yaw_harmonics and not self.quaternions:
             self.state_quaternions = quaternion_columns(names)
-            self.environment_quaternions = quaternion_columns(_names(features, OBS_ENV_STATE))
-        if self.ignore and not self.ignored_columns:
-            self.ignored_columns = matching_columns(self.ignore, names)
-        if self.residual and not self.residual_columns:
-            self.residual_columns = residual_columns(self.residual, _names(features, ACTION), names)
+            self.environment_quaternions = quaternion_columns(names_of(features, OBS_ENV_STATE))
         if self.sort_objects and not self.objects:
-            start, count, size, fields = object_columns(_names(features, OBS_ENV_STATE))
+            start, count, size, fields = object_columns(names_of(features, OBS_ENV_STATE))
             self.objects = [start, count, size, *fields] if count else []
             if set(TOOL) <= set(names):
                 self.tool_columns = [names.index(name) for name in TOOL]
@@ -353,11 +247,7 @@ class MlpConfig(PreTrainedConfig):
         self.scan.start, self.scan.beams = columns[0], len(columns)
 
     def validate_features(self) -> None:
-        """Keep the inputs that it reads, and refuse what it cannot be built for.
-
-        Raises:
-            ConfigError: there is no input or no action, or the beams lie outside the state.
-        """
+        """Keep the inputs that it reads, and refuse what it cannot be built for."""
         known: dict[str, PolicyFeature] = self.input_features or {}
         kept = {key: feature for key, feature in known.items() if key in (OBS_STATE, OBS_ENV_STATE, self.image_key)}
         self.input_features = kept
@@ -370,15 +260,7 @@ class MlpConfig(PreTrainedConfig):
                 raise ConfigError(f"{self.type} reads and writes vectors; {key} has the shape {tuple(feature.shape)}.")
         state = self.robot_state_feature
         width = state.shape[0] if state else 0
-        if self.ignore and not self.ignored_columns:
-            raise ConfigError(
-                f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
-                "policy with the metadata of its dataset, or give policy.ignored_columns."
-            )
-        if not all(0 <= column < width for column in self.ignored_columns):
-            raise ConfigError(
-                f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
-            )
+        self.check_columns(width)
         if self.yaw_harmonics and not self.quaternions:
             raise ConfigError(
                 f"policy.yaw_harmonics is {self.yaw_harmonics}, but no quaternion (…_qw, …_qx, …_qy, …_qz) is known "
@@ -389,7 +271,6 @@ class MlpConfig(PreTrainedConfig):
             size = kept[key].shape[0] if key in kept else 0
             if not all(0 <= column <= size - 4 for column in columns):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
-        check_residual(self, width)
         self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept and not self.sight_size:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")

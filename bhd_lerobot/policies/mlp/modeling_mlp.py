@@ -41,10 +41,6 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
 
     `features` turns a preprocessed batch into one vector a row, and `net`, a `torch.nn.Sequential` of linear layers and
     activations, turns that into the chunk.
-
-    Args:
-        config: its shape and its features.
-        kwargs: what LeRobot passes to every policy; of it `dataset_stats` are used, for `config.residual`.
     """
 
     config_class = MlpConfig
@@ -189,13 +185,8 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
         """Return normalised actions, shape (batch, chunk_size, actions).
 
-        Args:
-            batch: observations as in `features`.
-            noise: of a standard normal distribution, in the result's shape: act on the sample that it makes, instead of
-                the mean.
-
-        Raises:
-            ConfigError: noise for a policy that is not Gaussian.
+        `noise`: of a standard normal distribution, in the result's shape: act on the sample that it makes, instead of
+        the mean.
         """
         self.eval()
         mean = self._chunk(self.features(batch), batch)
@@ -234,11 +225,7 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
         return chunks, logits
 
     def split_modes(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Split what the network says into chunks, shape (batch, modes, chunk_size, actions), and the modes' logits.
-
-        Args:
-            outputs: of `net`, shape (batch, outputs).
-        """
+        """Split what the network says into chunks, shape (batch, modes, chunk_size, actions), and the modes' logits."""
         shape = (self.config.modes, self.config.chunk_size, self._action_size)
         chunks, logits = outputs.tensor_split([math.prod(shape)], dim=-1)
         return chunks.unflatten(-1, shape), logits if self.config.modes > 1 else outputs.new_zeros(len(outputs), 1)

@@ -1,21 +1,18 @@
 """Objects on their way into the network: in an order of their own, and where what is meant is from the tool."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.processor import ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
+from bhd_lerobot.policies.trained_steps import TrainedStep
 
 FIELDS = ("present", "target", "x", "y", "z", "qw", "qx", "qy", "qz")
 """What has to be told of every object, as `object_0_present` and so on."""
-
-TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
-"""Where the tool is, in `observation.state`."""
 
 OBS_RELATIVE = "observation.bhd_relative"
 """Key of where what is meant is from the tool: x, y, z in the base frame [m], and its yaw from the tool's [rad]."""
@@ -25,7 +22,7 @@ _SCALES = (0.1, 0.02, 0.005)  # [m] within which distances are told apart
 
 @ProcessorStepRegistry.register(name="bhd_object_order_processor")
 @dataclass
-class ObjectOrderProcessorStep(ObservationProcessorStep):
+class ObjectOrderProcessorStep(TrainedStep):
     """Sorts the objects in `observation.environment_state`: what is meant first, then the nearest to it.
 
     A network then finds each object in the same inputs and need not learn to look for it; what stands in which row of
@@ -38,9 +35,6 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
         fields: where `FIELDS` are among the numbers of an object.
         tool: columns of `observation.state` that have `TOOL`; nothing if it is not observed.
     """
-
-    is_elementwise: ClassVar[bool] = True
-    """What is beside it in a batch changes nothing."""
 
     start: int = 0
     count: int = 0
@@ -62,30 +56,9 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
                 observation[OBS_RELATIVE] = _relative(state[..., list(self.tool)], meant)
         return observation
 
-    def get_config(self) -> dict[str, Any]:
-        """Return what the step is made from again."""
-        return {
-            "start": self.start,
-            "count": self.count,
-            "size": self.size,
-            "fields": list(self.fields),
-            "tool": list(self.tool),
-        }
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Return the features unchanged: the same numbers, in another order."""
-        return features
-
 
 def in_order(rows: Tensor, fields: tuple[int, ...] | list[int]) -> Tensor:
-    """Return objects, shape (…, count, size): what is meant first, then the nearest to it, what is not there last.
-
-    Args:
-        rows: the objects, in the same shape.
-        fields: where `FIELDS` are among the numbers of an object.
-    """
+    """Return objects, shape (…, count, size): what is meant first, then the nearest to it, what is not there last."""
     present, target, x, y, *_ = fields
     is_meant = (rows[..., target] > 0.5) & (rows[..., present] > 0.5)
     place = rows[..., [x, y]]

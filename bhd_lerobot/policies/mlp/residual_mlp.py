@@ -1,14 +1,11 @@
 """Actions as changes: an action that is also observed begins where the robot is, and the network adds to that."""
 
-import fnmatch
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
-
-from bhd_lerobot.errors import ConfigError
 
 
 class Residual(nn.Module):
@@ -53,27 +50,3 @@ class Residual(nn.Module):
     def forward(self, state: Tensor) -> Tensor:
         """Return what actions begin at, shape (batch, 1, actions), of normalised states, shape (batch, width)."""
         return (state[:, self._columns] * self._scale + self._offset).unsqueeze(1)
-
-
-def residual_columns(patterns: Sequence[str], actions: Sequence[str], observed: Sequence[str]) -> list[int]:
-    """Return of each action the column of the observation that has its name, if its name matches; else -1.
-
-    Args:
-        patterns: of `policy.residual`.
-        actions: names of the actions.
-        observed: names of the numbers of `observation.state`.
-
-    Raises:
-        ConfigError: a pattern matches no action that is observed, too.
-    """
-    places = {name: place for place, name in enumerate(observed)}
-    both = [name for name in actions if name in places]
-    for pattern in patterns:
-        if not fnmatch.filter(both, pattern):
-            raise ConfigError(
-                f"policy.residual: {pattern!r} matches no action that is observed under the same name; there is: "
-                f"{', '.join(both) or 'none'}. For tool poses record with --robot.action_space=tool "
-                "--robot.tool_pose=true."
-            )
-    is_wanted = [any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns) for name in actions]
-    return [places.get(name, -1) if wanted else -1 for name, wanted in zip(actions, is_wanted, strict=True)]

@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.processor import ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
 from bhd_lerobot.policies.mlp.configuration_mlp import ScanConfig
+from bhd_lerobot.policies.trained_steps import TrainedStep
 
 OBS_SCAN = "observation.bhd_scan"
 """Key of the ranges [m], as they were measured, beside the normalised `observation.state`."""
@@ -18,18 +18,10 @@ OBS_SCAN = "observation.bhd_scan"
 
 @ProcessorStepRegistry.register(name="bhd_scan_processor")
 @dataclass
-class ScanProcessorStep(ObservationProcessorStep):
-    """Copies the ranges to `OBS_SCAN` before the normaliser changes them.
+class ScanProcessorStep(TrainedStep):
+    """Copies the ranges to `OBS_SCAN` before the normaliser changes them."""
 
-    Attributes:
-        start: column of the first beam in `observation.state`.
-        beams: how many there are.
-    """
-
-    is_elementwise: ClassVar[bool] = True
-    """What is beside it in a batch changes nothing."""
-
-    start: int = 0
+    start: int = 0  # column of the first beam in `observation.state`
     beams: int = 0
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
@@ -39,16 +31,6 @@ class ScanProcessorStep(ObservationProcessorStep):
             observation[OBS_SCAN] = state[..., self.start : self.start + self.beams]
         return observation
 
-    def get_config(self) -> dict[str, Any]:
-        """Return what the step is made from again."""
-        return {"start": self.start, "beams": self.beams}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Return the features unchanged: what is added is not a feature of the dataset."""
-        return features
-
 
 def transformed(ranges: Tensor, config: ScanConfig) -> Tensor:
     """Return ranges [m] as network inputs, of the same shape."""
@@ -57,13 +39,7 @@ def transformed(ranges: Tensor, config: ScanConfig) -> Tensor:
 
 
 class ScanEncoder(nn.Module):
-    """Convolutions over a closed circle of beams: turning the robot turns what they see.
-
-    Args:
-        config: channels, kernel size and stride.
-        n_obs_steps: scans, which are the input channels.
-        activation: class of the activation behind each convolution.
-    """
+    """Convolutions over a closed circle of beams: turning the robot turns what they see."""
 
     def __init__(self, config: ScanConfig, n_obs_steps: int, activation: type[nn.Module]) -> None:
         super().__init__()

@@ -46,11 +46,7 @@ class KeepsStatistics:
         raise NotImplementedError
 
     def train(self, mode: bool = True) -> Self:
-        """Go to training mode, or to evaluation mode.
-
-        Raises:
-            ConfigError: it is not known which statistics count.
-        """
+        """Go to training mode, or to evaluation mode."""
         if mode and self._is_unlike:
             raise ConfigError(
                 f"A part of the weights of this {self.name!r} are statistics of what it was trained on, and this "

@@ -1,13 +1,14 @@
 """Orientations on their way into the network: as sines and cosines of multiples of the yaw, past the normalisation."""
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.processor import ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
+
+from bhd_lerobot.policies.trained_steps import TrainedStep
 
 OBS_YAW = "observation.bhd_yaw"
 """Key of the yaws [rad] of all quaternions, beside the normalised inputs that they were computed from."""
@@ -15,16 +16,13 @@ OBS_YAW = "observation.bhd_yaw"
 
 @ProcessorStepRegistry.register(name="bhd_yaw_processor")
 @dataclass
-class YawProcessorStep(ObservationProcessorStep):
+class YawProcessorStep(TrainedStep):
     """Computes the yaws of quaternions before the normaliser changes them.
 
     Attributes:
         state: columns of `observation.state` at which a quaternion wxyz begins.
         environment: likewise of `observation.environment_state`.
     """
-
-    is_elementwise: ClassVar[bool] = True
-    """What is beside it in a batch changes nothing."""
 
     state: list[int] = field(default_factory=list)
     environment: list[int] = field(default_factory=list)
@@ -40,16 +38,6 @@ class YawProcessorStep(ObservationProcessorStep):
         if parts and len(parts) == len(self.state) + len(self.environment):
             observation[OBS_YAW] = torch.stack(parts, dim=-1)
         return observation
-
-    def get_config(self) -> dict[str, Any]:
-        """Return what the step is made from again."""
-        return {"state": list(self.state), "environment": list(self.environment)}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Return the features unchanged: what is added is not a feature of the dataset."""
-        return features
 
 
 def yaw(quaternions: Tensor) -> Tensor:

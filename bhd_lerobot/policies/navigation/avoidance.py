@@ -1,7 +1,6 @@
 """The rule of the articles: drive until something is near in front, then turn left."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -43,11 +42,7 @@ class AvoidanceConfig(BrainConfig):
 
 
 class AvoidanceBrain(ConfiguredBrain):
-    """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop.
-
-    Args:
-        config: the parameters; the articles' if None.
-    """
+    """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop."""
 
     name = "avoidance"
     robot_kind = "base"
@@ -66,9 +61,6 @@ class AvoidanceBrain(ConfiguredBrain):
         self._front = np.abs(angles) <= math.radians(self.config.front_sector_deg) + 1e-9
         self._forward, self._turn = find_columns(robot.action_names, ("x.vel", "theta.vel"), self.name, "action")
         self._width = len(robot.action_names)
-
-    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
-        """Nothing to forget: the rule has no memory."""
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
         """Return the twist, shape (n, actions)."""

@@ -124,10 +124,7 @@ def _rate(radius: Array, ratio: float, half_track: float) -> Array:
 def make_paths(full_speed: float, rim_speed: float, footprint: Footprint) -> Paths:
     """Return the paths of all families.
 
-    Args:
-        full_speed: forward speed when driving straight [m/s].
-        rim_speed: highest speed of a wheel's rim [m/s].
-        footprint: of the robot.
+    `full_speed`: forward speed when driving straight [m/s]. `rim_speed`: highest speed of a wheel's rim [m/s].
     """
     steps: list[int] = []
     radius: list[float] = []
@@ -150,12 +147,8 @@ def make_paths(full_speed: float, rim_speed: float, footprint: Footprint) -> Pat
 class ClearanceTable:
     """How far each path is free, given a scan.
 
-    Args:
-        paths: the paths.
-        sectors: number of readings in a scan, evenly spaced from straight ahead, counter-clockwise.
-        spread: a reading may lie this far to either side of its sector's middle [rad].
-        levels: the room that is required, the most first.
-        range_max: the largest range that can be looked up [m].
+    `spread`: a reading may lie this far to either side of its sector's middle [rad]. `range_max`: the largest range
+    that can be looked up [m].
     """
 
     def __init__(self, paths: Paths, sectors: int, spread: float, levels: tuple[Level, ...], range_max: float) -> None:

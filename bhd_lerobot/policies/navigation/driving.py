@@ -46,11 +46,7 @@ class DrivingConfig(BrainConfig):
     range_max_m: float = 3.5
 
     def __post_init__(self) -> None:
-        """Check the parameters; no parameter of a brain that drives is negative.
-
-        Raises:
-            ConfigError: names the parameter, and what would be valid.
-        """
+        """Check the parameters; no parameter of a brain that drives is negative."""
         check_positive("brain", self, ("forward_speed", "rim_speed", "turn_speed", "settle_s", "range_max_m"))
         check_positive("brain", self, asdict(self), or_zero=True)
         if self.forward_speed > self.rim_speed:
@@ -78,11 +74,7 @@ class DrivingBrain(ConfiguredBrain):
     _n: int
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the scan and the twist, and prepare the look-up table for this shape and this number of beams.
-
-        Raises:
-            ConfigError: a feature is missing, or the robot's shape is not known.
-        """
+        """Find the scan and the twist, and prepare the look-up table for this shape and this number of beams."""
         config = self.config
         if not isinstance(robot.body, MobileBase) or robot.body.lidar is None:
             raise ConfigError(

@@ -68,9 +68,6 @@ class GapFollowerBrain(DrivingBrain):
 
     It needs the scan and the measured twist. Where no path leaves the margin, it asks for less room, drives slower, and
     at last turns on the spot or backs off.
-
-    Args:
-        config: the parameters.
     """
 
     name = "gap_follower"

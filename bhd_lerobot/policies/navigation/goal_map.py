@@ -31,11 +31,7 @@ _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 class GoalMap:
-    """Maps of n robots.
-
-    Args:
-        n: how many.
-    """
+    """Maps of n robots."""
 
     def __init__(self, n: int) -> None:
         self._seen = np.zeros((n, _SIDE, _SIDE), np.bool_)
@@ -94,16 +90,7 @@ class GoalMap:
         return np.where(known, left * np.float32(_UNIT), np.hypot(x, y).astype(np.float32) + np.float32(_FAR * _UNIT))
 
     def plan(self, sim: int, x: float, y: float) -> bool:
-        """Find the ways to the goal in one map.
-
-        Args:
-            sim: the map.
-            x: where the robot is, in the goal's frame [m].
-            y: likewise.
-
-        Returns:
-            Whether there is one from where the robot is.
-        """
+        """Find the ways to the goal in one map; return whether there is one from the robot's place [m]."""
         self.news[sim] = 0
         self.blocked[sim] = False
         self._way[sim] = False

@@ -81,9 +81,6 @@ class NavigatorBrain(DrivingBrain):
 
     It needs the scan, the measured twist, and the goal in the robot's frame, as the task navigate reports it. It
     remembers what it saw up to 10 m from the goal.
-
-    Args:
-        config: the parameters.
     """
 
     name = "navigator"

@@ -17,19 +17,13 @@ _SECTORS = 120  # more beams than this are merged
 class ScanReader:
     """Reads the scans of n robots.
 
+    `limits`: a reading outside them is not valid [m]; a beam without a return reads exactly the upper one.
+
     Attributes:
         columns: where the scan lies among the observation's floats.
         angles: of the beams in the robot's frame [rad], shape (beams,).
         sectors: number of sectors, evenly spaced from straight ahead, counter-clockwise.
         spread: a reading may lie this far to either side of its sector's middle [rad].
-
-    Args:
-        names: the observation's features.
-        who: name of the brain, for messages.
-        limits: a reading outside them is not valid [m]; a beam without a return reads exactly the upper one.
-
-    Raises:
-        ConfigError: there is no scan, or one of too few beams.
     """
 
     def __init__(self, names: Sequence[str], who: str, limits: tuple[float, float]) -> None:

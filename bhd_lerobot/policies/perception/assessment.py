@@ -15,10 +15,6 @@ NUMBERS = ("chosen", "wrong", "error_m", "in_50", "in_90", "objects", "seen", "n
 def assess(plan: Mapping[str, Any], scene: TableScene) -> dict[str, float]:
     """Return how well a brain with a perception of its own saw; nothing of one without.
 
-    Args:
-        plan: the brain's, with what was `seen` and which of it was `chosen`.
-        scene: what stood on the table, whatever the task told of it.
-
     Returns:
         `chosen`: 1 if it found an object that the instruction means, else 0; `wrong`: 1 if that was another one;
         `error_m`: how far what it chose is from where it said [m]; `in_50` and `in_90`: whether that is within the

@@ -13,15 +13,10 @@ Region = tuple[int, int, int, int]
 
 
 class Projection:
-    """A pinhole camera and its image size.
+    """A pinhole camera and the size of its images [px].
 
     Attributes:
         position: of its centre in the base frame [m].
-
-    Args:
-        view: where the camera stands.
-        width: of its images [px].
-        height: of its images [px].
     """
 
     def __init__(self, view: CameraView, width: int, height: int) -> None:
@@ -70,14 +65,7 @@ class Projection:
     def region(self, low: tuple[float, ...], high: tuple[float, ...], margin: float, multiple: int) -> Region:
         """Return the part of the image in which a box of the base frame is seen.
 
-        Args:
-            low: smallest x, y, z of the box [m].
-            high: largest [m].
-            margin: what is added on every side, as a share of the image's width.
-            multiple: its width and height are multiples of this [px].
-
-        Raises:
-            ValueError: the box is not seen.
+        The box is from `low` to `high`, x, y, z [m]; width and height of the part are a multiple of `multiple` [px].
         """
         corners = self.pixels(np.array(list(itertools.product(*zip(low, high, strict=True)))))
         margin *= self.width

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot.utils.constants import OBS_ENV_STATE
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.perception.camera import Projection, Region
+from bhd_lerobot.policies.trained import TrainedConfig, names_of
 
 STRIDE = 4  # [px] of the image for each cell of the grid that the network answers on
 LABELS = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
@@ -20,7 +19,7 @@ LABELS = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for na
 
 @PreTrainedConfig.register_subclass("bhd_perception")
 @dataclass
-class PerceptionConfig(PreTrainedConfig):
+class PerceptionConfig(TrainedConfig):
     """Configuration of the policy type ``bhd_perception``.
 
     It reads one image. The true poses in `observation.environment_state` are what it learns to say, never an input.
@@ -78,16 +77,8 @@ class PerceptionConfig(PreTrainedConfig):
     optimizer_grad_clip_norm: float = 5.0
     scheduler_warmup_steps: int = 250
 
-    # LeRobot's class says so as well, but without types.
-    input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
-    output_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
-
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
         for name, count in (("camera_position", 3), ("camera_target", 3), ("area", 4)):
             values = getattr(self, name)
@@ -100,30 +91,12 @@ class PerceptionConfig(PreTrainedConfig):
                 f"policy.camera_position is {self.camera_position} and policy.camera_target {self.camera_target}; the "
                 "camera must stand above the table, and not look straight down."
             )
-        for name, low, high in (
-            ("camera_fovy", 0.0, 180.0),
-            ("object_height", 0.0, math.inf),
-            ("least_presence", 0.0, 1.0),
-        ):
-            if not low < getattr(self, name) < high:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be between {low:g} and {high:g}.")
-        for name in ("margin", "brightness", "recolour", "tint", "zoom"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be from 0 to below 1.")
-        for name in ("channels", "hidden", "context"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
-
-    @property
-    def image_key(self) -> str:
-        """The image's key in datasets and batches."""
-        return f"{OBS_IMAGES}.{self.camera}"
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the image [px]."""
-        _, height, width = (self.input_features or {})[self.image_key].shape
-        return int(width), int(height)
+        self.check_numbers("between 0 and 180", lambda number: 0 < number < 180, "camera_fovy")
+        self.check_numbers("positive and finite", lambda number: 0 < number < math.inf, "object_height")
+        self.check_numbers("between 0 and 1", lambda number: 0 < number < 1, "least_presence")
+        shares = ("margin", "brightness", "recolour", "tint", "zoom")
+        self.check_numbers("from 0 to below 1", lambda number: 0 <= number < 1, *shares)
+        self.check_numbers("at least 1", lambda number: number >= 1, "channels", "hidden", "context")
 
     @property
     def view(self) -> CameraView:
@@ -138,11 +111,7 @@ class PerceptionConfig(PreTrainedConfig):
 
     @property
     def region(self) -> Region:
-        """The part of the image in which objects may be.
-
-        Raises:
-            ConfigError: the camera sees nothing of the area.
-        """
+        """The part of the image in which objects may be."""
         x0, y0, x1, y1 = self.area
         try:
             return self.projection.region((x0, y0, 0.0), (x1, y1, self.object_height), self.margin, 2 * STRIDE)
@@ -157,35 +126,9 @@ class PerceptionConfig(PreTrainedConfig):
         """Only the present image."""
         return None
 
-    @property
-    def action_delta_indices(self) -> None:
-        """No actions."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        """Return AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig:
-        """Return a warm-up, and a cosine to 0."""
-        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
-
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are, and keep that as output; LeRobot's `make_policy` calls it.
-
-        Raises:
-            ConfigError: it does not.
-        """
-        names = (features.get(OBS_ENV_STATE) or {}).get("names") or []
+        """Check that the dataset says where objects are, and keep that as output; LeRobot's `make_policy` calls it."""
+        names = names_of(features, OBS_ENV_STATE)
         if tuple(names) != LABELS:
             raise ConfigError(
                 f"bhd_perception learns from the true poses of objects ({LABELS[0]}, {LABELS[1]}, …, {LABELS[-1]} in "
@@ -196,27 +139,8 @@ class PerceptionConfig(PreTrainedConfig):
         labels = PolicyFeature(FeatureType.ENV, (len(LABELS),))
         self.output_features = {**(self.output_features or {}), OBS_ENV_STATE: labels}
 
-    def known_features(self) -> dict[str, PolicyFeature]:
-        """Return all features, among which the image is.
-
-        Raises:
-            ConfigError: it is not.
-        """
-        known = {**(self.input_features or {}), **(self.output_features or {})}
-        cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
-        if self.image_key not in cameras:
-            raise ConfigError(
-                f"policy.camera is {self.camera!r}, and the dataset has no {self.image_key!r}. It has "
-                f"{', '.join(cameras) or 'no images'}. Record it with --robot.camera=true, or set --policy.camera."
-            )
-        return known
-
     def validate_features(self) -> None:
-        """Keep the image as input and the labels as output.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
+        """Keep the image as input and the labels as output."""
         known = self.known_features()
         if OBS_ENV_STATE not in known or tuple(known[OBS_ENV_STATE].shape) != (len(LABELS),):
             raise ConfigError(

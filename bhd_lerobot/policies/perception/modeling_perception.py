@@ -77,10 +77,6 @@ class PerceptionPolicy(PreTrainedPolicy):
     In evaluation mode, `forward` also calibrates: the stated errors are scaled so that of the errors on what was not
     learned from, the wanted share lies within the stated radius (A. Angelopoulos and S. Bates, "A gentle introduction
     to conformal prediction", 2021).
-
-    Args:
-        config: its shape and its features.
-        kwargs: what LeRobot passes to every policy; nothing of it is needed.
     """
 
     config_class = PerceptionConfig
@@ -271,17 +267,7 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def fit_camera(self, batches: Sequence[dict[str, Tensor]]) -> str:
-        """Find where the camera stands now, and look from there: what a network says of an image need not change much.
-
-        Args:
-            batches: images and true poses, as `forward` takes them.
-
-        Returns:
-            what was found, in words.
-
-        Raises:
-            ConfigError: too little of what is there was seen.
-        """
+        """Find where the camera stands now, look from there, and return what was found, in words."""
         self.eval()
         config, before = self.config, self.config.view
         for _ in range(_FITS):
@@ -316,9 +302,6 @@ class PerceptionPolicy(PreTrainedPolicy):
 
         Args:
             images: shape (batch, 3, height, width), 0 to 1.
-
-        Raises:
-            ConfigError: the policy was not calibrated, or its weights are broken.
         """
         if not bool(torch.isfinite(self.factor)):
             raise ConfigError(
@@ -334,30 +317,18 @@ class PerceptionPolicy(PreTrainedPolicy):
         return self._found(answers, float(self.factor))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Raise an error: there are no actions.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Raise an error: there are no actions."""
         raise ConfigError(
             "bhd_perception sees objects and gives no actions. Use it in a brain: --brain.type=language "
             "--brain.perception.path=CHECKPOINT."
         )
 
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Raise an error: there are no actions.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Raise an error: there are no actions."""
         return self.predict_action_chunk(batch)
 
     def checked(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return the images of a batch.
-
-        Raises:
-            ConfigError: they are missing, or of another size than those that it was trained on.
-        """
+        """Return the images of a batch."""
         key, size = self.config.image_key, self.config.image_size
         image = batch.get(key)
         if image is None:

@@ -68,21 +68,7 @@ class PerceivedObject(SeenObject):
 
 
 class Perceiver:
-    """Finds objects in images.
-
-    Attributes:
-        camera: name of the camera that it looks through.
-        image_size: width and height of its images [px].
-        dataset: what it was trained on.
-        path: which checkpoint it is, without where that lies on this machine.
-        weights: which weights it has.
-
-    Args:
-        options: which checkpoint, and where it runs.
-
-    Raises:
-        ConfigError: the checkpoint cannot be used; the message says why.
-    """
+    """Finds objects in images."""
 
     def __init__(self, options: PerceptionOptions) -> None:
         from bhd_lerobot.policies.learned.policy import load_perception
@@ -102,9 +88,6 @@ class Perceiver:
 
         Args:
             cameras: image shapes (height, width, channels) [px] by camera name.
-
-        Raises:
-            ConfigError: they are not; the message names both sides and the remedy.
         """
         width, height = self.image_size
         if self.camera not in cameras:
@@ -123,13 +106,7 @@ class Perceiver:
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
         """Return the objects that one robot's camera shows, the surest first.
 
-        Args:
-            images: by camera, shape (n, height, width, 3), RGB.
-            sim: the robot.
-
-        Raises:
-            ConfigError: there is no such camera, or its images have another size.
-            PerceptionError: the image shows nothing at all.
+        `images`: by camera, shape (n, height, width, 3), RGB.
         """
         import torch
 

@@ -24,10 +24,7 @@ def matched(found: "list[Detections]", labels: Labels, camera: Projection) -> tu
 
     What was found belongs to the object that is nearest in the image and likeliest in colour.
 
-    Args:
-        found: in each image.
-        labels: what is true of each.
-        camera: where the camera was taken to be when that was found.
+    `camera`: where the camera was taken to be when that was found.
     """
     places, pixels = [], []
     for row, seen in enumerate(found):

@@ -1,5 +1,6 @@
 """Configuration of `bhd_pixels`: an episode's first image, an instruction and the robot's state in, actions out."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,10 +9,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.mlp.configuration_mlp import check_residual, matching_columns
-from bhd_lerobot.policies.mlp.objects_mlp import TOOL
-from bhd_lerobot.policies.mlp.residual_mlp import residual_columns
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
+from bhd_lerobot.policies.trained import TOOL, names_of
 
 FIRST = -100_000
 """Frames back in time: before every episode, where datasets give the first frame."""
@@ -76,25 +75,13 @@ class PixelsConfig(PerceptionConfig):
     optimizer_grad_clip_norm: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         super().__post_init__()
-        for name in ("chunk_size", "n_action_steps", "longest_instruction", "text_dim", "n_cells", "n_heads"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
-        if self.n_action_steps > self.chunk_size:
-            raise ConfigError(
-                f"policy.n_action_steps is {self.n_action_steps}, but only policy.chunk_size = {self.chunk_size} "
-                "actions are predicted."
-            )
-        if min(self.hidden_dims, default=1) < 1:
-            raise ConfigError(f"policy.hidden_dims is {self.hidden_dims}; every width must be at least 1.")
-        for name in ("min_std", "pointing_weight", "perception_weight"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+        sizes = ("longest_instruction", "text_dim", "n_cells", "n_heads", "hidden_dims")
+        self.check_numbers("at least 1", lambda number: number >= 1, "chunk_size", "n_action_steps", *sizes)
+        weights = ("min_std", "pointing_weight", "perception_weight")
+        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, *weights)
+        self.check_chunk()
 
     @property
     def is_frozen(self) -> bool:
@@ -111,47 +98,22 @@ class PixelsConfig(PerceptionConfig):
         """Of the image only the first frame, where a loader can give of each observation other frames."""
         return {self.image_key: [FIRST]}
 
-    @property
-    def action_delta_indices(self) -> list[int]:  # type: ignore[override]
-        """Which actions it predicts, the present frame's being 0."""
-        return list(range(self.chunk_size))
-
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are, and find what is to be ignored by its name.
-
-        Raises:
-            ConfigError: it does not, or there is no such name.
-        """
+        """Check that the dataset says where objects are, and find what is to be ignored by its name."""
         super().set_dataset_feature_metadata(features)
-        names, actions = (list((features.get(key) or {}).get("names") or []) for key in (OBS_STATE, ACTION))
-        if self.ignore and not self.ignored_columns:
-            self.ignored_columns = matching_columns(self.ignore, names)
-        if self.residual and not self.residual_columns:
-            self.residual_columns = residual_columns(self.residual, actions, names)
+        self.find_columns(features)
+        names = names_of(features, OBS_STATE)
         if not self.tool_columns and set(TOOL) <= set(names):
             self.tool_columns = [names.index(name) for name in TOOL]
 
     def validate_features(self) -> None:
-        """Keep image and state as inputs, actions and, to learn from, labels as outputs.
-
-        Raises:
-            ConfigError: the dataset lacks one of them.
-        """
+        """Keep image and state as inputs, actions and, to learn from, labels as outputs."""
         known = self.known_features()
         for key in (OBS_STATE, ACTION):
             if key not in known or len(known[key].shape) != 1:
                 raise ConfigError(f"bhd_pixels needs {key}, a vector; the dataset has {', '.join(known)}.")
         width = int(known[OBS_STATE].shape[0])
-        if not all(0 <= column < width for column in self.ignored_columns):
-            raise ConfigError(
-                f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
-            )
-        if self.ignore and not self.ignored_columns:
-            raise ConfigError(
-                f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
-                "policy with the metadata of its dataset, or give policy.ignored_columns."
-            )
-        check_residual(self, width)
+        self.check_columns(width)
         self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
         self.output_features = {key: known[key] for key in (ACTION, OBS_ENV_STATE) if key in known}
         _ = self.region

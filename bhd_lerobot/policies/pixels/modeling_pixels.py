@@ -49,9 +49,6 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         config: its shape and its features.
         initialise: begin with the weights of `config.perception`; not where a checkpoint's own follow.
         kwargs: what LeRobot passes to every policy; of it `dataset_stats` are used, for `config.residual`.
-
-    Raises:
-        ConfigError: `config.perception` is no checkpoint of a ``bhd_perception`` that looks at the same images.
     """
 
     config_class = PixelsConfig
@@ -190,9 +187,6 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         Args:
             batch: `config.image_key`, shape (batch, 3, height, width), and `observation.language.tokens`, shape (batch,
                 bytes).
-
-        Raises:
-            ConfigError: one of them is missing, or the images are of another size than those that it was trained on.
         """
         self.eval()
         return self._see(self._cells(self._first(batch))[0], self._tokens(batch))[0]
@@ -204,9 +198,6 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         Args:
             seen: what `see` returned in the episode's first frame.
             batch: `observation.state`, normalised, shape (batch, width).
-
-        Raises:
-            ConfigError: there is no state.
         """
         self.eval()
         if OBS_STATE not in batch:
@@ -214,11 +205,7 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         return self._act(seen, batch[OBS_STATE])
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return normalised actions, shape (batch, chunk_size, actions); of the images only the first since `reset`.
-
-        Args:
-            batch: what `see` and `act` take.
-        """
+        """Return normalised actions, shape (batch, chunk_size, actions); of the images only the first since `reset`."""
         if self._remembered is None:
             self._remembered = self.see(batch)
         return self.act(self._remembered, batch)

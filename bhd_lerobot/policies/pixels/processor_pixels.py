@@ -2,57 +2,34 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.lerobot_types import PolicyAction, TransitionKey
-from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
+from lerobot.lerobot_types import TransitionKey
+from lerobot.processor import ProcessorStepRegistry
 from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.mlp.processor_mlp import floored
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
-from bhd_lerobot.stock import make_default_policy_processor_steps, make_policy_processor_pipelines
+from bhd_lerobot.policies.trained_steps import Pipelines, Stats, TrainedStep, make_pipelines
 
 
 @ProcessorStepRegistry.register(name="bhd_instruction_processor")
 @dataclass
-class InstructionProcessorStep(ObservationProcessorStep):
-    """Writes instructions as bytes: every language, no vocabulary, nothing to download.
+class InstructionProcessorStep(TrainedStep):
+    """Writes instructions as bytes: every language, no vocabulary, nothing to download."""
 
-    Attributes:
-        length: bytes of the longest instruction, in UTF-8.
-    """
-
-    is_elementwise: ClassVar[bool] = True
-    """What is beside it in a batch changes nothing."""
-
-    length: int = 128
+    length: int = 128  # bytes, in UTF-8
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation with the instructions, in small letters: 1 + each byte, then zeros; shape (b, length).
-
-        Raises:
-            ConfigError: there is no instruction, or a longer one.
-        """
+        """Return the observation with the instructions, in small letters: 1 + each byte, then zeros; (b, length)."""
         task = (self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
         if task is None:
             raise ConfigError("bhd_pixels acts on an instruction, and the batch has none (`task`).")
         texts = [task] if isinstance(task, str) else list(task)
         tokens = torch.stack([_tokens(text, self.length) for text in texts])
         return {**observation, OBS_LANGUAGE_TOKENS: tokens}
-
-    def get_config(self) -> dict[str, Any]:
-        """Return what the step is made from again."""
-        return {"length": self.length}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Return the features unchanged: what is added is not a feature of the dataset."""
-        return features
 
 
 @lru_cache(maxsize=4096)
@@ -69,20 +46,6 @@ def _tokens(text: str, length: int) -> Tensor:
     return torch.tensor([byte + 1 for byte in encoded] + [0] * (length - len(encoded)))
 
 
-def make_bhd_pixels_pre_post_processors(
-    config: PixelsConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
-]:
-    """Return LeRobot's pipelines, with the step that writes instructions as bytes.
-
-    Args:
-        config: of the policy.
-        dataset_stats: mean and standard deviation of every feature.
-    """
-    stats = floored(dataset_stats, config.min_std)
-    steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
-    before = [steps.rename_observations, steps.add_batch_dim, InstructionProcessorStep(config.longest_instruction)]
-    return make_policy_processor_pipelines(
-        [*before, steps.to_device, steps.normalize], [steps.unnormalize, steps.to_cpu]
-    )
+def make_bhd_pixels_pre_post_processors(config: PixelsConfig, dataset_stats: Stats | None = None) -> Pipelines:
+    """Return LeRobot's pipelines, with the step that writes instructions as bytes."""
+    return make_pipelines(config, dataset_stats, first=[InstructionProcessorStep(config.longest_instruction)])

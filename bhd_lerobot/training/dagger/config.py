@@ -84,11 +84,7 @@ class AggregationConfig:
         return self.expert, self.learner, self.policy, self.evaluation
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         if self.algorithm != ALGORITHM:
             raise ConfigError(unknown_name("algorithm", self.algorithm, (ALGORITHM, "ppo")))
         for name, least in (
@@ -105,16 +101,7 @@ class AggregationConfig:
 
 @dataclass(frozen=True)
 class Stages:
-    """What the configurations of the programs say.
-
-    Attributes:
-        expert: the type of the expert's brain.
-        brain: all of the expert's brain, as plain values.
-        robot: the type of its robot.
-        fps: frames a second [Hz].
-        has_advice: whether the expert's action is recorded in every frame.
-        steps: of a training.
-    """
+    """What the configurations of the programs say."""
 
     expert: str
     brain: dict[str, Any]
@@ -125,11 +112,7 @@ class Stages:
 
 
 def read_stages(config: AggregationConfig) -> Stages:
-    """Return what the configurations say, so that what is wrong in one of them is known before the first round.
-
-    Raises:
-        ConfigError: one of them cannot be used.
-    """
+    """Return what the configurations say, so that what is wrong in one of them is known before the first round."""
     expert = configuration.parse(RecordConfig, command(config.expert, {}))
     learner = configuration.parse(RecordConfig, command(config.learner, {}))
     kinds = [one.brain.get_choice_name(type(one.brain)) for one in (expert, learner)]
@@ -166,11 +149,7 @@ def read_stages(config: AggregationConfig) -> Stages:
 
 
 def _check_same(expert: RecordConfig, other: RecordConfig | EvalConfig, who: str, expert_file: str) -> None:
-    """Refuse a program that has another robot, frame rate or kind of task than the expert.
-
-    Raises:
-        ConfigError: names what differs.
-    """
+    """Refuse a program that has another robot, frame rate or kind of task than the expert."""
     for name, theirs, ours in (
         ("robot.type", other.robot.type, expert.robot.type),
         ("the frame rate", other.robot.fps, expert.robot.fps),
@@ -184,11 +163,7 @@ def _check_same(expert: RecordConfig, other: RecordConfig | EvalConfig, who: str
 
 
 def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:
-    """Return the command line of a program: its file, what a round needs, and the options of the stage.
-
-    Raises:
-        ConfigError: an option of the stage is one that a round sets itself.
-    """
+    """Return the command line of a program: its file, what a round needs, and the options of the stage."""
     # The curve compares with the expert that teaches, not with one that another option changed.
     if taken := sorted(name for name in _names(stage) if name in OWN or name.startswith("brains.expert.")):
         raise ConfigError(
@@ -204,11 +179,7 @@ def _names(stage: StageConfig) -> set[str]:
 
 
 def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
-    """Return what a command line asks for.
-
-    Raises:
-        ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
-    """
+    """Return what a command line asks for."""
     config = configuration.parse(AggregationConfig, arguments)
     given = configuration.read_overrides(arguments)
     file = Path(str(given.get(configuration.CONFIG_PATH, ""))).expanduser()
@@ -221,9 +192,6 @@ def kept(folder: Path) -> AggregationConfig | None:
     """Return the configuration that a folder's rounds were made with; None if there is none.
 
     An option that was not there yet when they were made has its default.
-
-    Raises:
-        ConfigError: it cannot be read, or has what is no option.
     """
     file = folder / CONFIG
     if not file.is_file():

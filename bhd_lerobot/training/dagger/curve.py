@@ -11,14 +11,7 @@ _POLICY, _EXPERT, _SHARE = "#1f6f8b", "#c0392b", "#8a8478"
 
 
 def draw_curve(rows: Sequence[Mapping[str, Any]], expert: Mapping[str, Any], path: Path, heading: str) -> None:
-    """Draw success and score of each round's policy with their 95 % intervals, and how much the expert had to drive.
-
-    Args:
-        rows: of `rounds.json`, one a round.
-        expert: the expert's own `success` and `score`.
-        path: where the image goes.
-        heading: what stands above it.
-    """
+    """Draw success and score of each round's policy with their 95 % intervals, and how much the expert had to drive."""
     figure = Figure(figsize=(7.5, 8.0), layout="constrained")
     figure.suptitle(heading, fontsize=11)
     axes = figure.subplots(3, 1, sharex=True)

@@ -65,11 +65,7 @@ def _repeated(root: Path) -> list[int]:
 
 
 class _StoppedError(Exception):
-    """A program ended otherwise than well.
-
-    Attributes:
-        status: its exit status.
-    """
+    """A program ended otherwise than well."""
 
     def __init__(self, status: int) -> None:
         super().__init__(status)
@@ -77,16 +73,7 @@ class _StoppedError(Exception):
 
 
 def train(config: AggregationConfig, console: Console | None = None) -> int:
-    """Do the rounds that are not done yet; return the exit status.
-
-    Args:
-        config: of the rounds.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or is another than that of the folder; there is no dataset where
-            one is to be.
-    """
+    """Do the rounds that are not done yet; return the exit status."""
     stages = read_stages(config)
     _check_data(config, stages)
     folder = Path(config.output_dir).expanduser()
@@ -102,12 +89,7 @@ def train(config: AggregationConfig, console: Console | None = None) -> int:
 
 
 def _check_data(config: AggregationConfig, stages: Stages) -> None:
-    """Check datasets that were recorded before, so that nothing is recorded in vain; merging checks their features.
-
-    Raises:
-        ConfigError: one is of another robot or frame rate.
-        DatasetError: there is none.
-    """
+    """Check datasets that were recorded before, so that nothing is recorded in vain; merging checks their features."""
     for root in config.data:
         found = dataset_info(Path(root).expanduser())
         if (found.robot_type, found.fps) != (stages.robot, stages.fps):
@@ -127,10 +109,6 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
     """Note the configuration in the folder, and what the files in it say.
 
     Refuse one that differs in more than how many rounds there are.
-
-    Raises:
-        ConfigError: it differs, or the folder holds something else.
-        BhdError: the folder cannot be written.
     """
     before = kept(folder)
     if before is None and folder.exists() and any(folder.iterdir()):
@@ -150,15 +128,6 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
     """Refuse a configuration other than that of the rounds in a folder.
 
     Of a configuration file its content counts, and of a dataset which folder it is, not by which path it is named.
-
-    Args:
-        folder: of the rounds.
-        before: their configuration.
-        config: the requested one.
-        files: what the requested one's files say, by their paths.
-
-    Raises:
-        ConfigError: names what differs, with both values.
     """
     known = read_file(folder / FILES) if (folder / FILES).exists() else {}
     for one in fields(config):

@@ -8,7 +8,6 @@ __all__ = [
     "learner",
     "log",
     "parts",
-    "privileged",
     "train",
     "validation",
 ]

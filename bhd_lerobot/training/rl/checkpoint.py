@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 
-from bhd_lerobot.errors import ConfigError, quoted
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.stock import load_rng_state, save_rng_state
 from bhd_lerobot.training.checkpoint import writing
 from bhd_lerobot.training.rl.parts import RlParts
@@ -15,7 +15,6 @@ from bhd_lerobot.training.rl.parts import RlParts
 BEST = "best"
 LEARNER, RUN = "learner.zip", "run.json"
 """In `training_state`: parameters of actor, critic and optimizer, in stable-baselines3's format; where the run was."""
-_OLD_LEARNER = "learner.pt"
 
 
 def folder_of(output_dir: Path, step: int) -> Path:
@@ -23,18 +22,8 @@ def folder_of(output_dir: Path, step: int) -> Path:
     return output_dir / CHECKPOINTS_DIR / f"{step:09d}"
 
 
-def save(output_dir: Path, parts: RlParts, learner: Any, run: dict[str, Any]) -> Path:
-    """Write a checkpoint, point `last` at it, and return its folder.
-
-    Args:
-        output_dir: the run's folder.
-        parts: the policy, whose weights are the learner's, and what belongs to it.
-        learner: the `WarmedUpPPO`.
-        run: state of the run, JSON values.
-
-    Raises:
-        BhdError: it cannot be written; those before it are intact.
-    """
+def save(output_dir: Path, parts: RlParts, learner: Any, next_episode: int) -> Path:
+    """Write a checkpoint, point `last` at it, and return its folder."""
     from stable_baselines3.common.save_util import save_to_zip_file
 
     final = folder_of(output_dir, learner.num_timesteps)
@@ -44,18 +33,12 @@ def save(output_dir: Path, parts: RlParts, learner: Any, run: dict[str, Any]) ->
         state.mkdir()
         save_to_zip_file(state / LEARNER, params=learner.get_parameters())
         save_rng_state(state)
-        (state / RUN).write_text(json.dumps(run), encoding="utf-8")
+        (state / RUN).write_text(json.dumps({"next_episode": next_episode}), encoding="utf-8")
     return final
 
 
 def export(folder: Path, parts: RlParts, log_std: torch.Tensor) -> None:
-    """Write the policy in LeRobot's form: configuration, weights, processors, and the contract.
-
-    Args:
-        folder: where it goes.
-        parts: the policy and what belongs to it.
-        log_std: the learner's exploration noise, shape (actions,).
-    """
+    """Write the policy in LeRobot's form: configuration, weights, processors, and the contract."""
     folder.mkdir(parents=True, exist_ok=True)
     if parts.actor.log_std is not None:
         with torch.no_grad():
@@ -66,31 +49,17 @@ def export(folder: Path, parts: RlParts, log_std: torch.Tensor) -> None:
     parts.contract.save(folder)
 
 
-def read_run(output_dir: Path) -> dict[str, Any]:
-    """Return the state of a run in its last checkpoint.
-
-    Raises:
-        ConfigError: there is none, or it is of version 0.1.
-    """
-    state = _last(output_dir) / TRAINING_STATE_DIR
+def read_next_episode(output_dir: Path) -> int:
+    """Return the number of the episode that a resumed run begins with."""
     try:
-        run = json.loads((state / RUN).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        run = json.loads((_last(output_dir) / TRAINING_STATE_DIR / RUN).read_text(encoding="utf-8"))
+        return int(run["next_episode"])
+    except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"There is no run to resume in {output_dir}: {error}") from error
-    if (state / _OLD_LEARNER).exists():
-        raise ConfigError(
-            f"The run in {output_dir} is of version 0.1, whose {_OLD_LEARNER} cannot be read any more. Start a new "
-            f"run from its policy: --start_from={quoted(output_dir)}."
-        )
-    return run
 
 
 def load(output_dir: Path, learner: Any) -> None:
-    """Load the last checkpoint of a run into a learner.
-
-    Raises:
-        ConfigError: there is none that fits.
-    """
+    """Load the last checkpoint of a run into a learner."""
     folder = _last(output_dir)
     try:
         learner.set_parameters(str(folder / TRAINING_STATE_DIR / LEARNER), device="cpu")  # tensors only, no pickle

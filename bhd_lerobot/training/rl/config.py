@@ -28,26 +28,18 @@ _CHOICES = {
 }
 # Not among them: that an expert drives ends nothing, and of a failure without a cause only a person says so.
 _EVENTS = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION, Event.FAILURE))
-_LEAST = {
-    "steps": 1,
-    "env.n_envs": 1,
-    "env.threads": 1,
-    "threads": 1,
-    "ppo.n_steps": 2,
-    "ppo.batch_size": 2,
-    "ppo.n_epochs": 1,
-    "validation.freq": 1,
-    "validation.n_episodes": 1,
-    "validation.n_envs": 1,
-    "validation.confirm": 0,
-    "validation.candidates": 1,
-    "validation.seed": 0,
-    "critic_warmup": 0,
-    "seed": 0,
-    "policy.critic_dims": 1,
-}
 # What numbers must be, and which of them.
 _RANGES = (
+    (
+        "at least 1",
+        lambda number: number >= 1,
+        (
+            *("steps", "threads", "env.n_envs", "env.threads", "ppo.n_epochs", "policy.critic_dims"),
+            *("validation.freq", "validation.n_episodes", "validation.n_envs"),
+        ),
+    ),
+    ("at least 2", lambda number: number >= 2, ("ppo.n_steps", "ppo.batch_size")),
+    ("at least 0", lambda number: number >= 0, ("seed", "validation.seed", "critic_warmup")),
     ("between 0 and 1", lambda number: 0 <= number <= 1, ("ppo.gamma", "ppo.gae_lambda")),
     (
         "positive and finite",
@@ -59,7 +51,7 @@ _RANGES = (
         lambda number: 0 <= number < math.inf,
         ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad"),
     ),
-    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame")),
+    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame", "reward.events")),
 )
 
 
@@ -105,25 +97,9 @@ class RlPolicyConfig:
     privileged_critic: bool = False
 
     def actor(self) -> MlpConfig:
-        """Return the configuration of an actor that begins from nothing.
-
-        Raises:
-            ConfigError: a value that a `bhd_mlp` cannot have.
-        """
-        return MlpConfig(
-            n_obs_steps=self.n_obs_steps,
-            obs_stride=self.obs_stride,
-            chunk_size=1,
-            n_action_steps=1,
-            hidden_dims=list(self.hidden_dims),
-            activation=self.activation,
-            layer_norm=self.layer_norm,
-            feature_clip=self.feature_clip,
-            gaussian=True,
-            scan=copy.deepcopy(self.scan),
-            device="cpu",
-            push_to_hub=False,
-        )
+        """Return the configuration of an actor that begins from nothing."""
+        own = {name: value for name, value in copy.deepcopy(vars(self)).items() if "critic" not in name}
+        return MlpConfig(**own, chunk_size=1, n_action_steps=1, gaussian=True, device="cpu", push_to_hub=False)
 
 
 @dataclass
@@ -189,9 +165,7 @@ class RewardConfig:
 class ValidationConfig:
     """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
 
-    The best checkpoint is chosen among all that were saved, the policy that the run started with included. It is the
-    one that was best on the way; or, as the best of many is best by chance, too, the best of a few on further episodes,
-    which those few drive at the end.
+    The best checkpoint is the one that was best on them, the policy that the run started with included.
 
     Attributes:
         freq: environment steps between two validations.
@@ -199,8 +173,6 @@ class ValidationConfig:
         n_envs: how many run side by side.
         seed: run seed of these episodes, of the split `train`; another than the training's.
         select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``; of equals, the score.
-        confirm: further episodes that decide at the end between the best candidates; none if 0.
-        candidates: how many checkpoints drive them, those that were best on the way; the start does besides.
         rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
     """
 
@@ -209,8 +181,6 @@ class ValidationConfig:
     n_envs: int = 64
     seed: int = 777_001
     select: str = "score"
-    confirm: int = 0
-    candidates: int = 2
     rule: BrainConfig | None = None
 
 
@@ -228,8 +198,8 @@ class RlConfig:
         reward: what the learner gets.
         validation: how it is judged on the way.
         steps: environment steps, all environments together.
-        max_minutes: end after this time [min] even if `steps` are not done, but for the last validation; nothing: after
-            `steps` only.
+        max_minutes: end after this time [min], counted from the start of the command, even if `steps` are not done, but
+            for the last validation; nothing: after `steps` only.
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor; of a chunk, the first action counts.
         see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A
             clone must not see its own speed, because it would repeat it; who learns from what comes of it may.
@@ -262,11 +232,7 @@ class RlConfig:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         self._check_names()
         self._check_numbers()
         _ = self.policy.actor()
@@ -308,30 +274,18 @@ class RlConfig:
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
 
     def _check_numbers(self) -> None:
-        for name, least in _LEAST.items():
-            value = attrgetter(name)(self)
-            for number in value if isinstance(value, list) else [value]:
-                if number is not None and number < least:
-                    raise ConfigError(f"{name} is {number}; it must be at least {least}.")
         for what, is_valid, names in _RANGES:
             for name in names:
-                number = attrgetter(name)(self)
-                if number is not None and not is_valid(number):
-                    raise ConfigError(f"{name} is {number}; it must be {what}.")
-        for event, number in self.reward.events.items():
-            if not math.isfinite(number):
-                raise ConfigError(f"reward.events.{event} is {number}; it must be a finite number.")
+                value = attrgetter(name)(self)
+                several = value if isinstance(value, dict) else dict.fromkeys([""], value)
+                for key, one in several.items():
+                    for number in one if isinstance(one, list) else [one]:
+                        if number is not None and not is_valid(number):
+                            raise ConfigError(f"{name}{key and '.'}{key} is {number}; it must be {what}.")
 
 
 def parse_rl(arguments: Sequence[str]) -> RlConfig:
-    """Return what a command line asks for.
-
-    Args:
-        arguments: `--config_path=FILE` and overrides; to resume, FILE may be the run's folder.
-
-    Raises:
-        ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
-    """
+    """Return what a command line asks for."""
     prefix = f"--{configuration.CONFIG_PATH}="
     found = [
         f"{prefix}{config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument

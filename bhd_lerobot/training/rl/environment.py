@@ -10,13 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.envs.stable_baselines import BhdSb3VecEnv
+from bhd_lerobot.envs.stage import Stage
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.config import RewardConfig
 from bhd_lerobot.training.rl.features import FeatureStack, in_units, rows_of
 from bhd_lerobot.training.rl.parts import RlParts
-from bhd_lerobot.training.rl.privileged import privileged_state
 
 Array = NDArray[np.float64]
 
@@ -26,13 +27,7 @@ _UNBOUNDED = 1e6
 
 
 class Shaping:
-    """The learner's reward of n simulations.
-
-    Args:
-        config: how it is made.
-        gamma: discount of a frame.
-        n: simulations.
-    """
+    """The learner's reward of n simulations; `gamma` is the discount of a frame."""
 
     def __init__(self, config: RewardConfig, gamma: float, n: int) -> None:
         self._config, self._gamma = config, gamma
@@ -55,13 +50,9 @@ class Shaping:
     def __call__(
         self, reward: Array, event: NDArray[np.int64], terminated: NDArray[np.bool_], potential: Array | None = None
     ) -> Array:
-        """Return the learner's reward of a frame, shape (n,).
+        """Return the learner's reward of a frame, shape (n,), as all arguments: `potential` is that at its end.
 
-        Args:
-            reward: the task's, shape (n,); it stays as it is.
-            event: `Event` that the frame ended with, shape (n,).
-            terminated: whether the episode ended for good, shape (n,): such a state has the potential 0.
-            potential: of the state at the frame's end, shape (n,), with a potential.
+        Where an episode `terminated`, the state has the potential 0.
         """
         shaped = self._config.scale * reward + self._events[event] + self._config.frame
         if self.uses_potential and potential is not None:
@@ -74,33 +65,28 @@ class Shaping:
 def pose_potential(tool: Array, target: Array, per_m: float, per_rad: float) -> Array:
     """Return minus the weighted distance between poses, shape (n,).
 
-    Args:
-        tool: x, y, z [m] and quaternion wxyz, shape (n, 7).
-        target: the same.
-        per_m: weight of the distance [1/m].
-        per_rad: weight of the angle [1/rad].
+    A pose is x, y, z [m] and a quaternion wxyz, shape (n, 7); the weights are in 1/m and 1/rad.
     """
     distance = np.linalg.norm(tool[:, :3] - target[:, :3], axis=1)
     angle = 2 * np.arccos(np.minimum(np.abs((tool[:, 3:] * target[:, 3:]).sum(axis=1)), 1.0))
     return -per_m * distance - per_rad * angle
 
 
+def privileged_state(stage: Stage) -> NDArray[np.float32]:
+    """Return what the simulator, the task and the cerebellum know beyond the observation, shape (n, k).
+
+    The last number is whether the cerebellum kept the robot from an obstacle in the last frame: the flag CLEARANCE.
+    """
+    kept = (stage.limits & Limit.CLEARANCE) != 0
+    parts = stage.simulation.privileged_state(), stage.task.privileged_state(), kept[:, None]
+    return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
 class RlVecEnv(BhdSb3VecEnv):
     """The environment as the learner sees it: feature vectors in, normalised actions out, and rewards of its own.
 
     A vector is what the actor sees, `stack.size` numbers, and behind that, if it is privileged, what only the critic
-    sees. `infos[i]["episode"]` holds the task's own return, not the learner's.
-
-    Attributes:
-        stack: what the network sees.
-        shaping: what the learner gets.
-
-    Args:
-        env: with autoreset mode DISABLED.
-        parts: the policy, whose inputs and outputs these are.
-        reward: how the learner's reward is made.
-        gamma: discount of a frame.
-        privileged: whether the critic sees more than the actor: `privileged_state`.
+    sees. `infos[i]["episode"]` holds the task's own return, not the learner's. `env` has the autoreset mode DISABLED.
     """
 
     def __init__(

@@ -22,14 +22,6 @@ class FeatureStack:
 
     Normalisation and features are computed by the policy and its processors, so that what is learned here is what runs
     elsewhere; only a convolution over beams, which is learned, is left to the learner.
-
-    Attributes:
-        size: width of a vector.
-
-    Args:
-        front: a `MlpPolicy` without `scan.channels`: its `features` are used.
-        before: its preprocessor.
-        n: robots.
     """
 
     def __init__(self, front: Any, before: Any, n: int) -> None:
@@ -44,12 +36,7 @@ class FeatureStack:
         self._head = 0
 
     def restart(self, ids: NDArray[np.intp], rows: Rows) -> None:
-        """Begin episodes: nothing was before their first frame but that frame.
-
-        Args:
-            ids: the robots.
-            rows: what all robots see, each of shape (n, width).
-        """
+        """Begin episodes: nothing was before their first frame but that frame."""
         for key in self._keys:
             self._history[key][:, ids] = rows[key][ids]
 
@@ -59,12 +46,11 @@ class FeatureStack:
         for key in self._keys:
             self._history[key][self._head] = rows[key]
 
-    def features(self, ids: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
-        """Return the vectors of some robots, all if None, shape (n, size)."""
+    def features(self) -> NDArray[np.float32]:
+        """Return the vectors, shape (n, size)."""
         batch = {}
         for key in self._keys:
             picked = self._history[key][(self._head - self._back) % self._length]
-            picked = picked if ids is None else picked[:, ids]
             values = picked[0] if self._single else picked.swapaxes(0, 1)
             batch[key] = torch.from_numpy(np.ascontiguousarray(values))
         with torch.inference_mode():

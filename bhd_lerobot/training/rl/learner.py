@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -36,12 +35,7 @@ _NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
 
 
 class ActorHead(nn.Module):
-    """From a feature vector, whose beams are not convolved yet, to the last hidden layer of a `bhd_mlp`.
-
-    Args:
-        policy: the `bhd_mlp`; its modules are shared, not copied.
-        size: how many numbers of a vector it sees, the first ones.
-    """
+    """From a feature vector, whose beams are not convolved yet, to the last hidden layer of a `bhd_mlp`."""
 
     def __init__(self, policy: MlpPolicy, size: int) -> None:
         super().__init__()
@@ -61,47 +55,8 @@ class ActorHead(nn.Module):
         return self.hidden(features)
 
 
-class Networks(nn.Module):
-    """The hidden layers of actor and critic, in the form that `ActorCriticPolicy` asks for.
-
-    Args:
-        policy: the actor.
-        actor_size: how many numbers of a vector the actor sees, the first ones.
-        size: width of a vector, all of which the critic sees.
-        critic_dims: widths of the critic's hidden layers.
-    """
-
-    def __init__(self, policy: MlpPolicy, actor_size: int, size: int, critic_dims: list[int]) -> None:
-        super().__init__()
-        self.policy_net = ActorHead(policy, actor_size)
-        self.latent_dim_pi = int(policy.net[-1].in_features)  # type: ignore[arg-type]
-        layers: list[nn.Module] = []
-        width = size
-        for dim in critic_dims:
-            layers += [nn.Linear(width, dim), ACTIVATION_LAYERS[policy.config.activation]()]
-            width = dim
-        self.value_net = nn.Sequential(*layers)
-        self.latent_dim_vf = width
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the last hidden layers of both."""
-        return self.forward_actor(features), self.forward_critic(features)
-
-    def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the actor's last hidden layer."""
-        return self.policy_net(features)
-
-    def forward_critic(self, features: Tensor) -> Tensor:
-        """Return the critic's last hidden layer."""
-        return self.value_net(features)
-
-
 class ActionHead(nn.Module):
-    """From the last hidden layer of a `bhd_mlp` with a chunk of one action to that action, of the likeliest mode.
-
-    Args:
-        policy: the `bhd_mlp`; its last layer is shared, not copied.
-    """
+    """From the last hidden layer of a `bhd_mlp` with a chunk of one action to that action, of the likeliest mode."""
 
     def __init__(self, policy: MlpPolicy) -> None:
         super().__init__()
@@ -114,50 +69,25 @@ class ActionHead(nn.Module):
 
 
 class MlpActorCritic(ActorCriticPolicy):
-    """A `bhd_mlp` as actor, and a critic of its own.
+    """A `bhd_mlp` with a chunk of one action as actor, which shares its parameters with this, and a critic of its own.
 
-    Attributes:
-        actor: the `bhd_mlp`, which shares its parameters with this.
-
-    Args:
-        observation_space: vectors of an `RlVecEnv`.
-        action_space: normalised actions.
-        lr_schedule: of the learning rate.
-        actor: the `bhd_mlp`, with a chunk of one action.
-        actor_size: how many numbers of a vector it sees, the first ones.
-        critic_dims: widths of the critic's hidden layers.
-        fresh: initialise the actor's linear layers; otherwise they stay as they are.
-        kwargs: what stable-baselines3 passes besides.
+    The actor sees the first `actor_size` numbers of a vector. Its linear layers are initialised if it is `fresh`.
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
-        lr_schedule: Any,
-        *,
-        actor: MlpPolicy,
-        actor_size: int,
-        critic_dims: list[int],
-        fresh: bool,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, actor: MlpPolicy, actor_size: int, fresh: bool, **kwargs: Any) -> None:
         # nn.Module wants to be initialised before it gets modules, and SB3 builds the networks while it does so.
-        self._ingredients: tuple[MlpPolicy, int, list[int], bool] = (actor, actor_size, critic_dims, fresh)
-        super().__init__(observation_space, action_space, lr_schedule, ortho_init=False, **kwargs)
-
-    @property
-    def actor(self) -> MlpPolicy:
-        """The `bhd_mlp`, which shares its parameters with this."""
-        return self._ingredients[0]
+        self._ingredients: tuple[MlpPolicy, int, bool] = (actor, actor_size, fresh)
+        super().__init__(*args, **{**kwargs, "ortho_init": False})
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """Return the parameters of the actor, its exploration noise included."""
         return [*self.mlp_extractor.policy_net.parameters(), *self.action_net.parameters(), self.log_std]
 
     def _build_mlp_extractor(self) -> None:
-        actor, actor_size, critic_dims, _ = self._ingredients
-        self.mlp_extractor = Networks(actor, actor_size, self.features_dim, critic_dims)  # type: ignore[assignment]
+        super()._build_mlp_extractor()
+        actor, actor_size, _ = self._ingredients
+        self.mlp_extractor.policy_net = ActorHead(actor, actor_size)  # type: ignore[assignment]
+        self.mlp_extractor.latent_dim_pi = int(actor.net[-1].in_features)  # type: ignore[arg-type]
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -176,36 +106,20 @@ class MlpActorCritic(ActorCriticPolicy):
 
 
 class WarmedUpPPO(PPO):
-    """PPO of stable-baselines3, whose actor can be frozen at first.
-
-    Args:
-        args: see `stable_baselines3.PPO`.
-        critic_warmup: environment steps in which the actor is frozen.
-        kwargs: see `stable_baselines3.PPO`.
-    """
+    """PPO of stable-baselines3, whose actor is frozen for the first `critic_warmup` environment steps."""
 
     policy: MlpActorCritic
-
-    def __init__(self, *args: Any, critic_warmup: int, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._warmup = critic_warmup
+    critic_warmup = 0
 
     def train(self) -> None:
         """Learn from the samples that were gathered."""
-        frozen = self.num_timesteps <= self._warmup
         for actor_parameter in self.policy.actor_parameters():
-            actor_parameter.requires_grad_(not frozen)
+            actor_parameter.requires_grad_(self.num_timesteps > self.critic_warmup)
         super().train()
 
 
 def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO:
-    """Return PPO on an actor.
-
-    Args:
-        config: of the run.
-        parts: the actor and what belongs to it.
-        env: the environments.
-    """
+    """Return PPO on an actor."""
     options = asdict(config.ppo)
     lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
     options["batch_size"] = min(options["batch_size"], options["n_steps"] * env.num_envs)
@@ -222,25 +136,19 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO
         policy_kwargs={
             "actor": parts.actor,
             "actor_size": env.stack.size,
-            "critic_dims": list(config.policy.critic_dims),
+            "net_arch": {"pi": [], "vf": list(config.policy.critic_dims)},
+            "activation_fn": ACTIVATION_LAYERS[parts.actor.config.activation],
             "fresh": parts.fresh,
             "log_std_init": log_std,
         },
-        critic_warmup=config.critic_warmup,
     )
+    learner.critic_warmup = config.critic_warmup
     learner.set_logger(Logger(None, []))
     return learner
 
 
 def learn(learner: WarmedUpPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
-    """Learn until a number of environment steps is done, or until it is over.
-
-    Args:
-        learner: what learns.
-        steps: environment steps in all.
-        updated: called with the learner and what it measured, after each update.
-        is_over: asked after each frame.
-    """
+    """Learn until a number of environment steps is done, or until it is over."""
     watcher = _Watcher(updated, is_over)
     learner.learn(
         max(0, steps - learner.num_timesteps), callback=watcher, log_interval=_NEVER, reset_num_timesteps=False

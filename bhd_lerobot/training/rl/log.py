@@ -17,8 +17,6 @@ SHOWN = (
     ("score", "score"),
     ("val_success", "validation success"),
     ("val_score", "validation score"),
-    ("confirmed_success", "confirmed success"),
-    ("confirmed_score", "confirmed score"),
     ("kl", "kl"),
     ("std", "std"),
     ("frames_per_s", "frames/s"),
@@ -26,53 +24,34 @@ SHOWN = (
 
 
 def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, Mapping[str, float]] | None) -> None:
-    """Draw return, success and score over environment steps and over minutes.
-
-    Args:
-        rows: rows of a metrics file.
-        path: where the image goes.
-        heading: what stands above it.
-        rule: name and level of the rule on the validation episodes, by the keys `val_return` and so on.
-    """
-    figure = Figure(figsize=(11, 8.4), layout="constrained")
+    """Draw return, success and score over environment steps."""
+    figure = Figure(figsize=(8.5, 8.4), layout="constrained")
     figure.suptitle(heading, fontsize=11)
-    axes = figure.subplots(len(_CURVES), 2, sharey="row", sharex="col", squeeze=False)
-    for line, (key, label) in zip(axes, _CURVES, strict=True):
-        for axis, time in zip(line, ("step", "minutes"), strict=True):
-            training = recent(rows, time, key)
-            if training:
-                name = f"training, with exploration: last {RECENT} episodes or more"
-                axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label=name)
-            judged = _points(rows, time, f"val_{key}")
-            if judged:
-                axis.plot(
-                    *judged, color="#1f6f8b", marker="o", markersize=4, linewidth=1.6, label="validation episodes"
-                )
-            if rule is not None:
-                axis.axhline(rule[1][f"val_{key}"], color="#c0392b", linestyle="--", linewidth=1.2, label=rule[0])
-            axis.grid(alpha=0.3)
-        line[0].set_ylabel(label)
-    axes[-1][0].set_xlabel("environment steps")
-    axes[-1][1].set_xlabel("minutes")
-    axes[0][0].legend(frameon=False, fontsize=9)
-    axes[0][0].xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M" if value >= 1e5 else f"{value:g}")
+    axes = figure.subplots(len(_CURVES), 1, sharex=True)
+    for axis, (key, label) in zip(axes, _CURVES, strict=True):
+        if training := recent(rows, key):
+            name = f"training, with exploration: last {RECENT} episodes or more"
+            axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label=name)
+        judged = [(row["step"], row[f"val_{key}"]) for row in rows if row.get(f"val_{key}") is not None]
+        if judged:
+            points = zip(*judged, strict=True)
+            axis.plot(*points, color="#1f6f8b", marker="o", markersize=4, linewidth=1.6, label="validation episodes")
+        if rule is not None:
+            axis.axhline(rule[1][f"val_{key}"], color="#c0392b", linestyle="--", linewidth=1.2, label=rule[0])
+        axis.grid(alpha=0.3)
+        axis.set_ylabel(label)
+    axes[-1].set_xlabel("environment steps")
+    axes[0].legend(frameon=False, fontsize=9)
+    axes[0].xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M" if value >= 1e5 else f"{value:g}")
     figure.savefig(path, dpi=110)
 
 
-def recent(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[float]] | None:
-    """Return the points of a curve of training: means over the last episodes that had ended by then.
+def recent(rows: Sequence[Row], key: str) -> tuple[list[float], list[float]] | None:
+    """Return the points of a curve of training: steps, and means over the last episodes that had ended by then.
 
     In one update few episodes end, and those that end between the others' are the failures.
-
-    Args:
-        rows: rows of a metrics file; those in which episodes ended say how many, and the mean over these.
-        time: key of the points' abscissae.
-        key: of what is shown.
-
-    Returns:
-        abscissae and ordinates; None if no episode has ended.
     """
-    ended = [(row[time], row["episodes"], row[key]) for row in rows if row.get(key) is not None]
+    ended = [(row["step"], row["episodes"], row[key]) for row in rows if row.get(key) is not None]
     values = []
     for last in range(len(ended)):
         first, count = last, ended[last][1]
@@ -81,8 +60,3 @@ def recent(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[
             count += ended[first][1]
         values.append(sum(number * value for _, number, value in ended[first : last + 1]) / count)
     return ([when for when, *_ in ended], values) if ended else None
-
-
-def _points(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[float]] | None:
-    points = [(row[time], row[key]) for row in rows if row.get(key) is not None]
-    return ([x for x, _ in points], [y for _, y in points]) if points else None

@@ -38,9 +38,6 @@ class RlParts:
     Attributes:
         actor: the policy, with a chunk of one action and a Gaussian around it.
         front: the same without convolutions, for its features only.
-        before: its preprocessor.
-        after: its postprocessor.
-        contract: what it is trained on.
         fresh: whether its weights are still to be initialised.
     """
 
@@ -53,16 +50,7 @@ class RlParts:
 
 
 def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] = ()) -> RlParts:
-    """Return the actor and what belongs to it.
-
-    Args:
-        config: of the run.
-        env: the environments.
-        episodes: what the observations' scale is estimated from; a short random run if there are none.
-
-    Raises:
-        ConfigError: the checkpoint cannot be started from.
-    """
+    """Return the actor and what belongs to it."""
     simulation, task = env.stage.simulation, env.stage.task
     contract = PolicyContract(
         robot_type=config.robot.type,

@@ -19,6 +19,8 @@ from rich.markup import escape
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
+from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.policies.learned.inference import use_threads
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training.checkpoint import clean, point
@@ -27,10 +29,7 @@ from bhd_lerobot.training.rl import checkpoint as checkpoints
 from bhd_lerobot.training.rl.config import CONFIG_NAME, RlConfig, parse_rl
 from bhd_lerobot.training.rl.log import PLOT_NAME, SHOWN, Row, draw_curve
 from bhd_lerobot.training.rl.parts import make_parts
-from bhd_lerobot.training.rl.validation import Level, Validation, level
-
-_ON_THE_WAY, _AT_THE_END = ("val", "step"), ("confirmed", "candidate")
-"""Of the rows of `metrics.jsonl` that judge a checkpoint: prefix of their levels, and key of the checkpoint's step."""
+from bhd_lerobot.training.rl.validation import Validation, level
 
 
 @dataclass
@@ -43,7 +42,7 @@ class RlResult:
         checkpoint: the last checkpoint.
         best: the checkpoint that was best on the validation episodes.
         rows: rows of `metrics.jsonl`.
-        rule: level of the rule on the validation episodes.
+        rule: level of the rule on the validation episodes, with the keys of a row.
         stopped_by: the signal that ended it, if one did.
     """
 
@@ -52,16 +51,12 @@ class RlResult:
     checkpoint: Path | None = None
     best: Path | None = None
     rows: list[Row] = field(default_factory=list)
-    rule: Level | None = None
+    rule: Row = field(default_factory=dict)
     stopped_by: StopRequest = field(default_factory=StopRequest)
 
 
 def require_sb3() -> None:
-    """Raise unless stable-baselines3 is installed.
-
-    Raises:
-        ConfigError: it is not; the message says how to install it.
-    """
+    """Raise unless stable-baselines3 is installed."""
     try:
         import stable_baselines3  # noqa: F401
     except ImportError as error:
@@ -71,22 +66,11 @@ def require_sb3() -> None:
 
 
 def train(config: RlConfig, console: Console | None = None) -> RlResult:
-    """Learn what a configuration asks for.
-
-    Args:
-        config: the configuration.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or training failed. Checkpoints saved before are intact.
-    """
+    """Learn what a configuration asks for."""
     require_sb3()
     folder = _run_folder(config)
-    threads = torch.get_num_threads()
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     try:
-        with closing(Validation(config)) as validation, stop_on_signals() as stop:
+        with use_threads(config.threads), closing(Validation(config)) as validation, stop_on_signals() as stop:
             return _Run(config, folder, console or Console(stderr=True), validation, stop).go()
     except OSError as error:
         raise BhdError(
@@ -94,17 +78,13 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
             f"Make room, and go on with --resume=true --config_path={quoted(folder)}."
         ) from error
     finally:
-        torch.set_num_threads(threads)
         if not config.resume:
-            _remove_empty(folder)
+            with suppress(OSError):  # a run that failed before it wrote anything can be started again
+                folder.rmdir()
 
 
 def _run_folder(config: RlConfig) -> Path:
-    """Return the run's folder, made if it was not there; without `output_dir`, a new one, which the configuration gets.
-
-    Raises:
-        ConfigError: it is there and not to be resumed, or to be resumed and not there, or cannot be written.
-    """
+    """Return the run's folder, made if it was not there; without `output_dir`, a new one."""
     if config.output_dir is None:
         config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
     folder = Path(config.output_dir).expanduser()
@@ -126,16 +106,10 @@ def _run_folder(config: RlConfig) -> Path:
 
 
 def _write_config(config: RlConfig, folder: Path) -> None:
-    """Write the resolved configuration; that of a run which cannot be resumed with another one stays as it was."""
+    """Write the resolved configuration."""
     values = {**configuration.encode(config), "resume": False}
     text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
     (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
-
-
-def _remove_empty(folder: Path) -> None:
-    """Remove the folder of a run that failed before it wrote anything, so that it can be started again."""
-    with suppress(OSError):
-        folder.rmdir()
 
 
 class _Run:
@@ -146,14 +120,12 @@ class _Run:
     ) -> None:
         self._config, self._console, self._validation, self._stop = config, console, validation, stop
         self._result = RlResult(folder, stopped_by=stop)
-        self._before = {"next_episode": 0, "seconds": 0.0}  # what a run that is resumed had done
-        self._saved = self._judged = -1
+        self._started = time.perf_counter()
+        self._saved = -1
 
     def go(self) -> RlResult:
         config, result = self._config, self._result
-        self._started = time.perf_counter()
-        if config.resume:
-            self._before = checkpoints.read_run(result.output_dir)
+        first_episode = checkpoints.read_next_episode(result.output_dir) if config.resume else 0
         rule = config.validation.rule
         episodes = [] if rule is None else self._validation.run(rule, self._stop.__bool__)
         result.rule = level(episodes)
@@ -167,7 +139,7 @@ class _Run:
             seed=config.seed,
             autoreset_mode="Disabled",
             threads=config.env.threads,
-            first_episode=int(self._before["next_episode"]),
+            first_episode=first_episode,
             episode_stride=config.env.n_envs,
         )
         with closing(env):
@@ -180,15 +152,6 @@ class _Run:
             self._learn(make_learner(config, self._parts, adapter))
         return result
 
-    def _done(self, step: int) -> float:
-        """Return how much of the run is done, from 0 to 1."""
-        minutes = self._config.max_minutes
-        passed = 0.0 if minutes is None else self._minutes() / minutes
-        return min(1.0, max(passed, step / self._config.steps))
-
-    def _minutes(self) -> float:
-        return (time.perf_counter() - self._started + self._before["seconds"]) / 60
-
     def _learn(self, learner: Any) -> None:
         from bhd_lerobot.training.rl.learner import learn
 
@@ -197,41 +160,29 @@ class _Run:
         rows: list[Row] = []
         if config.resume:
             checkpoints.load(result.output_dir, learner)
-            result.step = self._saved = self._judged = int(learner.num_timesteps)
+            result.step = self._saved = int(learner.num_timesteps)
             result.checkpoint = checkpoints.folder_of(result.output_dir, result.step)
             rows = read_metrics(metrics, result.step)
             clean(result.output_dir)
-        # The episodes that decide between checkpoints may be what a killed run has left to do.
-        is_judged = not config.validation.confirm or any(
-            row["step"] == result.step and "candidate" in row for row in rows
-        )
-        if result.step >= config.steps and is_judged:
+        if result.step >= config.steps:
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
             )
-        minutes = config.max_minutes
-        if config.resume and minutes is not None and self._minutes() >= minutes and is_judged:
-            raise ConfigError(
-                f"The run has used its time over all sittings: max_minutes is {minutes:g}. To go on, set more with "
-                f"--max_minutes, or no limit with --max_minutes=null."
-            )
         _write_config(config, result.output_dir)
         self._metrics = MetricsFile(metrics, rows)
+        self._minutes_before = rows[-1]["minutes"] if rows else 0.0
         result.rows = self._metrics.rows
         self._point_to_best()
-        with RunProgress(self._console, "learning", 1.0) as self._progress:
+        with RunProgress(self._console, "learning", config.steps, result.step) as self._progress:
             if not config.resume:
-                self._judge(learner, {"step": 0, "minutes": self._minutes()})
+                self._judge(learner, {})
             try:
                 learn(learner, config.steps, self._updated, self._is_over)
             except ValueError as error:
                 raise self._diverged(learner) or error from None
             result.step = int(learner.num_timesteps)
-            if self._saved != result.step and not self._stop:
-                self._judge(learner, {"step": result.step, "minutes": self._minutes()})
-            elif self._saved != result.step:
-                self._save(learner)
-            self._confirm()
+            if self._saved != result.step:
+                self._judge(learner, {})
             self._draw()
         self._print_summary()
 
@@ -245,6 +196,9 @@ class _Run:
             f"checkpoints, {kept}. Lower the learning rate (--ppo.lr) or the rewards (--reward.…)."
         )
 
+    def _minutes(self) -> float:
+        return (time.perf_counter() - self._started) / 60
+
     def _is_over(self) -> bool:
         minutes = self._config.max_minutes
         return bool(self._stop) or (minutes is not None and self._minutes() >= minutes)
@@ -252,92 +206,61 @@ class _Run:
     def _updated(self, learner: Any, row: Row) -> None:
         """Log an update; validate when it is time to."""
         self._result.step = int(learner.num_timesteps)
-        row = {"step": self._result.step, "minutes": self._minutes(), **row}
-        if self._result.step - self._judged >= self._config.validation.freq and not self._stop:
+        if self._result.step - self._saved >= self._config.validation.freq and not self._stop:
             self._judge(learner, row)
             self._draw()
         else:
             self._log(row)
 
     def _judge(self, learner: Any, row: Row) -> None:
-        """Save, and find out how good the policy is."""
-        self._judged = self._result.step
-        policy = self._save(learner) / PRETRAINED_MODEL_DIR
-        level_now = self._validation.checkpoint(policy, self._stop.__bool__)
-        self._log(row if level_now is None or self._stop else {**row, **level_now.row()})
-        self._point_to_best()
-
-    def _save(self, learner: Any) -> Path:
+        """Save, and, unless the run is to stop, find out how good the policy is."""
+        result = self._result
         following = max(member.course.following for member in self._env.members)
-        run = {"next_episode": following, "seconds": self._minutes() * 60}
-        folder = checkpoints.save(self._result.output_dir, self._parts, learner, run)
-        self._result.checkpoint, self._saved = folder, self._result.step
-        return folder
-
-    def _confirm(self) -> None:
-        """Let the best checkpoints, and the one that the run started from, drive the episodes that decide."""
-        config, result = self._config.validation, self._result
-        if not config.confirm:
-            return
-        steps = {row["step"] for row in self._ranked(_ON_THE_WAY)[: config.candidates]}
-        if self._config.start_from is not None:
-            steps.add(0)
-        levels = {}
-        for step in sorted(steps - {row["candidate"] for row in self._ranked(_AT_THE_END)}):
-            policy = checkpoints.folder_of(result.output_dir, step) / PRETRAINED_MODEL_DIR
-            levels[step] = self._validation.checkpoint(policy, self._stop.__bool__, further=True)
-            if self._stop:
-                return  # what not all have driven decides nothing
-        for step, found in levels.items():
-            if found is not None:
-                now = {"step": result.step, "minutes": self._minutes(), "candidate": step}
-                self._log({**now, **found.row(_AT_THE_END[0])})
+        result.checkpoint = checkpoints.save(result.output_dir, self._parts, learner, following)
+        self._saved = result.step
+        policy = LearnedBrainConfig(path=str(result.checkpoint / PRETRAINED_MODEL_DIR))
+        found = {} if self._stop else level(self._validation.run(policy, self._stop.__bool__))
+        if not self._stop:
+            row = {**row, **found}
+        if row:
+            self._log(row)
         self._point_to_best()
 
-    def _ranked(self, kind: tuple[str, str]) -> list[Row]:
-        """Return the rows that judge a checkpoint, the best first, the latest of equals."""
-        prefix, step = kind
-        keys = [f"{prefix}_{self._config.validation.select}", f"{prefix}_score", step]
+    def _best(self) -> Row | None:
+        """Return the row that judges the best checkpoint, the latest of equals."""
+        keys = (f"val_{self._config.validation.select}", "val_score", "step")
         judged = [row for row in self._result.rows if row.get(keys[0]) is not None]
-        return sorted(judged, key=lambda row: [row[key] for key in keys], reverse=True)
-
-    def _best(self) -> tuple[int, str, Row] | None:
-        """Return the step of the best checkpoint, and the row that says so with the prefix of its keys."""
-        for prefix, step in (_AT_THE_END, _ON_THE_WAY):
-            if ranked := self._ranked((prefix, step)):
-                return int(ranked[0][step]), prefix, ranked[0]
-        return None
+        return max(judged, key=lambda row: [row[key] for key in keys], default=None)
 
     def _point_to_best(self) -> None:
         best = self._best()
-        folder = None if best is None else checkpoints.folder_of(self._result.output_dir, best[0])
+        folder = None if best is None else checkpoints.folder_of(self._result.output_dir, best["step"])
         if folder is not None and folder.is_dir():
             self._result.best = folder
             point(folder, checkpoints.BEST)
 
     def _log(self, row: Row) -> None:
+        row = {"step": self._result.step, "minutes": self._minutes_before + self._minutes(), **row}
         self._metrics.append(row)
-        self._progress.advance(self._done(self._result.step))
-        judged = row.get("candidate", row["step"] if "val_score" in row else None)
-        prefix = "" if judged is None else f"step {judged:,}  {row['minutes']:.1f} min"
+        self._progress.advance(row["step"])
+        prefix = f"step {row['step']:,}  {row['minutes']:.1f} min" if "val_score" in row else ""
         self._progress.log(prefix, format_numbers(row, SHOWN))
 
     def _draw(self) -> None:
         config, result = self._config, self._result
         rule: Any = config.validation.rule
-        shown = None if result.rule is None else (rule.get_choice_name(type(rule)), result.rule.row())
+        shown = (rule.get_choice_name(type(rule)), result.rule) if result.rule else None
         heading = f"PPO, {config.environment}, {result.step:,} environment steps"
         draw_curve(result.rows, result.output_dir / PLOT_NAME, heading, shown)
 
     def _print_summary(self) -> None:
         result, lines = self._result, []
         lines.append(f"{result.step:,} environment steps in {self._minutes():.1f} min")
-        if result.rule is not None:
-            lines.append(f"rule on the validation episodes: {_text(result.rule.row())}")
+        if result.rule:
+            lines.append(f"rule on the validation episodes: {_text(result.rule)}")
         best = self._best()
         if best is not None and result.best is not None:
-            step, prefix, row = best
-            lines.append(f"best, after {step:,} steps: {_text(row, prefix)}")
+            lines.append(f"best, after {best['step']:,} steps: {_text(best)}")
             lines.append(f"best checkpoint: {result.best / PRETRAINED_MODEL_DIR}")
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
         if self._stop:
@@ -348,9 +271,8 @@ class _Run:
         self._console.print(escape("\n".join(lines)), soft_wrap=True, highlight=False)
 
 
-def _text(row: Row, prefix: str = "val") -> str:
-    score, success, total = (row[f"{prefix}_{key}"] for key in ("score", "success", "return"))
-    return f"score {score:.4f}, success {success:.3f}, return {total:.4f}"
+def _text(row: Row) -> str:
+    return "score {val_score:.4f}, success {val_success:.3f}, return {val_return:.4f}".format_map(row)
 
 
 def main(arguments: Sequence[str]) -> int:

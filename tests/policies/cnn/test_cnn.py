@@ -1,25 +1,20 @@
 """`bhd_cnn`: it sees ranges, keeps in mind where things are, and reads no range finder."""
 
 import math
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.cnn.modeling_cnn import CnnPolicy
-from bhd_lerobot.policies.cnn.processor_cnn import OBS_ODOMETRY, OBS_RANGES
-from bhd_lerobot.policies.learned.policy import load_policy
-from tests.cases import each_case
+from bhd_lerobot.policies.cnn.processor_cnn import OBS_RANGES
 
 WIDTH, HEIGHT, BEAMS, IMAGES = 24, 16, 36, 3
 IMAGE = "observation.images.front"
@@ -55,15 +50,6 @@ def raw(rows: int = 6, images: int = IMAGES, seed: int = 0) -> dict[str, Tensor]
 
 def batch(made: CnnConfig, samples: dict[str, Tensor]) -> dict[str, Tensor]:
     return make_pre_post_processors(made)[0]({key: values.clone() for key, values in samples.items()})
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    yield
-    torch.set_num_threads(before)
 
 
 # --- inputs -----------------------------------------------------------------------------------------------------------
@@ -157,68 +143,7 @@ def test_only_the_loss_of_the_ranges_depends_on_them() -> None:
 # --- acting -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("images", [1, IMAGES])
-def test_frame_by_frame_it_does_what_it_does_with_the_history_in_one_piece(images: int, tmp_path: Path) -> None:
-    made = config(n_obs_steps=images)
-    policy = CnnPolicy(made)
-    policy.save_pretrained(tmp_path)
-    for one in make_pre_post_processors(made):
-        one.save_pretrained(tmp_path)
-    loaded = load_policy(tmp_path)
-    assert loaded.cameras == {IMAGE: "front"}
-    samples = raw(1, images=7)
-    for frame in range(7):
-        shown = {key: samples[key][:, frame] for key in (OBS_STATE, IMAGE)}
-        action = loaded.policy.select_action(loaded.before(shown))
-        frames = [max(0, frame - 2 * back) for back in reversed(range(images))]
-        window = {key: samples[key][:, frames] for key in (OBS_STATE, IMAGE)}
-        wanted = policy.predict_action_chunk(batch(made, window))[:, 0]
-        assert torch.allclose(action, wanted, atol=1e-6)
-    assert get_policy_class("bhd_cnn") is CnnPolicy
-
-
 # --- refusals ---------------------------------------------------------------------------------------------------------
-
-
-@each_case(
-    ("options", "message"),
-    [
-        ({"sectors": 0}, r"policy\.sectors is 0"),
-        ({"channels": []}, r"policy\.channels is \[\]"),
-        ({"field_of_view": 0}, r"policy\.field_of_view is 0"),
-        ({"range_minimum": 4.0}, r"policy\.range_minimum is 4\.0"),
-        ({"range_weight": -1}, r"policy\.range_weight is -1"),
-        ({"camera": "rear"}, r"observation\.images\.rear.*observation\.images\.front.*robot\.camera=true"),
-        ({"shape": (3, 8, 24)}, r"24 x 8 px.*at least 16"),
-        ({"names": NAMES[:-3]}, r"no 'x\.pos'.*robot\.odometry=true"),
-        ({"names": ["x.vel", *NAMES[-3:]]}, r"range scan"),
-    ],
-)
-def test_it_refuses(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        CnnPolicy(config(**options))
-
-
-def test_it_refuses_to_read_a_scan() -> None:
-    with pytest.raises(ConfigError, match=r"does not read a range finder"):
-        config(scan=type(config().scan)(transform="inverse"))
-
-
-@each_case(
-    ("break_it", "message"),
-    [
-        (lambda ready: ready.pop(IMAGE), r"not in the batch.*camera_width=24 --robot\.camera_height=16"),
-        (lambda ready: ready.update({IMAGE: ready[IMAGE][..., :12]}), r"24 x 16 px.*\(3, 3, 16, 12\)"),
-        (lambda ready: ready.update({IMAGE: ready[IMAGE][:, :2]}), r"3 images"),
-        (lambda ready: ready.pop(OBS_ODOMETRY), r"bhd_odometry.*preprocessor"),
-    ],
-)
-def test_it_refuses_a_batch(break_it: Any, message: str) -> None:
-    made = config()
-    ready = batch(made, raw())
-    break_it(ready)
-    with pytest.raises(ConfigError, match=message):
-        CnnPolicy(made).predict_action_chunk(ready)
 
 
 def test_it_knows_the_statistics_as_a_perceptron_does() -> None:

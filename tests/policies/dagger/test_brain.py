@@ -247,33 +247,24 @@ def test_disagreement_counts_only_if_it_lasts() -> None:
 
 
 class Table(Desk):
-    """A desk with an arm of all joints."""
+    """A desk with an arm of all joints, on which an expert takes over."""
 
     def __init__(self, q: np.ndarray = HOME, patience_s: float = 0.04) -> None:
-        self.n = 1
         expert = PickBrain()
+        super().__init__(expert, [scene(CUP, BOX)])
         settings = DaggerConfig(
             NoopConfig(), PickBrainConfig(), collision_s=None, stall_s=None, patience_s=patience_s, hold_s=None
         )
         self.dagger = DaggerBrain(settings, NoopBrain(), expert)
-        super().__init__(expert, [scene(CUP, BOX)])
-        self.state = np.concatenate([q, np.zeros(7)])[None]
+        self.observed, self.state = ARM, np.concatenate([q, np.zeros(7)])[None]
         self.dagger.bind(replace(UR, environment_names=ENVIRONMENT))
         self.dagger.reset(np.arange(1), [0], 1, [""])
 
-    def look(self, results: Any = None, running: Any = None) -> dict[int, Any]:
-        environment = self.table.reshape(1, -1)
-        mixed = self.dagger.act(Observation(ARM, self.state, {}, environment, results or {}, np.ones(1, np.bool_)))
+    def commands(self, observation: Observation) -> Any:
+        mixed = self.dagger.act(replace(observation, running=np.ones(1, np.bool_)))
         assert isinstance(mixed, Mixed)
-        for sim, commands in mixed.commands.items():
-            assert mixed.by_goals[sim]
-            assert len(commands) == 1
-            assert commands[0].task_id not in [one.task_id for one in self.given[sim]]
-            self.given[sim] += commands
-        return {sim: commands[0] for sim, commands in mixed.commands.items()}
-
-    def steps(self, sim: int = 0) -> list[str]:
-        return [one.task_id.rsplit("-", 1)[1] for one in self.given[sim]]
+        assert all(mixed.by_goals[sim] for sim in mixed.commands)
+        return mixed.commands
 
 
 def taken_over(q: np.ndarray = HOME, **changes: Any) -> Table:

@@ -11,15 +11,11 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.skills import Plan, SceneObject, Skill, TextPlanner, make_plan
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
-from tests.policies.arm_desk import BOX, CUP, Desk, scene
+from tests.policies.arm_desk import BOX, CUP, Desk, episodes, scene
 
 BLUE_CUP = TableObject("cup", "blue", 0.03, 0.03, 0.10, 0.6, -0.2)
 TABLE = (CUP, BOX, BLUE_CUP)  # red cup, blue box, blue cup
@@ -207,15 +203,9 @@ def test_a_planner_that_names_something_else_picks_nothing() -> None:
 # --- in the simulator ------------------------------------------------------------------------------------------------
 
 
-def episodes(brain: LanguageBrain, seeds: list[int], config: PickConfig) -> list[Episode]:
-    simulation = UR5Simulation(UR5Config(), len(seeds), threads=1)
-    task = PickTask(config, len(seeds), simulation.config.fps)
-    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(k, seed) for k, seed in enumerate(seeds)]))
-
-
 def test_it_picks_what_the_task_asks_for_in_both_languages() -> None:
     config = PickConfig(language="any", min_objects=3, randomisation=RandomisationConfig(enabled=True))
-    done = episodes(LanguageBrain(), [episode_seed(21, k, "train") for k in range(4)], config)
+    done = episodes(LanguageBrain(), PickTask, config, [episode_seed(21, k, "train") for k in range(4)])
     assert {one.instruction.isascii() for one in done} == {True, False}
     for one in done:
         assert one.outcome.success, one.plan
@@ -232,7 +222,7 @@ def test_in_the_end_the_object_is_where_it_was_to_be(end: str) -> None:
     if end == "place":
         answer = {"target": 0, "steps": [{"skill": s.value, "object": 0} for s in (*GRASP, Skill.PLACE)]}
         brain = LanguageBrain(planner=TextPlanner(lambda _: json.dumps(answer)))
-    one = episodes(brain, [seed], dataclasses.replace(config, duration_s=12.0))[0]
+    one = episodes(brain, PickTask, dataclasses.replace(config, duration_s=12.0), [seed])[0]
     names = [f"object_0_{name}" for name in ("x", "y", "z")]
     task = PickTask(config, 1, 25)
     last = one.columns[keys.ENVIRONMENT_STATE][-1, [task.environment_names.index(name) for name in names]]

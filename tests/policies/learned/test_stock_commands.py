@@ -1,9 +1,11 @@
 """Checkpoints do the same in bhd-eval, lerobot-eval and lerobot-rollout, and what a robot cannot give is named."""
 
+import functools
 import re
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,210 +53,114 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.fixture(scope="module")
-def by_lerobot_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """Return a TurtleBot3's `bhd_mlp`, trained by lerobot-train, which evaluates it in between."""
-    folder = tmp_path_factory.mktemp("turtlebot3")
-    run_record(folder / "data", robot__beams=BEAMS, dataset__num_episodes=2)
-    env = arguments(
-        env__type="bhd",
-        env__task="TurtleBot3Avoid-v0",
-        env__robot=f"{{beams: {BEAMS}}}",
-        env__task_options="{duration_s: 1.0}",
-    )
-    options = arguments(
-        dataset__repo_id="test/avoid",
-        dataset__root=folder / "data",
-        policy__type="bhd_mlp",
-        policy__device="cpu",
-        policy__push_to_hub="false",
-        policy__n_obs_steps=2,
-        policy__chunk_size=4,
-        policy__n_action_steps=2,
-        policy__hidden_dims="[16]",
-        policy__scan__transform="inverse",
-        batch_size=16,
-        steps=4,
-        save_freq=4,
-        num_workers=0,
-        env_eval_freq=4,
-        eval__n_episodes=1,
-        eval__batch_size=1,
-        output_dir=folder / "run",
-    )
-    run_stock("lerobot-train", [*options, *env])
-    assert list((folder / "run" / "eval").glob("videos_step_*/**/*.mp4"))
-    robot = arguments(robot__type="turtlebot3", robot__beams=BEAMS)
-    return Trained(
-        folder / "run" / "checkpoints" / "last" / "pretrained_model",
-        [*robot, *arguments(task__type="avoid", task__duration_s=1.0)],
-        env,
-        [*robot, *arguments(robot__arena="random", robot__seed=SEED)],
-    )
+_CAMERA = {"robot__camera": "true"}
+_SMALL_ACT = {
+    **{f"policy__{name}": 1 for name in ("n_encoder_layers", "n_vae_encoder_layers", "n_heads")},
+    **{f"policy__{name}": 16 for name in ("dim_model", "dim_feedforward")},
+    **{"policy__latent_dim": 4, "policy__chunk_size": 6, "policy__n_action_steps": 3},
+    "policy__pretrained_backbone_weights": "null",
+    "policy__input_features": "{observation.state: {type: STATE, shape: [14]}, "
+    "observation.images.scene: {type: VISUAL, shape: [3, 32, 32]}}",
+}
+KINDS: dict[str, tuple[str, str, dict[str, Any], dict[str, Any]]] = {
+    "bhd_mlp": (
+        "turtlebot3",
+        "avoid",
+        {},
+        {"policy__n_obs_steps": 2, "policy__chunk_size": 4, "policy__n_action_steps": 2, "policy__hidden_dims": "[16]"}
+        | {"policy__scan__transform": "inverse"},
+    ),
+    "act": ("ur5", "reach", {**_CAMERA, "robot__camera_width": 32, "robot__camera_height": 32}, _SMALL_ACT),
+    # It reads an instruction, and remembers its first image.
+    "bhd_pixels": (
+        "ur5",
+        "pick",
+        {**_CAMERA, "robot__camera_width": 96, "robot__camera_height": 72},
+        {"policy__hidden_dims": "[16]", "policy__n_action_steps": 3},
+    ),
+    # It remembers images and odometry.
+    "bhd_cnn": (
+        "turtlebot3",
+        "avoid",
+        {"robot__odometry": "true", **_CAMERA, "robot__camera_width": 64, "robot__camera_height": 48},
+        {"policy__hidden_dims": "[16]", "policy__n_obs_steps": 3, "policy__obs_stride": 2},
+    ),
+    "bhd_perception": ("ur5", "pick", {**_CAMERA, "robot__camera_width": 96, "robot__camera_height": 72}, {}),
+}
+"""By the type of policy: robot, task, options of the robot, and options of the policy."""
+ENVIRONMENTS = {"avoid": "TurtleBot3Avoid-v0", "reach": "UR5Reach-v0", "pick": "UR5Pick-v0"}
+
+
+def training(folder: Path, kind: str, run: str = "run", **overrides: Any) -> list[str]:
+    """Record two short episodes, if there are none; return the options of a training of two steps."""
+    robot, task, body, policy = KINDS[kind]
+    if not (folder / "data").exists():
+        of_ur5 = {"robot__type": "ur5", "robot__beams": None, "task__type": task, "brain__type": task}
+        of_robot: dict[str, Any] = {"robot__beams": BEAMS} if robot == "turtlebot3" else {**of_ur5, "dataset__fps": 25}
+        seconds = 1.0 if robot == "turtlebot3" else 0.4
+        run_record(folder / "data", **of_robot, **body, dataset__episode_time_s=seconds, dataset__num_episodes=2)
+    common = {"policy__device": "cpu", "policy__push_to_hub": "false", "batch_size": 4, "steps": 2, "save_freq": 2}
+    data = {"dataset__repo_id": "test/avoid", "dataset__root": folder / "data", "dataset__use_imagenet_stats": "false"}
+    return arguments(policy__type=kind, output_dir=folder / run, **(data | common | policy | overrides))
 
 
 @pytest.fixture(scope="module")
-def by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """Return a UR5's ACT on its joints and one of its cameras, trained by bhd-train."""
-    folder = tmp_path_factory.mktemp("ur5")
-    robot = arguments(robot__type="ur5", robot__camera="true", robot__camera_width=32, robot__camera_height=32)
-    of_ur5: dict[str, Any] = {"robot__type": "ur5", "robot__beams": None, "task__type": "reach", "brain__type": "reach"}
-    camera = {"robot__camera": "true", "robot__camera_width": 32, "robot__camera_height": 32}
-    run_record(
-        folder / "data", **of_ur5, **camera, dataset__episode_time_s=0.4, dataset__fps=25, dataset__num_episodes=2
-    )
-    small = {f"policy__{name}": 1 for name in ("n_encoder_layers", "n_vae_encoder_layers", "n_heads")}
-    options = arguments(
-        dataset__repo_id="test/avoid",
-        dataset__root=folder / "data",
-        policy__type="act",
-        policy__device="cpu",
-        policy__input_features="{observation.state: {type: STATE, shape: [14]}, "
-        "observation.images.scene: {type: VISUAL, shape: [3, 32, 32]}}",
-        policy__pretrained_backbone_weights="null",
-        policy__chunk_size=6,
-        policy__n_action_steps=3,
-        policy__dim_model=16,
-        policy__dim_feedforward=16,
-        policy__latent_dim=4,
-        **small,
-        batch_size=4,
-        steps=1,
-        save_freq=1,
-        threads=1,
-        output_dir=folder / "run",
-    )
-    assert train.main(options) == 0
-    return Trained(
-        folder / "run" / "checkpoints" / "last" / "pretrained_model",
-        [*robot, *arguments(task__type="reach", task__duration_s=0.4)],
-        arguments(
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Trained]:
+    """Return a function that trains a type of policy by one of the programs; each once."""
+
+    @functools.cache
+    def make(kind: str, program: str) -> Trained:
+        folder = tmp_path_factory.mktemp(kind)
+        robot, task, body, _ = KINDS[kind]
+        seconds = 1.0 if robot == "turtlebot3" else 0.4
+        own = {name.removeprefix("robot__"): value for name, value in body.items() if name != "robot__camera"}
+        own |= {"beams": BEAMS} if robot == "turtlebot3" else {}
+        env = arguments(
             env__type="bhd",
-            env__task="UR5Reach-v0",
-            env__cameras="true",
-            env__robot="{camera_width: 32, camera_height: 32}",
-            env__task_options="{duration_s: 0.4}",
-        ),
-        [*robot, *arguments(robot__scene="reach", robot__seed=SEED)],
-    )
+            env__task=ENVIRONMENTS[task],
+            env__cameras="true" if body else "false",
+            env__robot=f"{{{', '.join(f'{name}: {value}' for name, value in own.items())}}}",
+            env__task_options=f"{{duration_s: {seconds}}}",
+        )
+        if program == "bhd-train":
+            assert train.main([*training(folder, kind), "--threads=1"]) == 0
+        elif kind == "bhd_mlp":  # evaluated in between
+            evaluated = arguments(env_eval_freq=2, eval__n_episodes=1, eval__batch_size=1)
+            run_stock("lerobot-train", [*training(folder, kind), "--num_workers=0", *env, *evaluated])
+            assert list((folder / "run" / "eval").glob("videos_step_*/**/*.mp4"))
+        else:
+            run_stock("lerobot-train", [*training(folder, kind), "--num_workers=0", "--env_eval_freq=0"])
+        options = arguments(robot__type=robot, **({"robot__beams": BEAMS} if robot == "turtlebot3" else {}), **body)
+        scene = {"robot__arena": "random"} if robot == "turtlebot3" else {"robot__scene": task}
+        if task == "pick":
+            scene["task"] = PickTask(PickConfig(), 1, 25).sample(SEED).instruction
+        return Trained(
+            folder / "run" / "checkpoints" / "last" / "pretrained_model",
+            [*options, *arguments(task__type=task, task__duration_s=seconds)],
+            env,
+            [*options, *arguments(**scene, robot__seed=SEED)],
+        )
 
-
-@pytest.fixture(scope="module")
-def pixels_by_lerobot_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    return from_pixels(tmp_path_factory.mktemp("pixels"), "lerobot-train")
-
-
-@pytest.fixture(scope="module")
-def pixels_by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    return from_pixels(tmp_path_factory.mktemp("pixels"), "bhd-train")
-
-
-def from_pixels(folder: Path, program: str) -> Trained:
-    """Return a UR5's `bhd_pixels`, which reads an instruction and remembers its first image."""
-    robot = arguments(robot__type="ur5", robot__camera="true", robot__camera_width=96, robot__camera_height=72)
-    of_ur5: dict[str, Any] = {"robot__type": "ur5", "robot__beams": None, "task__type": "pick", "brain__type": "pick"}
-    camera = {"robot__camera": "true", "robot__camera_width": 96, "robot__camera_height": 72}
-    run_record(
-        folder / "data", **of_ur5, **camera, dataset__episode_time_s=0.4, dataset__fps=25, dataset__num_episodes=2
-    )
-    options = arguments(
-        dataset__repo_id="test/avoid",
-        dataset__root=folder / "data",
-        dataset__use_imagenet_stats="false",
-        policy__type="bhd_pixels",
-        policy__device="cpu",
-        policy__push_to_hub="false",
-        policy__hidden_dims="[16]",
-        policy__n_action_steps=3,
-        batch_size=4,
-        steps=2,
-        save_freq=2,
-        output_dir=folder / "run",
-    )
-    if program == "bhd-train":
-        assert train.main([*options, "--threads=1"]) == 0
-    else:
-        run_stock("lerobot-train", [*options, *arguments(num_workers=0, env_eval_freq=0)])
-    instruction = PickTask(PickConfig(), 1, 25).sample(SEED).instruction
-    return Trained(
-        folder / "run" / "checkpoints" / "last" / "pretrained_model",
-        [*robot, *arguments(task__type="pick", task__duration_s=0.4)],
-        arguments(
-            env__type="bhd",
-            env__task="UR5Pick-v0",
-            env__cameras="true",
-            env__robot="{camera_width: 96, camera_height: 72}",
-            env__task_options="{duration_s: 0.4}",
-        ),
-        [*robot, *arguments(robot__scene="pick", robot__seed=SEED, task=instruction)],
-    )
-
-
-@pytest.fixture(scope="module")
-def cnn_by_lerobot_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    return from_front_camera(tmp_path_factory.mktemp("cnn"), "lerobot-train")
-
-
-@pytest.fixture(scope="module")
-def cnn_by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    return from_front_camera(tmp_path_factory.mktemp("cnn"), "bhd-train")
-
-
-def from_front_camera(folder: Path, program: str) -> Trained:
-    """Return a TurtleBot3's `bhd_cnn`, which remembers images and odometry."""
-    body = {"robot__odometry": "true", "robot__camera": "true", "robot__camera_width": 64, "robot__camera_height": 48}
-    robot = arguments(robot__type="turtlebot3", robot__beams=BEAMS, **body)
-    run_record(folder / "data", robot__beams=BEAMS, **body, dataset__episode_time_s=1.0, dataset__num_episodes=2)
-    options = arguments(
-        dataset__repo_id="test/avoid",
-        dataset__root=folder / "data",
-        dataset__use_imagenet_stats="false",
-        policy__type="bhd_cnn",
-        policy__device="cpu",
-        policy__push_to_hub="false",
-        policy__hidden_dims="[16]",
-        policy__n_obs_steps=3,
-        policy__obs_stride=2,
-        batch_size=4,
-        steps=2,
-        save_freq=2,
-        output_dir=folder / "run",
-    )
-    if program == "bhd-train":
-        assert train.main([*options, "--threads=1"]) == 0
-    else:
-        run_stock("lerobot-train", [*options, *arguments(num_workers=0, env_eval_freq=0)])
-    return Trained(
-        folder / "run" / "checkpoints" / "last" / "pretrained_model",
-        [*robot, *arguments(task__type="avoid", task__duration_s=1.0)],
-        arguments(
-            env__type="bhd",
-            env__task="TurtleBot3Avoid-v0",
-            env__cameras="true",
-            env__robot=f"{{beams: {BEAMS}, odometry: true, camera_width: 64, camera_height: 48}}",
-            env__task_options="{duration_s: 1.0}",
-        ),
-        [*robot, *arguments(robot__arena="random", robot__seed=SEED)],
-    )
+    return make
 
 
 @pytest.mark.parametrize(
-    "which",
+    ("kind", "program"),
     [
-        *("by_lerobot_train", "by_bhd_train", "pixels_by_lerobot_train", "pixels_by_bhd_train"),
-        *("cnn_by_lerobot_train", "cnn_by_bhd_train"),
+        *(("bhd_mlp", "lerobot-train"), ("act", "bhd-train")),
+        *((kind, program) for kind in ("bhd_pixels", "bhd_cnn") for program in ("lerobot-train", "bhd-train")),
     ],
 )
 def test_a_checkpoint_does_the_same_in_all_three_programs(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
+    kind: str, program: str, trained: Callable[[str, str], Trained], tmp_path: Path
 ) -> None:
-    trained: Trained = request.getfixturevalue(which)
-    assert (trained.checkpoint / CONTRACT_FILE).exists() == which.endswith("by_bhd_train")
-    ours = trace_bhd_eval(tmp_path / "bhd", [*trained.bhd_eval, f"--brain.path={trained.checkpoint}"])
-    path = f"--policy.path={trained.checkpoint}"
-    theirs = trace_lerobot_eval(tmp_path / "lerobot", [*trained.lerobot_eval, path])
+    made = trained(kind, program)
+    assert (made.checkpoint / CONTRACT_FILE).exists() == (program == "bhd-train")
+    ours = trace_bhd_eval(tmp_path / "bhd", [*made.bhd_eval, f"--brain.path={made.checkpoint}"])
+    path = f"--policy.path={made.checkpoint}"
+    theirs = trace_lerobot_eval(tmp_path / "lerobot", [*made.lerobot_eval, path])
     frames = len(theirs.done)
-    robots = trace_lerobot_rollout(frames, [*trained.lerobot_rollout, path])
+    robots = trace_lerobot_rollout(frames, [*made.lerobot_rollout, path])
     assert len(ours.done) == len(robots.done) == frames >= 10
     # The three start alike, so equal actions are what keeps the observations equal to the end.
     assert np.array_equal(ours.seen, theirs.seen)
@@ -266,10 +172,25 @@ def test_a_checkpoint_does_the_same_in_all_three_programs(
     assert not connected_robots()
 
 
-def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize("kind", ["bhd_mlp", "bhd_cnn", "bhd_pixels", "bhd_perception"])
+def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_path: Path) -> None:
+    once = {"save_freq": 1, "threads": 1, "num_workers": 0}
+    for run, budget in (("whole", 4.0), ("stock_loader", 1e-6)):
+        assert train.main(training(tmp_path, kind, run, **once, budget_gib=budget)) == 0
+    last = [tmp_path / run / "checkpoints" / "000002" / "pretrained_model" for run in ("whole", "stock_loader")]
+    whole, by_stock = ((folder / "model.safetensors").read_bytes() for folder in last)
+    assert by_stock == whole
+    shutil.rmtree(last[0].parent)
+    assert train.main(["--resume=true", f"--config_path={last[0].parents[1] / '000001' / 'pretrained_model'}"]) == 0
+    assert (last[0] / "model.safetensors").read_bytes() == whole
+
+
+def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(
+    trained: Callable[[str, str], Trained],
+) -> None:
     """It imports our package as a plug-in, and nothing else of it; here, other tests have imported everything."""
-    made = ("by_lerobot_train", "by_bhd_train", "pixels_by_bhd_train", "cnn_by_bhd_train")
-    paths = [str(request.getfixturevalue(one).checkpoint) for one in made]
+    made = [("bhd_mlp", "lerobot-train"), *((kind, "bhd-train") for kind in ("act", "bhd_pixels", "bhd_cnn"))]
+    paths = [str(trained(*one).checkpoint) for one in made]
     program = f"""
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
@@ -289,10 +210,11 @@ print(*ProcessorStepRegistry.list())
 
 
 def test_lerobot_rollout_ends_after_its_duration_and_what_it_records_is_a_dataset(
-    by_lerobot_train: Trained, tmp_path: Path
+    trained: Callable[[str, str], Trained], tmp_path: Path
 ) -> None:
+    made = trained("bhd_mlp", "lerobot-train")
     options = arguments(
-        policy__path=by_lerobot_train.checkpoint,
+        policy__path=made.checkpoint,
         strategy__type="sentry",
         fps=10,
         duration=0.5,
@@ -304,7 +226,7 @@ def test_lerobot_rollout_ends_after_its_duration_and_what_it_records_is_a_datase
         dataset__single_task="Roam.",
         dataset__push_to_hub="false",
     )
-    run_stock("lerobot-rollout", [*by_lerobot_train.lerobot_rollout, *options])
+    run_stock("lerobot-rollout", [*made.lerobot_rollout, *options])
     dataset = LeRobotDataset("test/rollout_avoid", root=tmp_path / "rollout")
     names = [f"scan_{beam:03}.pos" for beam in range(BEAMS)]
     assert dataset.meta.features["observation.state"]["names"] == ["x.vel", "theta.vel", *names]

@@ -13,13 +13,11 @@ from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
-from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, scene
+from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, episodes, scene
 
 GRASPED = 0.06  # [m] the opening when the cup is between the fingers
 
@@ -282,15 +280,9 @@ def test_a_task_that_reports_no_objects_is_refused() -> None:
 # --- in the simulator ------------------------------------------------------------------------------------------------
 
 
-def episodes(brain, seeds: list[int], config: PickConfig, simulation: UR5Simulation | None = None) -> list[Episode]:
-    simulation = simulation or UR5Simulation(UR5Config(), len(seeds), threads=1)
-    task = PickTask(config, simulation.n, simulation.config.fps)
-    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(k, seed) for k, seed in enumerate(seeds)]))
-
-
 def test_it_picks() -> None:
     seeds = [episode_seed(11, episode, "train") for episode in range(4)]
-    for episode in episodes(PickBrain(), seeds, PickConfig()):
+    for episode in episodes(PickBrain(), PickTask, PickConfig(), seeds):
         assert episode.outcome.success, episode.plan
         assert episode.plan["attempts"] == 1
         assert [result.task_id for _, result in episode.results] == [command.task_id for _, command in episode.commands]
@@ -300,8 +292,8 @@ def test_with_a_camera_error_that_it_knows_it_picks_as_before() -> None:
     error = (0.0, 0.05, 0.02)
     seeds = [episode_seed(11, episode, "train") for episode in range(2)]
     off = PickConfig(randomisation=RandomisationConfig(enabled=True, camera_error_m=list(error)))
-    right = episodes(PickBrain(), seeds, PickConfig(randomisation=RandomisationConfig(enabled=True)))
-    knows = episodes(PickBrain(PickBrainConfig(camera_error_m=list(error))), seeds, off)
+    right = episodes(PickBrain(), PickTask, PickConfig(randomisation=RandomisationConfig(enabled=True)), seeds)
+    knows = episodes(PickBrain(PickBrainConfig(camera_error_m=list(error))), PickTask, off, seeds)
     for before, one in zip(right, knows, strict=True):
         assert one.outcome.success
         assert len(one.columns["action"]) == len(before.columns["action"])
@@ -334,7 +326,7 @@ def test_an_object_that_moves_away_under_the_gripper_is_picked_at_the_second_att
     simulation = UR5Simulation(UR5Config(), 1, threads=1)
     brain = Thief(simulation)
     config = PickConfig(max_objects=1, duration_s=30.0)
-    episode = episodes(brain, [episode_seed(5, 0, "train")], config, simulation)[0]
+    episode = episodes(brain, PickTask, config, [episode_seed(5, 0, "train")], simulation=simulation)[0]
     assert brain.moved
     steps = [command.task_id.split("-")[1] for _, command in episode.commands]
     assert steps[:5] == ["above", "down", "close", "back", "above"]

@@ -6,46 +6,29 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
+from bhd_lerobot.control.commands import CommandResult, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.brain import RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.types import Episode
 from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
+from tests.policies.arm_desk import Bench, episodes
 
 TARGET = np.array([0.5, 0.1, 0.3, 0.0, 0.6, 0.8, 0.0])
 
 
-class Desk:
-    """n targets, a brain, and the goals that it gives."""
+class Desk(Bench):
+    """n targets."""
+
+    failure, message = ResultCode.UNREACHABLE, "no way"
 
     def __init__(self, n: int = 1, **options: Any) -> None:
-        self.n, self.brain = n, ReachBrain(ReachBrainConfig(**options))
         self.targets = np.tile(TARGET, (n, 1))
-        self.last: dict[int, BrainCommand] = {}
-        self.names: list[tuple[int, str]] = []
-        self.brain.bind(RobotFeatures(("a",), ("a",), 25, ENVIRONMENT))
-        self.brain.reset(np.arange(n), [0] * n, n)
-
-    def look(self, results: dict[int, list[CommandResult]] | None = None) -> dict[int, BrainCommand]:
-        goals = self.brain.act(Observation(("a",), np.zeros((self.n, 1)), {}, self.targets, results or {}))
-        assert isinstance(goals, Goals)
-        new = {sim: commands[0] for sim, commands in goals.commands.items()}
-        for sim, command in new.items():
-            assert (sim, command.task_id) not in self.names
-            self.names.append((sim, command.task_id))
-        self.last |= new
-        return new
-
-    def end(self, success: bool = True, sim: int = 0) -> BrainCommand | None:
-        code = ResultCode.SUCCEEDED if success else ResultCode.UNREACHABLE
-        return self.look({sim: [CommandResult(self.last[sim].task_id, success, code, "no way")]}).get(sim)
+        super().__init__(ReachBrain(ReachBrainConfig(**options)), self.targets, ENVIRONMENT, ("a",))
+        self.begin()
 
 
 def test_it_asks_for_the_target_once_and_holds() -> None:
@@ -129,7 +112,7 @@ def test_simulations_do_not_influence_each_other_and_strange_results_are_ignored
     assert [goals[sim].target_pose.position[0] for sim in range(3)] == [0.5, 0.4, 0.5]  # type: ignore[union-attr]
     stray = CommandResult("7-reach", False, ResultCode.FAULT, "")
     assert desk.look({0: [stray], 1: [stray], 9: [stray]}) == {}
-    home = desk.end(success=False, sim=1)
+    home = desk.end(1, success=False)
     assert home is not None
     assert home.joint_target is not None
     assert list(desk.brain.subtasks()) == ["move the tool to the target", "go home", "move the tool to the target"]
@@ -140,7 +123,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
     desk.look()
     desk.end(success=False)
     desk.brain.reset(np.array([0]), [0], 1)
-    desk.names.clear()
+    desk.given[0].clear()
     assert desk.look()[0].task_id == "1-reach"
     assert desk.end() is None
     assert desk.brain.subtasks()[0] == "hold"
@@ -157,10 +140,8 @@ def test_a_task_without_a_target_is_refused() -> None:
 @pytest.mark.parametrize("randomised", [False, True])
 def test_it_reaches(randomised: bool) -> None:
     config = ReachConfig(randomisation=RandomisationConfig(enabled=randomised))
-    simulation = UR5Simulation(UR5Config(), 4, threads=1)
-    loop = EpisodeLoop(simulation, ReachTask(config, 4, simulation.config.fps), ReachBrain())
-    specs = [EpisodeSpec(index, episode_seed(3, index, "train")) for index in range(8)]
-    for episode in loop.run(specs):
+    seeds = [episode_seed(3, index, "train") for index in range(8)]
+    for episode in episodes(ReachBrain(), ReachTask, config, seeds, n=4):
         assert episode.outcome.success, episode.results
         assert episode.outcome.details["error_m"] <= config.tolerance_m
         assert [result.task_id for _, result in episode.results] == ["1-reach"]
@@ -168,13 +149,11 @@ def test_it_reaches(randomised: bool) -> None:
 
 def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not() -> None:
     error = (0.012, -0.009, 0.01)  # 18 mm
-    simulation = UR5Simulation(UR5Config(), 4, threads=1)
     off = RandomisationConfig(enabled=True, camera_error_m=list(error))
 
     def run(randomisation: RandomisationConfig, brain: ReachBrainConfig) -> list[Episode]:
-        task = ReachTask(ReachConfig(duration_s=4.0, randomisation=randomisation), 4, simulation.config.fps)
-        loop = EpisodeLoop(simulation, task, ReachBrain(brain))
-        return list(loop.run([EpisodeSpec(index, episode_seed(3, index, "train")) for index in range(4)]))
+        seeds = [episode_seed(3, index, "train") for index in range(4)]
+        return episodes(ReachBrain(brain), ReachTask, ReachConfig(duration_s=4.0, randomisation=randomisation), seeds)
 
     right = run(RandomisationConfig(enabled=True), ReachBrainConfig())
     knows, trusts = run(off, ReachBrainConfig(camera_error_m=list(error))), run(off, ReachBrainConfig())

@@ -20,18 +20,15 @@ from bhd_lerobot.policies.manipulation.servo import (
     ServoConfig,
 )
 from bhd_lerobot.robots.arm_host import TOOL_NAMES
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.pick import ENVIRONMENT, PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
+from tests.policies.arm_desk import episodes
 
 POSE = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
-TOOL = UR5Config(action_space="tool", tool_pose=True)
+TOOL = {"action_space": "tool", "tool_pose": True}
 
 
 def features(environment: tuple[str, ...]) -> RobotFeatures:
@@ -67,16 +64,15 @@ def pick(config: PickServoConfig | None = None) -> PickServoBrain:
 @each_case(("randomised", "wider"), [(False, 0.0), (True, 0.016)])
 def test_it_picks(randomised: bool, wider: float) -> None:
     config = PickConfig(order="random", randomisation=RandomisationConfig(enabled=randomised))
-    simulation = UR5Simulation(TOOL, 4)
-    loop = EpisodeLoop(simulation, PickTask(config, 4, 25), PickServoBrain(PickServoConfig(wider_m=wider)))
-    episodes = list(loop.run([EpisodeSpec(i, episode_seed(5, i, "train")) for i in range(8)]))
-    assert [episode.outcome.event for episode in episodes] == [Event.SUCCESS] * 8
+    seeds = [episode_seed(5, i, "train") for i in range(8)]
+    done = episodes(PickServoBrain(PickServoConfig(wider_m=wider)), PickTask, config, seeds, n=4, **TOOL)
+    assert [episode.outcome.event for episode in done] == [Event.SUCCESS] * 8
 
 
 def test_it_reaches() -> None:
-    loop = EpisodeLoop(UR5Simulation(TOOL, 4), ReachTask(ReachConfig(), 4, 25), ReachServoBrain())
-    episodes = list(loop.run([EpisodeSpec(i, episode_seed(0, i, "train")) for i in range(4)]))
-    assert sum(episode.outcome.success for episode in episodes) >= 3  # straight ways may lead through singularities
+    seeds = [episode_seed(0, i, "train") for i in range(4)]
+    done = episodes(ReachServoBrain(), ReachTask, ReachConfig(), seeds, **TOOL)
+    assert sum(episode.outcome.success for episode in done) >= 3  # straight ways may lead through singularities
 
 
 @each_case(("brain", "environment"), [(PickServoBrain(), ENVIRONMENT), (ReachServoBrain(), POSE)])

@@ -20,6 +20,7 @@ from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptio
 from bhd_lerobot.registry import make_brain
 from bhd_lerobot.rollout.configuration import parse
 from tests.cases import each_case
+from tests.policies.learned.rig import save_policy
 from tests.recording.support import run_record
 from tests.training.support import make_dataset, run_train
 
@@ -190,20 +191,8 @@ def test_checkpoints_that_are_none(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_policy_that_acts_is_no_perception(tmp_path: Path) -> None:
-    root, folder = make_dataset(tmp_path / "data"), tmp_path / "run"
-    run_train(
-        [
-            f"--dataset.root={root}",
-            "--dataset.repo_id=test/data",
-            f"--output_dir={folder}",
-            "--policy.type=bhd_mlp",
-            "--policy.device=cpu",
-            "--steps=2",
-            "--batch_size=4",
-        ]
-    )
     with pytest.raises(ConfigError, match=r"a 'bhd_mlp'; perception is a 'bhd_perception'.*--brain.path"):
-        Perceiver(PerceptionOptions(str(folder)))
+        Perceiver(PerceptionOptions(str(save_policy(tmp_path))))
 
 
 def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_path: Path) -> None:

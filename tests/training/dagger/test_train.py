@@ -24,27 +24,22 @@ CONFIGS = Path("configs").absolute()
 BRIEF = ["--robot.beams=36", "--task.duration_s=2"]
 
 
+def stage(name: str, *options: str) -> dict[str, Any]:
+    return {"config": str(CONFIGS / f"{name}.yaml"), "options": list(options)}
+
+
 def settings(folder: Path, **changed: Any) -> Path:
     """Write a configuration of short rounds; return the file."""
-    record = {"options": [*BRIEF, "--n_envs=2", "--preview_video=false"]}
+    record = (*BRIEF, "--n_envs=2", "--preview_video=false")
+    training = ("--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]")
     values: dict[str, Any] = {
         "algorithm": "dagger",
-        "expert": {
-            "config": str(CONFIGS / "record/turtlebot3_avoid.yaml"),
-            "options": [*record["options"], "--brain.type=gap_follower", "--brain.margin_m=0.08"],
-        },
-        "learner": {
-            "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
-            "options": [*record["options"], "--brain.expert.margin_m=0.08", "--brain.learner.exact=true"],
-        },
-        "policy": {
-            "config": str(CONFIGS / "train/bc_turtlebot3_avoid.yaml"),
-            "options": [
-                *("--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]"),
-                "--selection.learner_weight=0.5",
-            ],
-        },
-        "evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [*BRIEF, "--n_envs=2"]},
+        "expert": stage("record/turtlebot3_avoid", *record, "--brain.type=gap_follower", "--brain.margin_m=0.08"),
+        "learner": stage(
+            "record/turtlebot3_avoid_dagger", *record, "--brain.expert.margin_m=0.08", "--brain.learner.exact=true"
+        ),
+        "policy": stage("train/bc_turtlebot3_avoid", *training, "--selection.learner_weight=0.5"),
+        "evaluation": stage("eval/turtlebot3_avoid", *BRIEF, "--n_envs=2"),
         "output_dir": str(folder / "run"),
         "rounds": 1,
         "expert_episodes": 2,
@@ -238,21 +233,19 @@ def test_files_that_say_something_else_than_before_are_not_gone_on_with(
 
 
 def test_a_training_that_had_ended_before_it_was_noted_is_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    argument = f"--config_path={settings(tmp_path, rounds=0)}"
-    assert main([argument]) == 0
-    (tmp_path / "run" / "round_0" / "done.json").write_text(json.dumps({"done": ["record"], "seconds": 1.0}))
+    run = shutil.copytree(finished / "run", tmp_path / "run", symlinks=True)
+    (run / "round_0" / "done.json").write_text(json.dumps({"done": ["record"], "seconds": 1.0}))
     called: list[str] = []
     programs = {name: lambda given, name=name: called.append(name) or 130 for name in dagger._PROGRAMS}
     monkeypatch.setattr(dagger, "_PROGRAMS", programs)
-    assert main([argument]) == 130
+    assert main([f"--config_path={run / 'config.yaml'}"]) == 130
     assert called == ["bhd-eval"]
 
 
-def test_the_expert_is_judged_as_it_is_configured(tmp_path: Path) -> None:
-    assert main([f"--config_path={settings(tmp_path, rounds=0)}"]) == 0
-    judged = yaml.safe_load((tmp_path / "run" / "round_0" / "evaluation" / "config.yaml").read_text())
+def test_the_expert_is_judged_as_it_is_configured(finished: Path) -> None:
+    judged = yaml.safe_load((finished / "run" / "round_0" / "evaluation" / "config.yaml").read_text())
     assert judged["brains"]["expert"]["margin_m"] == 0.08
 
 
@@ -304,10 +297,10 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
     called: list[list[str]] = []
     monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda given: called.append(given) or 1))
     stages = {
-        "expert": {"config": str(CONFIGS / "record/ur5_pick.yaml"), "options": []},
-        "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
-        "policy": {"config": str(CONFIGS / "train/bc_ur5_pick_servo.yaml"), "options": []},
-        "evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []},
+        "expert": stage("record/ur5_pick"),
+        "learner": stage("record/ur5_pick_dagger"),
+        "policy": stage("train/bc_ur5_pick_servo"),
+        "evaluation": stage("eval/ur5_pick"),
     }
     config = parse_aggregation([f"--config_path={settings(tmp_path, **stages)}"])
     found = read_stages(config)
@@ -333,13 +326,10 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
         ({"data": ["nowhere"]}, "nowhere"),
         ({"policy": {"config": "", "options": []}}, "policy.config is empty; name a configuration file"),
         ({"policy": {"config": "missing.yaml", "options": []}}, "missing.yaml"),
-        (
-            {"learner": {"config": str(CONFIGS / "record/turtlebot3_avoid.yaml"), "options": []}},
-            "whose brain is 'avoidance'; it must be 'dagger'",
-        ),
+        ({"learner": stage("record/turtlebot3_avoid")}, "whose brain is 'avoidance'; it must be 'dagger'"),
         *(
             (
-                {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [f"--{name}=x"]}},
+                {"evaluation": stage("eval/turtlebot3_avoid", f"--{name}=x")},
                 f"The option --{name} of .* is set by the rounds themselves",
             )
             for name in ("split", "brains.policy.path", "brains.expert.margin_m")
@@ -350,35 +340,27 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
         ),
         ({"data": ["without"]}, r"data names without, which has no expert\.action"),
         (
-            {"evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []}},
+            {"evaluation": stage("eval/ur5_pick")},
             "robot.type is 'ur5' in evaluation.config, .*ur5_pick.yaml', and 'turtlebot3' in that of the expert",
         ),
         (
-            {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_navigate.yaml"), "options": []}},
+            {"evaluation": stage("eval/turtlebot3_navigate")},
             "task.type is 'navigate' in evaluation.config, .* and 'avoid' in that of the expert",
         ),
         (
-            {"learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []}},
+            {"learner": stage("record/ur5_pick_dagger")},
             "robot.type is 'ur5' in learner.config, .*ur5_pick_dagger.yaml', and 'turtlebot3' in that of the expert",
         ),
         (
-            {
-                "learner": {
-                    "config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"),
-                    "options": [*BRIEF, "--dataset.fps=5"],
-                }
-            },
+            {"learner": stage("record/turtlebot3_avoid_dagger", *BRIEF, "--dataset.fps=5")},
             "the frame rate is 5 in learner.config, .* and 10 in that of the expert",
         ),
         (
             {
-                "expert": {"config": str(CONFIGS / "record/ur5_pick.yaml"), "options": []},
-                "evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []},
-                "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
-                "policy": {
-                    "config": str(CONFIGS / "train/bc_ur5_pick_servo.yaml"),
-                    "options": ["--selection.learner_weight=2"],
-                },
+                "expert": stage("record/ur5_pick"),
+                "evaluation": stage("eval/ur5_pick"),
+                "learner": stage("record/ur5_pick_dagger"),
+                "policy": stage("train/bc_ur5_pick_servo", "--selection.learner_weight=2"),
             },
             "--selection.learner_weight of .* they are not learned from",
         ),

@@ -81,7 +81,6 @@ def test_a_vector_is_what_the_policy_sees_of_the_frames_that_its_configuration_n
     batch = {"observation.state": torch.from_numpy(np.stack([seen[1], seen[3], seen[5]], axis=1))}
     wanted = rig.parts.front.features(rig.parts.before(batch)).detach().numpy()
     np.testing.assert_array_equal(stack.features(), wanted)
-    np.testing.assert_array_equal(stack.features(np.array([2])), wanted[2:])
 
 
 def test_at_an_episodes_start_nothing_was_before_its_first_frame(rig: Rig) -> None:

@@ -14,7 +14,7 @@ def test_a_point_stands_for_the_last_episodes_however_many_end_in_an_update() ->
             {"step": step, "lr": 1.0} | ({"episodes": len(one), "success": float(one.mean())} if len(one) else {})
             for step, one in enumerate(ended)
         ]
-        points = recent(rows, "step", "success")
+        points = recent(rows, "success")
         assert points is not None
         assert points[0] == [step for step, one in enumerate(ended) if len(one)]
         for step, value in zip(*points, strict=True):
@@ -27,4 +27,4 @@ def test_a_point_stands_for_the_last_episodes_however_many_end_in_an_update() ->
 
 
 def test_there_is_no_curve_before_an_episode_has_ended() -> None:
-    assert recent([{"step": 1, "lr": 1.0}], "step", "success") is None
+    assert recent([{"step": 1, "lr": 1.0}], "success") is None
