@@ -23,12 +23,12 @@ from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.rollout.options_help import meanings_of, summary_of
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event

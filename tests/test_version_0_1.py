@@ -9,15 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot import renames
+from bhd_lerobot.cli import evaluate, record, replay, train
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.recording import record
-from bhd_lerobot.rollout import replay
-from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.training import train
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.training.rl.config import RlConfig
 from tests.apps.view.support import served
 

@@ -15,15 +15,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.text import perception_sentence, sentences
+from bhd_lerobot.options.command import Parser, exit_status
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording import record
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout import replay
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.training import train
 from bhd_lerobot.training.arguments import parse_train
 

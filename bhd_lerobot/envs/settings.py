@@ -8,8 +8,8 @@ from typing import Any
 
 from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.parse import decode
 from bhd_lerobot.registry import is_for, robot_configs, robot_of_task
-from bhd_lerobot.rollout.configuration import decode
 from bhd_lerobot.tasks.task import TaskConfig
 
 OBS_TYPES: dict[str, tuple[str, ...]] = {

@@ -21,7 +21,7 @@ from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults
 from bhd_lerobot.evaluation.statistics import Estimate
 from bhd_lerobot.evaluation.text import number, percent, sentences
-from bhd_lerobot.rollout.configuration import encode
+from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
 VIDEO_BYTES = 12_000_000  # videos in the page; those beyond stay files beside it

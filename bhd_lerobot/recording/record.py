@@ -1,9 +1,8 @@
 """`bhd-record`: episodes of a simulated robot, driven by a brain, into a LeRobotDataset."""
 
 import os
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
@@ -30,17 +29,15 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetEditedError, RealtimeError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary, progress_bars
-from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.host import Host, describe
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
@@ -432,22 +429,3 @@ def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
             console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
             raise
     console.print(escape(message), soft_wrap=True, highlight=False)
-
-
-def _main(config: RecordConfig, arguments: Sequence[str]) -> int:
-    try:
-        return record(config).exit_status
-    except DatasetEditedError as error:
-        for line in instead_of_resuming(config, arguments):
-            error.add_note(line)
-        raise
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-record`; return the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    return run(lambda config: _main(config, arguments), RecordConfig, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,8 +5,6 @@ the robot is put into each recorded physics state, and its sensors are read agai
 """
 
 import json
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,6 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.plots import draw_divergence
 from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
 
@@ -310,18 +307,3 @@ def _robot_config(recorded: dict[str, Any]) -> Any:
     recorded = {"jerk_limits": False, **recorded}  # what is older than these limits was recorded without them
     parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
     return kind(**{**parameters, "camera": False, "clock": "lockstep"})
-
-
-def _main(config: ReplayConfig) -> int:
-    results = replay(config)
-    worst = max(float(result.position_m.max()) for result in results)
-    return int(config.tolerance_m is not None and worst > config.tolerance_m)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-replay`; return the exit status: 1 if the replay differs by more than `tolerance_m`."""
-    return run(_main, ReplayConfig, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

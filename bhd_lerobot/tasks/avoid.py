@@ -80,6 +80,7 @@ class AvoidTask(BaseTask):
     """
 
     name = "avoid"
+    never = (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE)
     needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     lasts = True
 

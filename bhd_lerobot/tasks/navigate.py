@@ -105,6 +105,7 @@ class NavigateTask(BaseTask):
     """
 
     name = "navigate"
+    never = (Event.WRONG_OBJECT, Event.DROPPED)
     needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     environment_names: tuple[str, ...] = ENVIRONMENT
 

@@ -136,6 +136,7 @@ class PickTask(ArmTask):
     """
 
     name = "pick"
+    never = (Event.STUCK,)
     environment_names = ENVIRONMENT
 
     def __init__(self, config: PickConfig, n: int, fps: int, body: Body | None = None) -> None:

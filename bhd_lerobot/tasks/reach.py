@@ -73,6 +73,7 @@ class ReachTask(ArmTask):
     """
 
     name = "reach"
+    never = (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK)
     environment_names = ENVIRONMENT
     needs: frozenset[str] | None = frozenset({"tool_pose"})
 

@@ -14,9 +14,9 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.world import World

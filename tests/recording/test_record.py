@@ -12,13 +12,14 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from bhd_lerobot.cli.record import main
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetExistsError, DatasetMismatchError, RenderingError
 from bhd_lerobot.hub.card import CardOptions, make_card
+from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import encode, parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
@@ -289,11 +290,11 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, messa
 
 
 def test_the_command_line_prints_a_sentence_and_a_status(tmp_path, capsys):
-    assert record_module.main(options(tmp_path / "d", robot__beems=3)) == 2
+    assert main(options(tmp_path / "d", robot__beems=3)) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: Unknown option 'robot.beems'. Did you mean 'robot.beams'?")
     assert "Traceback" not in error
-    assert record_module.main(["--help"]) == 0
+    assert main(["--help"]) == 0
     assert "--dataset.num_episodes" in capsys.readouterr().out
 
 

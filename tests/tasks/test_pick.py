@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.parse import parse as parse_configuration
 from bhd_lerobot.policies.language.instruction import RulePlanner, parse
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
 from bhd_lerobot.policies.manipulation.skills import scene_object
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse as parse_configuration
 from bhd_lerobot.tasks.pick import (
     HELD_OUT_INSTRUCTIONS,
     HELD_OUT_NAMES,

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.bodies.body import Arm, PositionLimits
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import is_being_written
@@ -19,7 +20,6 @@ from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.datasets.validate.values import Limits
 from bhd_lerobot.errors import DatasetLockedError, counted
-from bhd_lerobot.plugins import body_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain, MobileBase, WheelDrive
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
@@ -18,7 +19,6 @@ from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, counted
-from bhd_lerobot.plugins import body_of
 from bhd_lerobot.rosbag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.rosbag.exporter.export import export_bags
 from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME

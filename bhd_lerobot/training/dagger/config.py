@@ -7,14 +7,14 @@ from typing import Any
 
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.arguments import parse_train
 
 ALGORITHM = "dagger"
-CONFIG, FILES = "config.yaml", "files.yaml"
-"""What a run's folder keeps: the configuration, and what the files in it say."""
+FILES = "files.yaml"
+"""What the files say that the configuration of a run names, in the run's folder."""
 OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
@@ -203,17 +203,17 @@ def _names(stage: StageConfig) -> set[str]:
     return {option.removeprefix("--").partition("=")[0] for option in stage.options}
 
 
-def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
+def parse_aggregation(arguments: Sequence[str] | configuration.CommandLine) -> AggregationConfig:
     """Return what a command line asks for.
 
     Raises:
         ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
     """
-    config = configuration.parse(AggregationConfig, arguments)
-    given = configuration.read_overrides(arguments)
-    file = Path(str(given.get(configuration.CONFIG_PATH, ""))).expanduser()
-    if "output_dir" not in given and file.name == CONFIG and (file.parent / FILES).is_file():
-        config.output_dir = str(file.parent)  # it is that of a run, which may have been moved
+    line = configuration.read_line(arguments)
+    config, path = configuration.parse(AggregationConfig, line), line.path
+    if "output_dir" not in line.options and path is not None and path.name == configuration.RUN_CONFIG:
+        if (path.parent / FILES).is_file():  # it is that of a run, which may have been moved
+            config.output_dir = str(path.parent)
     return config
 
 
@@ -225,7 +225,7 @@ def kept(folder: Path) -> AggregationConfig | None:
     Raises:
         ConfigError: it cannot be read, or has what is no option.
     """
-    file = folder / CONFIG
+    file = folder / configuration.RUN_CONFIG
     if not file.is_file():
         return None
     return parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"])

@@ -21,11 +21,10 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
 from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
 from bhd_lerobot.recording import record
-from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
-    CONFIG,
     FILES,
     OWN,
     AggregationConfig,
@@ -33,7 +32,6 @@ from bhd_lerobot.training.dagger.config import (
     Stages,
     command,
     kept,
-    parse_aggregation,
     read_stages,
 )
 from bhd_lerobot.training.dagger.curve import draw_curve
@@ -140,7 +138,7 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         _check_same(folder, before, config, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, what in ((CONFIG, encode(config)), (FILES, files)):
+        for name, what in ((RUN_CONFIG, encode(config)), (FILES, files)):
             Disk().publish(folder / name, yaml.safe_dump(what, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
@@ -431,9 +429,3 @@ def _level(brain: dict[str, Any]) -> dict[str, Any]:
 
 def _interval(one: dict[str, float]) -> str:
     return f"{one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f})"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Learn in rounds; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    interrupted = "Stopped; what is done is kept, and the same command goes on there."
-    return run(train, AggregationConfig, arguments, read=parse_aggregation, interrupted=interrupted)

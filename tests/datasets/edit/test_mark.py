@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bhd_lerobot import tasks
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.edit.edits import edits_of
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.plugins import body_of
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 from tests.cases import each_case
 from tests.datasets import support

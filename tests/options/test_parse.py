@@ -3,9 +3,10 @@
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.options.help import help_of
+from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import encode, parse, run
-from bhd_lerobot.rollout.options_help import help_of
 from tests.cases import each_case
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
@@ -75,10 +76,10 @@ def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(cap
     def bug(config):
         raise RuntimeError("a bug")
 
-    assert run(fail, RecordConfig, REQUIRED) == 2
+    assert run(Program(RecordConfig, fail), REQUIRED) == 2
     assert capsys.readouterr().err == "error: a sentence\n"
     with pytest.raises(RuntimeError):
-        run(bug, RecordConfig, REQUIRED)
+        run(Program(RecordConfig, bug), REQUIRED)
 
 
 def test_help_lists_every_option():
@@ -112,5 +113,5 @@ def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
     def stopped(config):
         raise KeyboardInterrupt
 
-    assert run(stopped, RecordConfig, REQUIRED) == 130
+    assert run(Program(RecordConfig, stopped), REQUIRED) == 130
     assert capsys.readouterr().err == "Stopped.\n"

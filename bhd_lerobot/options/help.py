@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bhd_lerobot.rollout.configuration import choices_of, entries_of, options_of
+from bhd_lerobot.options.parse import choices_of, entries_of, options_of
 
 _INDENT = 26  # [characters] where meanings begin
 # What LeRobot's own classes say nowhere; where a class says it, that counts.
