@@ -210,10 +210,10 @@ def parse_aggregation(arguments: Sequence[str] | configuration.CommandLine) -> A
         ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
     """
     line = configuration.read_line(arguments)
-    config, path = configuration.parse(AggregationConfig, line), line.path
-    if "output_dir" not in line.options and path is not None and path.name == configuration.RUN_CONFIG:
-        if (path.parent / FILES).is_file():  # it is that of a run, which may have been moved
-            config.output_dir = str(path.parent)
+    config = configuration.parse(AggregationConfig, line)
+    run = line.path.parent if line.path is not None and line.path.name == configuration.RUN_CONFIG else None
+    if run is not None and "output_dir" not in line.options and (run / FILES).is_file():
+        config.output_dir = str(run)  # it may have been moved
     return config
 
 
