@@ -1,5 +1,6 @@
 """`bhd-train`: a policy learns from a dataset, by trial and error, or in rounds from what an expert would have done."""
 
+import importlib
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -8,8 +9,6 @@ from bhd_lerobot.cli.start import keep_memory
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import CommandLine
-
-_INTERRUPTED = "Stopped; checkpoints that were written before are complete."
 
 
 def algorithm_of(line: CommandLine) -> Any:
@@ -25,22 +24,9 @@ def algorithm_of(line: CommandLine) -> Any:
 def _program(line: CommandLine) -> Program:
     """Return what learns as a command line asks. Only that is imported: stable-baselines3 is an extra."""
     algorithm = algorithm_of(line)
-    if algorithm is None:
-        from bhd_lerobot.training import train
-        from bhd_lerobot.training.arguments import parse_train
-        from bhd_lerobot.training.config import BhdTrainConfig
-
-        return Program(BhdTrainConfig, lambda one: train.train(one).exit_status, parse_train, _INTERRUPTED)
-    if algorithm == "dagger":
-        from bhd_lerobot.training.dagger import train as dagger
-        from bhd_lerobot.training.dagger.config import AggregationConfig, parse_aggregation
-
-        kept = "Stopped; what is done is kept, and the same command goes on there."
-        return Program(AggregationConfig, dagger.train, parse_aggregation, kept)
-    from bhd_lerobot.training.rl import train as rl
-    from bhd_lerobot.training.rl.config import RlConfig, parse_rl
-
-    return Program(RlConfig, lambda config: rl.train(config).stopped_by.exit_status, parse_rl, _INTERRUPTED)
+    part = "" if algorithm is None else "dagger." if algorithm == "dagger" else "rl."
+    program: Program = importlib.import_module(f"bhd_lerobot.training.{part}train").PROGRAM
+    return program
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -68,7 +68,7 @@ def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
         body: the robot's hardware; None if it is not known.
     """
     grasping = (Event.WRONG_OBJECT, Event.DROPPED) if isinstance(body, MobileBase) else ()
-    known = getattr(TASKS[task], "never", ()) if task in TASKS else ()  # of one that is not known, anything
+    known = getattr(TASKS[task], "never", ()) if task and task in TASKS else ()  # of one that is not known, anything
     never = {event.cause for event in (*known, *grasping)}
     return tuple(name for name in OUTCOMES if name not in never)
 

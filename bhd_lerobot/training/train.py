@@ -11,10 +11,11 @@ from rich.markup import escape
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.command import Program
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training import checkpoint as train_checkpoint
-from bhd_lerobot.training.arguments import Request
+from bhd_lerobot.training.arguments import Request, parse_train
 from bhd_lerobot.training.checkpoint import TrainingParts, resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData, open_data, open_metadata, select_episodes
@@ -227,4 +228,12 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
     return agreed
 
 
-__all__ = ["TrainResult", "resume_command", "train"]
+PROGRAM = Program(
+    BhdTrainConfig,
+    lambda request: train(request).exit_status,
+    parse_train,
+    # Ctrl-C before the first step, or a second time while a step or a checkpoint was under way.
+    "Stopped; checkpoints that were written before are complete.",
+)
+
+__all__ = ["PROGRAM", "TrainResult", "resume_command", "train"]

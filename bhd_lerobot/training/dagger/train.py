@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ from bhd_lerobot.datasets.format.features import EXPERT_ACTION
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
-from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
-from bhd_lerobot.recording import record
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
     FILES,
@@ -32,6 +36,7 @@ from bhd_lerobot.training.dagger.config import (
     Stages,
     command,
     kept,
+    parse_aggregation,
     read_stages,
 )
 from bhd_lerobot.training.dagger.curve import draw_curve
@@ -41,9 +46,9 @@ _DONE = "done.json"
 _OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _SIGNALLED = 128  # what an exit status is above if a signal stopped the program
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
-    "bhd-record": record.main,
-    "bhd-train": training.main,
-    "bhd-eval": evaluate.main,
+    "bhd-record": partial(run, Program(RecordConfig, lambda config: record(config).exit_status)),
+    "bhd-train": partial(run, training.PROGRAM),
+    "bhd-eval": partial(run, Program(EvalConfig, lambda config: evaluate(config).exit_status)),
 }
 
 
@@ -429,3 +434,7 @@ def _level(brain: dict[str, Any]) -> dict[str, Any]:
 
 def _interval(one: dict[str, float]) -> str:
     return f"{one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f})"
+
+
+_KEPT = "Stopped; what is done is kept, and the same command goes on there."
+PROGRAM = Program(AggregationConfig, train, parse_aggregation, _KEPT)

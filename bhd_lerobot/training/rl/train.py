@@ -19,11 +19,12 @@ import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.options import parse as configuration
+from bhd_lerobot.options.command import Program
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training.checkpoint import clean, point
 from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, RunProgress, format_numbers, read_metrics
 from bhd_lerobot.training.rl import checkpoint as checkpoints
-from bhd_lerobot.training.rl.config import RlConfig
+from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 from bhd_lerobot.training.rl.log import PLOT_NAME, SHOWN, Row, draw_curve
 from bhd_lerobot.training.rl.parts import make_parts
 from bhd_lerobot.training.rl.validation import Level, Validation, level
@@ -350,3 +351,11 @@ class _Run:
 def _text(row: Row, prefix: str = "val") -> str:
     score, success, total = (row[f"{prefix}_{key}"] for key in ("score", "success", "return"))
     return f"score {score:.4f}, success {success:.3f}, return {total:.4f}"
+
+
+PROGRAM = Program(
+    RlConfig,
+    lambda config: train(config).stopped_by.exit_status,
+    parse_rl,
+    "Stopped; checkpoints that were written before are complete.",
+)
