@@ -53,26 +53,26 @@ written `null`.
 
 def reference() -> str:
     """Return the whole document."""
+    listed: dict[frozenset[type], str] = {}
     parts = [
         _INTRODUCTION,
         "## `bhd-record`\n",
-        *_options(RecordConfig, ""),
+        *_options(RecordConfig, "", listed),
         "## `bhd-replay`\n",
-        *_options(ReplayConfig, ""),
+        *_options(ReplayConfig, "", listed),
         "## `bhd-eval`\n",
-        *_options(EvalConfig, "", choices=False),
+        *_options(EvalConfig, "", listed),
         "## `bhd-train`\n",
         "LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their "
         "names and their meaning. Beside them:\n",
-        *_options(BhdTrainConfig, "", only=own_fields()),
+        *_options(BhdTrainConfig, "", listed, own_fields()),
         "## `bhd-train` with `algorithm: ppo`\n",
-        *_options(RlConfig, "", choices=False),
+        *_options(RlConfig, "", listed),
         "## `bhd-train` with `algorithm: dagger`\n",
-        *_options(AggregationConfig, "", choices=False),
+        *_options(AggregationConfig, "", listed),
         "## Teleoperator `bhd_brain`\n",
-        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`; its options "
-        "are those of `brain.*` above.\n",
-        *_options(BhdBrainConfig, "teleop.", choices=False),
+        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`.\n",
+        *_options(BhdBrainConfig, "teleop.", listed),
         "## Dataset columns\n",
         _columns(),
         "### Modes\n\nIn `control.mode`.\n",
@@ -97,36 +97,50 @@ def reference() -> str:
 
 
 def _options(
-    config_class: type, prefix: str, *, choices: bool = True, only: Sequence[str] | None = None
+    config_class: type, prefix: str, listed: dict[frozenset[type], str], only: Sequence[str] | None = None
 ) -> Iterator[str]:
-    """Yield the table of a class's plain options, and then those of the classes inside it."""
+    """Yield the table of a class's plain options, and then those of the classes inside it.
+
+    Args:
+        config_class: a dataclass.
+        prefix: of its options.
+        listed: groups of classes whose options are listed already, and the options that they are of; it is extended.
+        only: names of the fields to list; all if None.
+    """
     described, hints = meanings_of(config_class), typing.get_type_hints(config_class)
-    rows, inner = [], []
+    rows, inner, above = [], [], []
     for field in dataclasses.fields(config_class):
         if only is not None and field.name not in only:
             continue
         key, kind, meaning = f"{prefix}{field.name}", hints[field.name], described.get(field.name)
         if meaning is None:
             raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {field.name!r}.")
-        if _choices(kind):
+        groups = {f"{key}.type={name}": one for name, one in _choices(kind).items()}
+        if groups:
             default = _default(field)
             shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
             rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
-            # A choice that holds others of its own kind is listed once.
-            if choices and not issubclass(config_class, kind):
-                inner += [(f"`{key}.type={name}`", one, f"{key}.") for name, one in _choices(kind).items()]
         elif dataclasses.is_dataclass(kind):
-            inner.append((f"`{key}`", typing.cast(type, kind), f"{key}."))
+            groups = {key: typing.cast(type, kind)}
         else:
             default = _default(field)
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
             rows.append((f"`{key}`", _type_name(kind), shown, meaning))
+        if classes := frozenset(groups.values()):
+            first = next((where for known, where in listed.items() if classes <= known), None)
+            if first is None:
+                listed[classes] = key
+                inner += [(title, one, f"{key}.") for title, one in groups.items()]
+            else:
+                above.append(f"`{key}.*`" if first == key else f"`{key}.*`, as `{first}.*`")
     yield summary_of(config_class) + "\n"
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
+    if above:
+        yield f"Listed above: {'; '.join(above)}.\n"
     for title, one, inner_prefix in inner:
-        yield f"### {title}\n"
-        yield from _options(one, inner_prefix)
+        yield f"### `{title}`\n"
+        yield from _options(one, inner_prefix, listed)
 
 
 def _choices(kind: Any) -> dict[str, type]:
