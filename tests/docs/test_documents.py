@@ -57,7 +57,7 @@ def test_an_option_without_a_description_is_found() -> None:
         mode: str = "both"
 
     with pytest.raises(SystemExit, match="does not describe 'mode'"):
-        list(script._options(Undocumented, ""))
+        list(script._options(Undocumented, "", {}))
 
 
 # --- links and files -------------------------------------------------------------------------------------------------
