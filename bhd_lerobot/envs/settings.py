@@ -47,19 +47,7 @@ def make_settings(
     cameras: bool | None = None,
     obs_type: str | None = None,
 ) -> Settings:
-    """Return what an environment is made of.
-
-    Args:
-        environment: its name, with or without the namespace.
-        robot: options of the robot that differ from their defaults, by name, nested where they are; or a whole
-            configuration.
-        task: the same of the task.
-        cameras: whether the robot's cameras are observed; the robot's own option if None.
-        obs_type: one of `OBS_TYPES`; all that there is if None.
-
-    Raises:
-        ConfigError: there is no such environment or option, or a value that cannot be honoured.
-    """
+    """Return what an environment is made of."""
     name = environment.removeprefix(f"{NAMESPACE}/") if isinstance(environment, str) else environment
     if name not in ENVIRONMENTS:
         raise ConfigError(unknown_name("environment", environment, ENVIRONMENTS))

@@ -69,9 +69,6 @@ class ActionScale:
         Args:
             actions: shape (n, a); those of simulations that do not run mean nothing.
             running: the simulations that the actions are for, shape (n,).
-
-        Raises:
-            ActionError: another shape, not numbers, or a value that is not finite.
         """
         values = np.asarray(actions)
         shape = (len(running), len(self.names))

@@ -302,11 +302,7 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
 
 
 def _refuse_results(config: EvalConfig) -> None:
-    """Refuse a folder that holds the results of another evaluation, or of this one if it is complete.
-
-    Raises:
-        ConfigError: names the folder.
-    """
+    """Refuse a folder that holds the results of another evaluation, or of this one if it is complete."""
     folder = Path(config.output_dir or "").expanduser()
     if config.output_dir and (folder / RESULTS_NAME).is_file() and not _is_continued(config, folder):
         raise ConfigError(

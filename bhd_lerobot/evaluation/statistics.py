@@ -47,16 +47,7 @@ class Discordance:
 
 
 def wilson(successes: int, count: int, confidence: float = CONFIDENCE) -> Estimate:
-    """Return a share with its Wilson score interval.
-
-    Args:
-        successes: how many of them were a success.
-        count: number of independent trials; nothing is known after none: 0 to 1.
-        confidence: probability that the interval covers the truth.
-
-    Raises:
-        ValueError: more successes than trials, fewer than none, or a confidence that is not between 0 and 1.
-    """
+    """Return a share with its Wilson score interval; after no trials it is 0 to 1."""
     if not 0 <= successes <= count:
         raise ValueError(f"{successes} successes in {count} trials.")
     if not 0 < confidence < 1:

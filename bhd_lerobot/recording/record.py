@@ -191,11 +191,7 @@ def _run(
 def _episodes(
     loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
 ) -> Iterator[Episode]:
-    """Run episodes; with `timing.reject`, those that were too unpunctual are run again.
-
-    Raises:
-        RealtimeError: an episode was too unpunctual every time.
-    """
+    """Run episodes; with `timing.reject`, those that were too unpunctual are run again."""
 
     def stop() -> bool:
         return bool(result.stopped_by)
@@ -227,11 +223,7 @@ def _episodes(
 
 
 def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Console) -> None:
-    """Let a signal and, in a terminal, a key press the emergency stop.
-
-    Raises:
-        ConfigError: `estop_key` is set where there is no terminal.
-    """
+    """Let a signal and, in a terminal, a key press the emergency stop."""
     is_live = config.robot.clock == "realtime"
     number = estop_signal(config.estop_signal)
     pressed.add_signal(number)
@@ -316,11 +308,6 @@ def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, 
     """Return options without those that a dataset is older than, if they are as they are by default.
 
     By default an option of a task leaves it as it was before there was that option.
-
-    Args:
-        asked: the options, as plain values.
-        recorded: those of the dataset; anything else than a mapping is left for the comparison to refuse.
-        kind: the dataclass that they are of.
     """
     if not isinstance(recorded, Mapping):
         return asked

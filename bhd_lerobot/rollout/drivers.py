@@ -36,11 +36,6 @@ class DriverLog:
         intervenes: whether an expert can take over in the brain.
         is_mixed: whether it gives setpoints in some frames and goals in others.
         gives_goals: whether it gives goals at all.
-
-    Args:
-        brain: the brain; an `Intervening` if an expert takes over in it.
-        n: number of simulations.
-        frames: longest episode, in frames.
     """
 
     def __init__(self, brain: Any, n: int, frames: int) -> None:

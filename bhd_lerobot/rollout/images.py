@@ -22,9 +22,6 @@ class EpisodeImages:
 
     Attributes:
         sinks: where the images of each simulation go: something with `add_image` and `discard`, or None.
-
-    Args:
-        simulation: the robots.
     """
 
     def __init__(self, simulation: Host) -> None:

@@ -273,10 +273,6 @@ class PathLengths:
     Attributes:
         total: in all [m], shape (n,).
         recent: in the last `window` frames [m], shape (n,).
-
-    Args:
-        n: number of robots.
-        window: how many frames `add` looks back.
     """
 
     def __init__(self, n: int, window: int) -> None:

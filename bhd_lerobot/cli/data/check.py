@@ -44,19 +44,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:
-    """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not.
-
-    Args:
-        root: the dataset.
-        console: where it is printed.
-        as_json: print plain values.
-        is_strict: a warning makes it invalid, too.
-        videos: read the videos, too.
-
-    Raises:
-        DatasetLockedError: it is being recorded or changed.
-        DatasetError: there is no dataset that could be checked.
-    """
+    """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not."""
     if is_being_written(root):
         raise DatasetLockedError(
             f"{root} is being recorded or changed at this moment, so it is neither valid nor not. Check it when "

@@ -80,12 +80,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
-    """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing.
-
-    Args:
-        robot_type: the robot of the dataset.
-        recording: the identity of its recording. If its robot was simulated, the noise is known.
-    """
+    """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing."""
     if robot_type == "turtlebot3":
         robot = (recording or {}).get("robot")
         return _turtlebot3(is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
