@@ -59,11 +59,7 @@ class BhdEnvConfig(EnvConfig):
     render_mode: str = "rgb_array"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be honoured, and work out the features.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse what cannot be honoured, and work out the features."""
         if self.vector not in VECTORS:
             raise ConfigError(unknown_name("env.vector", self.vector, VECTORS))
         if self.threads is not None and self.threads < 1:

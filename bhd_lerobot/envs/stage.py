@@ -138,9 +138,6 @@ class Stage:
 
         Args:
             actions: of each robot, shape (n, a), finite and of single precision.
-
-        Raises:
-            SimulationError: the physics diverged.
         """
         simulation = self.simulation
         report = simulation.step(actions)
@@ -162,11 +159,7 @@ class Stage:
         return "" if scene is None else self.task.instruction(scene)
 
     def render(self, sim: int) -> NDArray[np.uint8]:
-        """Return one simulation from outside, shape (240, 320, 3).
-
-        Raises:
-            RenderingError: no image can be rendered here.
-        """
+        """Return one simulation from outside, shape (240, 320, 3)."""
         if self._view is None:
             self._view = Camera(self.simulation.world, _VIEW_WIDTH, _VIEW_HEIGHT)
         return self._view.render(sim, self.simulation.view)

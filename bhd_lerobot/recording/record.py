@@ -238,11 +238,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
 
 
 def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task, brain: Brain) -> DatasetRecorder:
-    """Open the dataset that a configuration asks for, or go on with it.
-
-    Raises:
-        BhdError: it exists and is not to be resumed, or holds something else.
-    """
+    """Open the dataset that a configuration asks for, or go on with it."""
     nq, nv = (part.shape[1] for part in simulation.physics)
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(

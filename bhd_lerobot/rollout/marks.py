@@ -40,9 +40,6 @@ class Marks:
         Args:
             name: one of `outcomes`, for example ``success``, ``failure`` or ``collision``.
             simulation: whose episode.
-
-        Raises:
-            ConfigError: there is no such outcome or simulation.
         """
         if name not in self._valid:
             raise ConfigError(unknown_name("outcome", name, self._valid))
@@ -55,9 +52,6 @@ class Marks:
         Args:
             is_on: whether it begins; toggled if None.
             simulation: in whose episode.
-
-        Raises:
-            ConfigError: there is no such simulation.
         """
         with self._lock:
             if (self._checked(simulation) not in self._driving) if is_on is None else is_on:

@@ -20,9 +20,6 @@ class Preview:
 
     Args:
         simulation: one robot, for this alone.
-
-    Raises:
-        RenderingError: no image can be rendered here.
     """
 
     def __init__(self, simulation: Simulation) -> None:

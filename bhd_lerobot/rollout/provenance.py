@@ -73,9 +73,6 @@ def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], i
         recorded: what `episode_metadata` returned when it was recorded.
         columns: its columns in the dataset.
         instruction: its task in the dataset.
-
-    Raises:
-        DatasetError: the metadata are not those of an episode of this version.
     """
     try:
         details = {name: value for name, value in recorded.items() if name not in _OF_AN_EPISODE}
@@ -137,11 +134,7 @@ def scene_to_json(scene: Any) -> str:
 
 
 def scene_from_json(text: str) -> Any:
-    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`.
-
-    Raises:
-        DatasetError: the text is no scene.
-    """
+    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`."""
     try:
         scene = json.loads(text)
         if "shapes" in scene:

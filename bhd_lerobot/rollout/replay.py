@@ -107,9 +107,6 @@ class Replay:
     Args:
         root: the dataset.
         episode: the episode's number in it.
-
-    Raises:
-        DatasetError: the dataset, or what a replay needs of it, is missing.
     """
 
     def __init__(self, root: Path, episode: int) -> None:

@@ -21,9 +21,6 @@ def run_folder(config: Any, kind: str) -> Iterator[Path]:
     Args:
         config: of the run, with `output_dir`, `robot` and `task`.
         kind: of the run, for the default place: ``record`` or ``eval``.
-
-    Raises:
-        ConfigError: the folder cannot be written.
     """
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()

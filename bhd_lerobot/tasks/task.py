@@ -84,9 +84,6 @@ def episode_seed(seed: int, episode: int, split: Split) -> int:
         seed: the run's seed.
         episode: the episode's number in the run.
         split: which of the sets the episode belongs to.
-
-    Raises:
-        ConfigError: there is no such split, or a number is negative.
     """
     if split not in SPLITS:
         raise ConfigError(f"Unknown split {split!r}. Valid: {', '.join(SPLITS)}.")
