@@ -17,15 +17,7 @@ _END = 2**63  # infos of vector environments hold the numbers as int64
 
 
 class Course:
-    """The episodes of one environment, by their numbers in a run.
-
-    Attributes:
-        seed: the run's seed.
-        split: `train`, `validation` or `held_out`.
-        episode: number of the present episode; -1 before the first.
-        following: number of the next one.
-        stride: how many episodes further each one after it is.
-    """
+    """The episodes of one environment: `episode` is the number of the present one, -1 before the first."""
 
     def __init__(self, seed: int = 0, split: Split = "train", first: int | None = None, stride: int = STREAM) -> None:
         first = int(np.random.default_rng().integers(STREAM)) if first is None else first

@@ -24,14 +24,7 @@ OBS_TYPES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What an environment is made of.
-
-    Attributes:
-        name: the environment's name, without its namespace.
-        robot: the robot's configuration.
-        task: the task's configuration.
-        parts: what an observation holds: some of `agent_pos`, `environment_state` and `pixels`.
-    """
+    """What an environment is made of; `parts` are some of `agent_pos`, `environment_state` and `pixels`."""
 
     name: str
     robot: Any

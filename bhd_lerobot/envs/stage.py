@@ -64,18 +64,10 @@ class Stage:
     """n simulations, each in an episode of its own, or idle.
 
     Attributes:
-        simulation: the robots.
-        task: what is to be achieved.
         frames: longest duration of an episode [frames].
         seeds: seed of the episode that each simulation is in, shape (n,).
         scenes: its scene, by simulation.
         limits: `Limit` flags of the last frame, shape (n,).
-
-    Args:
-        robot: the robot's configuration.
-        task: the task's configuration.
-        n: how many simulations.
-        threads: threads that step the physics; all processors if None.
     """
 
     def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:

@@ -21,11 +21,7 @@ _SETTABLE = ("seed", "split", "stride", "render_mode")
 
 
 class Member:
-    """What `get_attr`, `call` and `set_attr` of a vector environment find: what a `BhdEnv` would have.
-
-    Attributes:
-        course: which episode comes next.
-    """
+    """What `get_attr`, `call` and `set_attr` of a vector environment find: what a `BhdEnv` would have."""
 
     def __init__(self, stage: Stage, sim: int, course: Course, vector: Any) -> None:
         self.stage, self.course = stage, course

@@ -132,15 +132,7 @@ class EvalResult:
 
 
 def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
-    """Run every brain on the same episodes, write results and report.
-
-    Args:
-        config: what to compare.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured; the message names the brain that does not fit.
-    """
+    """Run every brain on the same episodes, write results and report."""
     console = console or Console(stderr=True)
     _refuse_results(config)
     is_live = config.robot.clock == "realtime"

@@ -92,8 +92,6 @@ class EvalResults:
         config: what decides the numbers: robot, task, brains, episodes and seeds.
         versions: of the programs that made them.
         requested: how many episodes of each brain were requested.
-        episodes: all episodes, brain by brain, in their order.
-        brains: what each brain achieved.
         paired: the brains beside the baseline.
     """
 

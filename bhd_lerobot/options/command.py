@@ -28,14 +28,11 @@ INTERRUPTED = 128 + signal.SIGINT
 
 
 def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[], str] = "Stopped.") -> int:
-    """Run a program; return its exit status.
+    """Run a program, whose exit status may be None for 0; return the status.
 
-    An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C gives
-    130, and the status is that of other programs where nobody reads what is printed, as of ``| head -1``.
-
-    Args:
-        program: returns its exit status; None is 0.
-        interrupted: what is printed after Ctrl-C.
+    An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C prints
+    `interrupted` and gives 130, and the status is that of other programs where nobody reads what is printed, as of
+    ``| head -1``.
     """
     try:
         try:
@@ -89,11 +86,10 @@ class Program:
 
 
 def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequence[str] | None = None) -> int:
-    """Run a program on the configuration of a command line, or print its help; return the exit status.
+    """Run a program, or that which a command line chooses, with the arguments of this process if None.
 
-    Args:
-        program: what is run; or what chooses that by the command line.
-        arguments: of the command line; those of this process if None.
+    Returns:
+        The exit status; 0 after the help.
     """
     from bhd_lerobot.options.help import help_of
     from bhd_lerobot.options.parse import CommandLine, parse, read_line
@@ -135,11 +131,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
-        """Return what a command line asks for.
-
-        Raises:
-            ConfigError: an option of version 0.1 that was renamed or removed.
-        """
+        """Return what a command line asks for; end with status 2 if it has what is not known."""
         options, unknown = self.parse_known_args(arguments)
         if unknown:
             command: argparse.ArgumentParser = getattr(options, "command_parser", self)

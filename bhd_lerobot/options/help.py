@@ -112,12 +112,7 @@ def type_word(kind: Any) -> str:
 
 
 def help_of(config_class: type, chosen: Mapping[str, str]) -> str:
-    """Return the help of a program: its options in groups, each with its meaning and its default.
-
-    Args:
-        config_class: the program's configuration.
-        chosen: types that were chosen on the command line, by option; only the options of these are listed.
-    """
+    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option."""
     width = max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
     lines = textwrap.wrap(summary_of(config_class), width)
     lines += ["", "Options are written --key=value, or nested in a YAML file: --config_path=FILE.", ""]

@@ -42,22 +42,14 @@ class CommandLine:
 
     @cached_property
     def file(self) -> dict[str, Any]:
-        """What the file holds; nothing if none is named.
-
-        Raises:
-            ConfigError: it cannot be read.
-        """
+        """What the file holds; nothing if none is named."""
         if self.path is None:
             return {}
         inside = self.path / RUN_CONFIG
         return read_file(inside if inside.is_file() else self.path)
 
     def over(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return nested values, those of the file for example, with the options in their place.
-
-        Raises:
-            ConfigError: an option is one of a plain value.
-        """
+        """Return nested values, those of the file for example, with the options in their place."""
         result = copy.deepcopy(dict(values))
         for name, value in self.options.items():
             *keys, last = name.split(".")
@@ -71,14 +63,9 @@ class CommandLine:
 
 
 def read_line(arguments: Sequence[str] | CommandLine) -> CommandLine:
-    """Return what a command line says.
+    """Return what a command line says: ``--config_path=FILE``, ``--a.b=value`` or ``--a.b value``; values are YAML.
 
-    Args:
-        arguments: ``--config_path=FILE`` and overrides ``--a.b=value`` or ``--a.b value``; values are YAML. A line that
-            was read before is returned as it is.
-
-    Raises:
-        ConfigError: an argument that is no option, an option without a value or given twice, or what is no YAML.
+    One that was read before is returned as it is.
     """
     if isinstance(arguments, CommandLine):
         return arguments
@@ -104,25 +91,18 @@ def read_line(arguments: Sequence[str] | CommandLine) -> CommandLine:
 
 
 def parse[T](config_class: type[T], arguments: Sequence[str] | CommandLine) -> T:
-    """Return the configuration that a command line describes.
-
-    Raises:
-        ConfigError: an unknown key, a value of the wrong type, or a file that cannot be read.
-    """
+    """Return the configuration that a command line describes."""
     line = read_line(arguments)
     return decode(config_class, line.over(line.file))
 
 
 def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -> T:
-    """Return the configuration that plain values stand for.
+    """Return the configuration that plain values, nested, stand for.
 
     Args:
         config_class: a dataclass.
-        values: by the names of its fields, nested; values with an exponent and entries that are nothing are replaced.
+        values: by the names of its fields; values with an exponent and entries that are nothing are replaced.
         prefix: what stands before the fields' names in messages, ``"robot."``, for example.
-
-    Raises:
-        ConfigError: an unknown or missing key, a value that cannot be honoured, or names of version 0.1.
     """
     check_values(values)
     _check_keys(config_class, values, prefix)
@@ -137,12 +117,7 @@ def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -
 
 
 def from_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return keyword arguments as plain values, nested, as a file would hold them.
-
-    Args:
-        options: values by name; configurations, paths and tuples may stand where a file has dictionaries, texts and
-            lists.
-    """
+    """Return keyword arguments, with configurations, paths and tuples among them, as a file would hold them."""
     return {name: _plain(value) for name, value in options.items()}
 
 
@@ -162,11 +137,7 @@ def encode(config: Any) -> dict[str, Any]:
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """Return what a YAML or JSON file holds.
-
-    Raises:
-        ConfigError: it cannot be read, or holds no keys and values.
-    """
+    """Return what a YAML or JSON file holds."""
     try:
         text = path.read_text(encoding="utf-8")
         values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)  # JSON's 1e-05 is text in YAML

@@ -28,12 +28,7 @@ _imported: set[str] = set()
 
 
 def load_plugins(report: Callable[[str], object] | None = None) -> None:
-    """Import every plug-in that is installed, once.
-
-    Args:
-        report: called with a sentence for each that cannot be imported, the others are imported all the same; printed
-            on standard error if None.
-    """
+    """Import every plug-in that is installed, once; report those that fail, on standard error if None."""
     for name, reason in import_plugins():
         if reason:
             text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
@@ -64,14 +59,7 @@ def misnamed() -> list[tuple[str, str]]:
 
 
 def load_named(arguments: Sequence[str]) -> list[str]:
-    """Import the modules that a command line names; return its other arguments.
-
-    Args:
-        arguments: of the command line; ``--robot.discover_packages_path=my_robots`` names one, by any option in front.
-
-    Raises:
-        ConfigError: a module cannot be imported.
-    """
+    """Import the modules that options ``--….discover_packages_path=MODULE`` name; return the other arguments."""
     left: list[str] = []
     rest = list(arguments)
     while rest:

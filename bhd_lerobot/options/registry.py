@@ -33,11 +33,7 @@ class Registry[T](Mapping[str, T]):
         return len(self._table)
 
     def register(self, name: str, value: T | str, config: type | None = None) -> None:
-        """Add one, with its configuration; the same one again changes nothing.
-
-        Raises:
-            ConfigError: another one has this name.
-        """
+        """Add one, with its configuration; the same one again changes nothing, another one is refused."""
         known: Any = self._table.get(name) if config is None else self._choices.get_known_choices().get(name)
         added = value if config is None else config
         if known is not None and known != added:
@@ -50,11 +46,7 @@ class Registry[T](Mapping[str, T]):
         self._table[name] = value
 
     def of(self, config: Any) -> T:
-        """Return what a configuration is of.
-
-        Raises:
-            ConfigError: its configuration was registered, and no class for it.
-        """
+        """Return what a configuration is of."""
         name = config.get_choice_name(type(config))
         if name not in self._table:
             raise ConfigError(

@@ -80,16 +80,7 @@ _ATTEMPTS = 3  # that an episode gets to be punctual
 
 
 def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
-    """Record the episodes that a configuration describes.
-
-    Args:
-        config: what to record.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or the dataset cannot be written. Episodes that were saved
-            before are intact.
-    """
+    """Record the episodes that a configuration describes; those that were saved before an error are intact."""
     if config.dataset.push_to_hub:
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)

@@ -67,13 +67,7 @@ _OF_AN_EPISODE = frozenset(
 
 
 def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], instruction: str) -> Episode:
-    """Return an episode that was recorded: what can be measured of it, without images, goals and interventions.
-
-    Args:
-        recorded: what `episode_metadata` returned when it was recorded.
-        columns: its columns in the dataset.
-        instruction: its task in the dataset.
-    """
+    """Return a recorded episode from its metadata and columns: without images, goals and interventions."""
     try:
         details = {name: value for name, value in recorded.items() if name not in _OF_AN_EPISODE}
         event = Event[recorded["outcome"].upper()]

@@ -102,12 +102,7 @@ class Divergence:
 
 
 class Replay:
-    """One recorded episode and a simulation of its robot.
-
-    Args:
-        root: the dataset.
-        episode: the episode's number in it.
-    """
+    """One recorded episode and a simulation of its robot."""
 
     def __init__(self, root: Path, episode: int) -> None:
         summary = dataset_info(root)
@@ -219,12 +214,7 @@ class Replay:
 
 
 def replay(config: ReplayConfig, console: Console | None = None) -> list[Divergence]:
-    """Replay an episode, print how far it diverges, and draw it.
-
-    Raises:
-        ConfigError: no dataset is given.
-        DatasetError: the dataset cannot be replayed.
-    """
+    """Replay an episode, print how far it diverges, and draw it."""
     console = console or Console(stderr=True)
     if config.dataset.root:
         root = Path(config.dataset.root).expanduser()

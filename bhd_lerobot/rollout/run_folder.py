@@ -16,11 +16,7 @@ from bhd_lerobot.options.parse import RUN_CONFIG, encode
 def run_folder(config: Any, kind: str) -> Iterator[Path]:
     """Make the folder of a run, with its resolved configuration; if the block fails, the run was refused.
 
-    A run that was refused leaves no folder; what was there before stays.
-
-    Args:
-        config: of the run, with `output_dir`, `robot` and `task`.
-        kind: of the run, for the default place: ``record`` or ``eval``.
+    A run that was refused leaves no folder; what was there before stays. The default place is in ``outputs/<kind>``.
     """
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()

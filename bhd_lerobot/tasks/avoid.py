@@ -71,12 +71,6 @@ class AvoidTask(BaseTask):
     that the robot's centre visited before the first contact or the end, as a share of the free cells, those that it
     could have got into. The reward of a frame is what the frame adds to the score. Failures: `collision`, `stuck`, and
     `timeout` when the time is over and the path too short.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
     """
 
     name = "avoid"

@@ -93,12 +93,6 @@ class NavigateTask(BaseTask):
 
     A shortest way keeps the robot's radius and `CLEARANCE` from all obstacles and goes in sixteen directions on a grid
     of 0.05 m, so it may be up to 2.8 % longer than the shortest one that there is.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
     """
 
     name = "navigate"
