@@ -15,8 +15,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import draccus
-
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
@@ -24,6 +22,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.help import meanings_of, summary_of
+from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.robots.base_host import observation_names
@@ -107,23 +106,22 @@ def _options(
         listed: groups of classes whose options are listed already, and the options that they are of; it is extended.
         only: names of the fields to list; all if None.
     """
-    described, hints = meanings_of(config_class), typing.get_type_hints(config_class)
+    described = meanings_of(config_class)
     rows, inner, above = [], [], []
-    for field in dataclasses.fields(config_class):
-        if only is not None and field.name not in only:
+    for name, kind, default in options_of(config_class):
+        if only is not None and name not in only:
             continue
-        key, kind, meaning = f"{prefix}{field.name}", hints[field.name], described.get(field.name)
+        key, meaning = f"{prefix}{name}", described.get(name)
         if meaning is None:
-            raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {field.name!r}.")
-        groups = {f"{key}.type={name}": one for name, one in _choices(kind).items()}
+            raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {name!r}.")
+        choices = _choices(kind)
+        groups = {f"{key}.type={name}": one for name, one in choices.items()}
         if groups:
-            default = _default(field)
-            shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
-            rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
+            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), "*required*")
+            rows.append((f"`{key}.type`", ", ".join(f"`{name}`" for name in choices), chosen, meaning))
         elif dataclasses.is_dataclass(kind):
             groups = {key: typing.cast(type, kind)}
         else:
-            default = _default(field)
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
             rows.append((f"`{key}`", _type_name(kind), shown, meaning))
         if classes := frozenset(groups.values()):
@@ -145,22 +143,8 @@ def _options(
 
 def _choices(kind: Any) -> dict[str, type]:
     """Return the classes of ours that are registered under a choice type, or nothing if it is none."""
-    if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
-        known = kind.get_known_choices().items()
-        return {name: one for name, one in sorted(known) if one.__module__.startswith("bhd_lerobot.")}
-    return {}
-
-
-def _choice_name(kind: Any, chosen: type) -> str:
-    return next(name for name, one in _choices(kind).items() if one is chosen)
-
-
-def _kinds(kind: Any) -> str:
-    return ", ".join(f"`{name}`" for name in _choices(kind))
-
-
-def _default(field: dataclasses.Field) -> Any:
-    return field.default_factory() if field.default_factory is not dataclasses.MISSING else field.default
+    known = choices_of(kind) if isinstance(kind, type) else {}
+    return {name: one for name, one in sorted(known.items()) if one.__module__.startswith("bhd_lerobot.")}
 
 
 def _plain(value: Any) -> str:
