@@ -110,13 +110,7 @@ def register_task[T](name: str, config: type[TaskConfig]) -> Callable[[type[T]],
     Raises:
         ConfigError: another task has this name.
     """
-
-    def register(task: type[T]) -> type[T]:
-        task.name = name  # type: ignore[attr-defined]
-        TASKS.register(name, task, config)
-        return task
-
-    return register
+    return _decorator(TASKS, name, config)
 
 
 def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]], type[T]]:
@@ -125,11 +119,14 @@ def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]
     Raises:
         ConfigError: another brain has this name.
     """
+    return _decorator(BRAINS, name, config)
 
-    def register(brain: type[T]) -> type[T]:
-        brain.name = name  # type: ignore[attr-defined]
-        BRAINS.register(name, brain, config)
-        return brain
+
+def _decorator[T](registry: Registry[Any], name: str, config: type) -> Callable[[type[T]], type[T]]:
+    def register(made: type[T]) -> type[T]:
+        made.name = name  # type: ignore[attr-defined]
+        registry.register(name, made, config)
+        return made
 
     return register
 
@@ -153,16 +150,7 @@ def robots_of(wanted: str) -> list[str]:
 
 
 def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
-    """Refuse a robot that cannot be simulated, one whose rates do not divide each other, and another robot's task.
-
-    Args:
-        robot: the robot's configuration.
-        task: the task's.
-        program: the command that they are for; the message names it.
-
-    Raises:
-        ConfigError: names the value and the valid ones.
-    """
+    """Refuse a robot that cannot be simulated, one whose rates do not divide each other, and another robot's task."""
     if robot.type not in ROBOTS:
         raise ConfigError(
             f"robot.type is {robot.type!r}; {program} drives simulated robots: {', '.join(sorted(ROBOTS))}. "
@@ -178,11 +166,7 @@ def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
 
 
 def check_brain(key: str, brain: BrainConfig, robot_type: str) -> None:
-    """Refuse a brain that is for another robot; `key` is the option that it comes from.
-
-    Raises:
-        ConfigError: names the brain, its robot, and the brains that fit.
-    """
+    """Refuse a brain that is for another robot; `key` is the option that it comes from."""
     try:
         driven = robot_of_brain(brain)
     except ConfigError as error:
@@ -207,11 +191,7 @@ def robot_of_task(config: TaskConfig) -> str:
 
 
 def robot_of_brain(config: BrainConfig) -> str:
-    """Return the kind or type of robot that a brain is for, empty if it is for every robot.
-
-    Raises:
-        ConfigError: the brain is a trained policy, and there is no checkpoint where the configuration says.
-    """
+    """Return the kind or type of robot that a brain is for, empty if it is for every robot."""
     brain = BRAINS.of(config)
     robot = str(brain.robot_of(config) if hasattr(brain, "robot_of") else brain.robot_kind)
     return "" if robot == ANY_ROBOT else robot
@@ -245,12 +225,7 @@ def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> "Sim
 
 
 def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Host":
-    """Return n robots on the clock that the configuration asks for.
-
-    Raises:
-        ConfigError: more than one on the wall clock, or there is no such plant.
-        RealtimeError: the processes of a robot on the wall clock could not be started.
-    """
+    """Return n robots on the clock that the configuration asks for; on the wall clock there can be one."""
     if config.clock != "realtime":
         return make_simulation(config, n, threads)
     if n != 1:
@@ -261,14 +236,7 @@ def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Host":
 
 
 def make_task(config: TaskConfig, n: int, fps: int, body: Body | None = None) -> Task:
-    """Return the task that a configuration describes, for n simulations at `fps` frames a second.
-
-    Args:
-        config: the configuration.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware; a TurtleBot3's or a UR5's if None.
-    """
+    """Return the task that a configuration describes, for n simulations at `fps` frames a second [Hz]."""
     made: Task = TASKS.of(config)(config, n, fps, body)
     return made
 

@@ -39,12 +39,8 @@ class Request:
 def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> Request:
     """Return what a command line asks for.
 
-    Args:
-        arguments: `--config_path=FILE` and overrides `--a.b=value`; with `--resume=true`, FILE is a checkpoint's
-            `train_config.json`, or the folder of a checkpoint or of a run.
-
-    Raises:
-        ConfigError: an unknown key or policy, a value of the wrong type, or a file that cannot be read.
+    With `--resume=true`, its `--config_path` is a checkpoint's `train_config.json`, or the folder of a checkpoint or of
+    a run.
     """
     line = configuration.read_line(arguments)
     checkpoint: Path | None = None
@@ -62,11 +58,7 @@ def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> Request
 
 
 def request_of(values: dict[str, Any]) -> Request:
-    """Return what plain values, nested, ask for.
-
-    Raises:
-        ConfigError: an unknown key or policy, or a value of the wrong type.
-    """
+    """Return what plain values, nested, ask for."""
     return _decoded(values, None)
 
 
@@ -84,11 +76,7 @@ def _resumed(path: Path, output_dir: Any) -> Path:
 
 
 def resumed_checkpoint(path: Path) -> Path:
-    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run.
-
-    Raises:
-        ConfigError: there is none; names what was looked for.
-    """
+    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run."""
     folder = path.parent if path.is_file() else path
     for one in (folder.parent, folder, folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK):
         if (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():
