@@ -1,4 +1,4 @@
-"""The loop of an episode, configurations and replay."""
+"""The loop of an episode, and replay."""
 
 __all__ = [
     "drivers",
