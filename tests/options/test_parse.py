@@ -4,9 +4,9 @@ import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.options.help import help_of
 from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.training.rl.config import RlConfig
 from tests.cases import each_case
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
@@ -82,11 +82,14 @@ def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(cap
         run(Program(RecordConfig, bug), REQUIRED)
 
 
-def test_help_lists_every_option():
-    chosen = {"robot.type": "turtlebot3", "brain.type": "avoidance", "task.type": "avoid"}
-    text = help_of(RecordConfig, chosen)
-    for option in ("--robot.beams", "--dataset.episode_time_s", "--brain.safe_distance_m", "--task.arena", "--resume"):
-        assert option in text
+def test_help_is_that_of_what_the_command_line_chooses_whatever_else_is_wrong_with_it(capsys):
+    def choose(line):
+        return Program(RlConfig if "algorithm" in line.options else RecordConfig, lambda _: pytest.fail("it ran"))
+
+    for given, option in ((["--algorithm=ppo", "--help"], "--ppo.lr"), (["-h", "--robot.type=ur5", "x"], "--robot.id")):
+        assert run(choose, given) == 0
+        assert option in capsys.readouterr().out
+    assert run(choose, ["x"]) == 2
 
 
 @each_case(
