@@ -14,7 +14,7 @@ help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-15s %s\n", $$1, $$2}' Makefile
 
 demo: venv ## record, replay, train and evaluate both robots
-	$(PYTHON_IN_VENV) -m bhd_lerobot.apps.demo
+	$(PYTHON_IN_VENV) -m bhd_lerobot.cli.demo
 
 test: venv ## run the tests of every behaviour; PYTEST_ARGS='-k name' narrows them down
 	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal --thorough=no $(PYTEST_ARGS)

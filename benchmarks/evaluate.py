@@ -31,14 +31,14 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from rich.console import Console
 
 from benchmarks._turns import ratios, shown, spread, verdict, write
+from bhd_lerobot.cli.record import main as record_main
+from bhd_lerobot.cli.train import main as train_main
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import find_checkpoint
-from bhd_lerobot.recording.record import main as record_main
-from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.training.train import main as train_main
 
 GOAL = 10.0
 TASKS = {"avoid": ("turtlebot3", "TurtleBot3Avoid-v0", "gap_follower"), "reach": ("ur5", "UR5Reach-v0", "reach")}

@@ -56,7 +56,7 @@ def record(folder: Path, policy: str, episodes: int) -> Path:
     root, (config, *more) = folder / "data", RECORDINGS[policy]
     shutil.rmtree(root, ignore_errors=True)
     options = [f"--dataset.root={root}", f"--dataset.num_episodes={episodes}", f"--output_dir={folder / 'recording'}"]
-    command = ["bhd_lerobot.recording.record", f"--config_path=configs/record/{config}.yaml", *options, *more]
+    command = ["bhd_lerobot.cli.record", f"--config_path=configs/record/{config}.yaml", *options, *more]
     subprocess.run([sys.executable, "-m", *command, "--preview_video=false"], check=True, capture_output=True)
     return root
 

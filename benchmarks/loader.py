@@ -28,8 +28,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks._turns import spread, status, write
+from bhd_lerobot.cli.record import main as record_main
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
-from bhd_lerobot.recording.record import main as record_main
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)
 NAMES = ("ours", *(f"LeRobot, {n} workers" for n in WORKERS))

@@ -17,12 +17,12 @@ from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult
 from bhd_lerobot.evaluation.evaluate import evaluate as run_evaluation
-from bhd_lerobot.plugins import load_plugins
+from bhd_lerobot.options.parse import decode, from_options
+from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.policies.brain import Brain, BrainConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record as run_record
 from bhd_lerobot.recording.report import RecordResult
-from bhd_lerobot.rollout.configuration import decode, from_options
 from bhd_lerobot.rollout.replay import Divergence, ReplayConfig
 from bhd_lerobot.rollout.replay import replay as run_replay
 from bhd_lerobot.stock import make_robot_from_config

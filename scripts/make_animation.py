@@ -1,10 +1,11 @@
-"""Make an animation of a recorded episode, docs/images/pick.gif for example.
+r"""Make an animation of a recorded episode, docs/images/pick.gif for example.
 
 `bhd-record` makes the episode, with a camera; the caption is its instruction.
 
-    bhd-record --config_path=configs/record/ur5_pick.yaml --brain.type=language --robot.camera=true \\
-        --robot.camera_width=480 --robot.camera_height=360 --dataset.root=data/animation --dataset.num_episodes=4 --seed=7
-    python scripts/make_animation.py data/animation 0 docs/images/pick.gif
+    bhd-record --config_path=configs/record/ur5_pick.yaml --brain.type=language --robot.camera=true \
+        --robot.camera_width=480 --robot.camera_height=360 --dataset.root=data/animation --dataset.num_episodes=4 \
+        --task.language=en --seed=7
+    python scripts/make_animation.py data/animation 1 docs/images/pick.gif
 """
 
 import argparse

@@ -15,20 +15,19 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import draccus
-
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.help import meanings_of, summary_of
+from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.rollout.options_help import meanings_of, summary_of
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
@@ -53,26 +52,26 @@ written `null`.
 
 def reference() -> str:
     """Return the whole document."""
+    listed: dict[frozenset[type], str] = {}
     parts = [
         _INTRODUCTION,
         "## `bhd-record`\n",
-        *_options(RecordConfig, ""),
+        *_options(RecordConfig, "", listed),
         "## `bhd-replay`\n",
-        *_options(ReplayConfig, ""),
+        *_options(ReplayConfig, "", listed),
         "## `bhd-eval`\n",
-        *_options(EvalConfig, "", choices=False),
+        *_options(EvalConfig, "", listed),
         "## `bhd-train`\n",
         "LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their "
         "names and their meaning. Beside them:\n",
-        *_options(BhdTrainConfig, "", only=own_fields()),
+        *_options(BhdTrainConfig, "", listed, own_fields()),
         "## `bhd-train` with `algorithm: ppo`\n",
-        *_options(RlConfig, "", choices=False),
+        *_options(RlConfig, "", listed),
         "## `bhd-train` with `algorithm: dagger`\n",
-        *_options(AggregationConfig, "", choices=False),
+        *_options(AggregationConfig, "", listed),
         "## Teleoperator `bhd_brain`\n",
-        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`; its options "
-        "are those of `brain.*` above.\n",
-        *_options(BhdBrainConfig, "teleop.", choices=False),
+        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`.\n",
+        *_options(BhdBrainConfig, "teleop.", listed),
         "## Dataset columns\n",
         _columns(),
         "### Modes\n\nIn `control.mode`.\n",
@@ -97,56 +96,55 @@ def reference() -> str:
 
 
 def _options(
-    config_class: type, prefix: str, *, choices: bool = True, only: Sequence[str] | None = None
+    config_class: type, prefix: str, listed: dict[frozenset[type], str], only: Sequence[str] | None = None
 ) -> Iterator[str]:
-    """Yield the table of a class's plain options, and then those of the classes inside it."""
-    described, hints = meanings_of(config_class), typing.get_type_hints(config_class)
-    rows, inner = [], []
-    for field in dataclasses.fields(config_class):
-        if only is not None and field.name not in only:
+    """Yield the table of a class's plain options, and then those of the classes inside it.
+
+    Args:
+        config_class: a dataclass.
+        prefix: of its options.
+        listed: groups of classes whose options are listed already, and the options that they are of; it is extended.
+        only: names of the fields to list; all if None.
+    """
+    described = meanings_of(config_class)
+    rows, inner, above = [], [], []
+    for name, kind, default in options_of(config_class):
+        if only is not None and name not in only:
             continue
-        key, kind, meaning = f"{prefix}{field.name}", hints[field.name], described.get(field.name)
+        key, meaning = f"{prefix}{name}", described.get(name)
         if meaning is None:
-            raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {field.name!r}.")
-        if _choices(kind):
-            default = _default(field)
-            shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
-            rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
-            # A choice that holds others of its own kind is listed once.
-            if choices and not issubclass(config_class, kind):
-                inner += [(f"`{key}.type={name}`", one, f"{key}.") for name, one in _choices(kind).items()]
+            raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {name!r}.")
+        choices = _choices(kind)
+        groups = {f"{key}.type={name}": one for name, one in choices.items()}
+        if groups:
+            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), "*required*")
+            rows.append((f"`{key}.type`", ", ".join(f"`{name}`" for name in choices), chosen, meaning))
         elif dataclasses.is_dataclass(kind):
-            inner.append((f"`{key}`", typing.cast(type, kind), f"{key}."))
+            groups = {key: typing.cast(type, kind)}
         else:
-            default = _default(field)
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
             rows.append((f"`{key}`", _type_name(kind), shown, meaning))
+        if classes := frozenset(groups.values()):
+            first = next((where for known, where in listed.items() if classes <= known), None)
+            if first is None:
+                listed[classes] = key
+                inner += [(title, one, f"{key}.") for title, one in groups.items()]
+            else:
+                above.append(f"`{key}.*`" if first == key else f"`{key}.*`, as `{first}.*`")
     yield summary_of(config_class) + "\n"
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
+    if above:
+        yield f"Listed above: {'; '.join(above)}.\n"
     for title, one, inner_prefix in inner:
-        yield f"### {title}\n"
-        yield from _options(one, inner_prefix)
+        yield f"### `{title}`\n"
+        yield from _options(one, inner_prefix, listed)
 
 
 def _choices(kind: Any) -> dict[str, type]:
     """Return the classes of ours that are registered under a choice type, or nothing if it is none."""
-    if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
-        known = kind.get_known_choices().items()
-        return {name: one for name, one in sorted(known) if one.__module__.startswith("bhd_lerobot.")}
-    return {}
-
-
-def _choice_name(kind: Any, chosen: type) -> str:
-    return next(name for name, one in _choices(kind).items() if one is chosen)
-
-
-def _kinds(kind: Any) -> str:
-    return ", ".join(f"`{name}`" for name in _choices(kind))
-
-
-def _default(field: dataclasses.Field) -> Any:
-    return field.default_factory() if field.default_factory is not dataclasses.MISSING else field.default
+    known = choices_of(kind) if isinstance(kind, type) else {}
+    return {name: one for name, one in sorted(known.items()) if one.__module__.startswith("bhd_lerobot.")}
 
 
 def _plain(value: Any) -> str:

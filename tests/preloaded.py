@@ -13,11 +13,10 @@ import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.scripts import lerobot_record, lerobot_replay
 
+from bhd_lerobot.cli import evaluate, record
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.remote import hub, local, store
-from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.hub import transfer
-from bhd_lerobot.recording import record
 from bhd_lerobot.rosbag.messages.types import type_store
 from bhd_lerobot.training import train
 from bhd_lerobot.training.rl import train as rl

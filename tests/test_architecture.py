@@ -23,15 +23,14 @@ SOURCE = ROOT / PACKAGE
 # package -> what it may import of ours, besides itself and errors: the files of a package without its subpackages
 # ("control"), with them ("control.*"), or one module ("bodies.body").
 EVERYTHING = ("*",)
-_TASKS = ("bodies", "control", "control.geometry")
+_TASKS = ("options", "bodies", "control", "control.geometry")
 _DATASETS = ("datasets.format", "datasets.storage")
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
     "versions": (),
     "stock": (),
-    "command_line": (),
-    "bodies": (),
-    "plugins": ("bodies",),
+    "options": (),
+    "bodies": ("options",),
     "sim": ("versions", "bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
     "control.geometry": ("versions", "bodies.body", "control"),
@@ -42,12 +41,12 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "tasks": _TASKS,
     "robots.host": ("bodies.body", "sim", "control.*", "realtime"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host"),
-    "registry": ("plugins", "bodies.body", "tasks", "robots.*", "policies.*"),
-    "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
+    "registry": ("options", "bodies", "tasks", "robots.*", "policies.*"),
+    "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry", "policies"),
     "policies.cnn": ("bodies", "policies", "policies.mlp"),
-    "policies.learned": ("__version__", "plugins", "control", "datasets.storage", "policies", "policies.mlp"),
+    "policies.learned": ("__version__", "options", "control", "datasets.storage", "policies", "policies.mlp"),
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),
     "policies.perception": ("bodies", "policies", "policies.learned", "policies.manipulation"),
@@ -57,47 +56,57 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.storage": (),
     "datasets.format": ("datasets.storage",),
     "datasets.assembly": _DATASETS,
-    "datasets.edit": (*_DATASETS, "datasets.assembly", "plugins", "tasks"),
+    "datasets.edit": (*_DATASETS, "datasets.assembly", "bodies", "tasks"),
     "datasets.validate": (*_DATASETS, "control.geometry"),
     "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
     "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),
     "datasets.remote": (*_DATASETS, "datasets.assembly", "datasets.edit"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": (*_DATASETS, "control"),
-    "rosbag.messages": ("plugins", "bodies.body", "datasets.format"),
+    "rosbag.messages": ("bodies", "datasets.format"),
     "rosbag.storage": ("datasets.storage", "rosbag.messages"),
     "rosbag.exporter": (*_DATASETS, "datasets.edit", "rosbag.messages", "rosbag.storage"),
     "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),
     "rollout": (
-        *("__version__", "command_line", "plugins", "registry"),
+        *("__version__", "options", "registry"),
         *("tasks", "bodies", "sim", "control", "robots.*", "policies.*", "datasets.format"),
     ),
-    "hub": ("plugins", "bodies.body", *_DATASETS, "datasets.remote", "rollout"),
+    "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
     "recording": (
-        *("registry", "tasks", "bodies", "control", "robots.host", "policies", *_DATASETS, "datasets.writer"),
+        *(
+            "options",
+            "registry",
+            "tasks",
+            "bodies",
+            "control",
+            "robots.host",
+            "policies",
+            *_DATASETS,
+            "datasets.writer",
+        ),
         *("rollout", "hub", "cluster"),
     ),
     "evaluation": (
         *("tasks", "control", "robots.host", "policies", "policies.perception"),
         *("datasets.format", "datasets.timing", "datasets.writer"),
-        *("registry", "rollout", "cluster", "recording"),
+        *("options", "registry", "rollout", "cluster", "recording"),
     ),
     "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
-        *("plugins", "registry", "rollout", "hub"),
+        *("options", "registry", "rollout", "hub"),
     ),
     "training.rl": (
         *("registry", "plugin", "control", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
+        "options",
     ),
     "training.dagger": (
         *("policies", "policies.dagger", "datasets.format", "datasets.storage", "datasets.edit"),
-        *("rollout", "recording", "evaluation", "training"),
+        *("options", "rollout", "recording", "evaluation", "training"),
     ),
     "apps.view": (
-        "plugins",
         "tasks",
         "bodies",
         "control",
@@ -106,11 +115,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "datasets.assembly",
         "datasets.edit",
     ),
-    "apps.monitor": ("command_line", "control", "control.motion", "realtime"),
+    "apps.monitor": ("control", "control.motion", "realtime"),
     "apps.doctor": (
-        "command_line",
+        "options",
         "versions",
-        "plugins",
         "tasks",
         "policies",
         "bodies",
@@ -118,9 +126,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "realtime",
         "datasets.format",
     ),
-    "apps.demo": ("command_line", "rollout", "recording", "evaluation", "training"),
+    "apps.demo": ("options", "rollout", "recording", "evaluation", "training"),
     "api": (
-        *("plugins", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
+        *("options", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
     ),
     "cli": EVERYTHING,
     "cli.data": EVERYTHING,
@@ -129,9 +137,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
 # third-party package -> the only packages of ours that may import it, and those that may not, by the first name.
 ONLY_IN = {"mujoco": ("sim",)}
 NEVER_IN = {
-    "torch": ("bodies", "sim", "control", "realtime"),
-    "lerobot": ("errors", "bodies", "sim", "control", "realtime", "tasks"),
-    "mujoco": ("bodies", "control", "realtime"),
+    "torch": ("options", "bodies", "sim", "control", "realtime"),
+    "lerobot": ("errors", "options", "bodies", "sim", "control", "realtime", "tasks"),
+    "mujoco": ("options", "bodies", "control", "realtime"),
 }
 # What of LeRobot is made for plug-ins; everything else moves from version to version, and only `stock` imports it.
 LEROBOT_MODULES = (
@@ -361,7 +369,7 @@ def test_the_real_time_process_stays_light(packages: tuple[str, ...], unwanted: 
 
 def test_recording_and_evaluating_rules_start_without_what_networks_need() -> None:
     unwanted = ("diffusers", "torchvision", "transformers", "datasets", "lerobot.configs", "lerobot.datasets")
-    programs = [f"{PACKAGE}.recording.record", f"{PACKAGE}.evaluation.evaluate"]
+    programs = [f"{PACKAGE}.cli.record", f"{PACKAGE}.cli.evaluate"]
     assert imported_with(programs, unwanted) == []
 
 

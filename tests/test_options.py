@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.parse import decode
 from bhd_lerobot.policies.baselines import RandomConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
@@ -17,7 +18,6 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.policies.navigation.navigator import NavigatorConfig
 from bhd_lerobot.registry import make_brain, make_task
-from bhd_lerobot.rollout.configuration import decode
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.navigate import NavigateConfig
 from bhd_lerobot.tasks.pick import PickConfig

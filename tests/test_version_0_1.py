@@ -7,12 +7,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.cli import record, replay
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.loader import make_loader
-from bhd_lerobot.recording import record
-from bhd_lerobot.rollout import replay
 from tests.apps.view.support import served
 
 

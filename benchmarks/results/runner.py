@@ -26,9 +26,9 @@ _OWN = ".made_by_results"  # in a folder that was empty when a run took it
 
 # Command lines, and the modules behind them: the tests of a checkout must not depend on what is in PATH.
 _MODULES = {
-    "bhd-record": "bhd_lerobot.recording.record",
+    "bhd-record": "bhd_lerobot.cli.record",
     "bhd-train": "bhd_lerobot.cli.train",
-    "bhd-eval": "bhd_lerobot.evaluation.evaluate",
+    "bhd-eval": "bhd_lerobot.cli.evaluate",
     "bhd-data": "bhd_lerobot.cli.data.main",
 }
 

@@ -6,7 +6,7 @@ A minute of training is too short for a good policy; the demo measures how good 
 import logging
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -15,15 +15,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.text import perception_sentence, sentences
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording import record
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout import replay
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.training import train
 from bhd_lerobot.training.arguments import parse_train
 
@@ -405,19 +404,12 @@ def new_folder(path: Path) -> Path:
     return path
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; return the exit status."""
-    return exit_status(lambda: _main(arguments), "Stopped. What was finished is complete.")
-
-
-def _main(arguments: Sequence[str] | None) -> int:
-    parser = Parser(prog="python -m bhd_lerobot.apps.demo", description=__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, help="new folder; one in outputs/demo if nothing")
-    options = parser.parse(arguments)
+def run(folder: Path | None = None) -> int:
+    """Run the demo in a new folder, one in outputs/demo if None; return the exit status."""
     console = Console()
     started = time.perf_counter()
     try:
-        folder = new_folder(options.folder or Path(f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}"))
+        folder = new_folder(folder or Path(f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}"))
         log = logging.FileHandler(folder / LOG, mode="w", encoding="utf-8")  # what libraries log goes there, too
         logging.getLogger().addHandler(log)
         try:
@@ -436,7 +428,3 @@ def _main(arguments: Sequence[str] | None) -> int:
     for path in reports:
         console.print(escape(str(path)), soft_wrap=True, highlight=False)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,3 +1,3 @@
 """Numbers about hardware, each with its source; arenas, and what can lie on a table."""
 
-__all__ = ["arenas", "body", "differential_base", "tabletop", "turtlebot3", "ur5"]
+__all__ = ["arenas", "body", "differential_base", "registry", "tabletop", "turtlebot3", "ur5"]

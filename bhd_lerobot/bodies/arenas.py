@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.registry import Registry
 
 BURGER_RADIUS = 0.124  # [m] of the TurtleBot3 Burger around its wheel axis, as in bodies/turtlebot3.py
 CLEARANCE = 0.051  # [m] what must be free beside the robot for a place to count as reachable
@@ -124,8 +125,7 @@ def register_arena(name: str, make: Callable[[int, float], Arena]) -> None:
     Raises:
         ConfigError: another arena has this name.
     """
-    if ARENAS.setdefault(name, make) is not make:
-        raise ConfigError(f"There is an arena {name!r} already; that of {make.__module__} needs another name.")
+    ARENAS.register(name, make)
 
 
 def turtlebot3_world() -> Arena:
@@ -335,9 +335,10 @@ def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
     return np.hypot(ax, ay, out=outside, where=beside_x & beside_y)
 
 
-ARENAS: dict[str, Callable[[int, float], Arena]] = {
+_OWN: dict[str, Callable[[int, float], Arena]] = {
     "turtlebot3_world": lambda _seed, _radius: turtlebot3_world(),
     "random": random_arena,
     "empty": lambda _seed, _radius: _empty(),
 }
+ARENAS = Registry("arena", _OWN)
 """What makes an arena of a seed and the radius of a robot [m], by name."""

@@ -11,13 +11,14 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 
 from bhd_lerobot import __version__
-from bhd_lerobot.command_line import INTERRUPTED, exit_status
+from bhd_lerobot.options.command import INTERRUPTED, exit_status
 from bhd_lerobot.versions import check_version
 
-_WITHOUT_LEROBOT = ("bhd_lerobot.apps.doctor.doctor", "bhd_lerobot.apps.monitor.monitor")
+_WITHOUT_LEROBOT = ("bhd_lerobot.cli.doctor", "bhd_lerobot.cli.monitor")
 
 
 @contextmanager
@@ -85,36 +86,10 @@ def keep_memory() -> None:
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # options of mallopt(3), by their numbers in malloc.h
 
 
-def record() -> int:
-    """Run `bhd-record`."""
-    return run("bhd_lerobot.recording.record")
-
-
-def train() -> int:
-    """Run `bhd-train`."""
-    return run("bhd_lerobot.cli.train")
-
-
-def evaluate() -> int:
-    """Run `bhd-eval`."""
-    return run("bhd_lerobot.evaluation.evaluate")
-
-
-def replay() -> int:
-    """Run `bhd-replay`."""
-    return run("bhd_lerobot.rollout.replay")
-
-
-def data() -> int:
-    """Run `bhd-data`."""
-    return run("bhd_lerobot.cli.data.main")
-
-
-def doctor() -> int:
-    """Run `bhd-doctor`."""
-    return run("bhd_lerobot.apps.doctor.doctor")
-
-
-def monitor() -> int:
-    """Run `bhd-monitor`."""
-    return run("bhd_lerobot.apps.monitor.monitor")
+record = partial(run, "bhd_lerobot.cli.record")
+train = partial(run, "bhd_lerobot.cli.train")
+evaluate = partial(run, "bhd_lerobot.cli.evaluate")
+replay = partial(run, "bhd_lerobot.cli.replay")
+data = partial(run, "bhd_lerobot.cli.data.main")
+doctor = partial(run, "bhd_lerobot.cli.doctor")
+monitor = partial(run, "bhd_lerobot.cli.monitor")

@@ -3,40 +3,37 @@
 import importlib
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.cli.start import keep_memory
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.rollout import configuration
-from bhd_lerobot.training.rl.config import config_file
+from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.options.parse import CommandLine
 
 
-def algorithm_of(arguments: Sequence[str]) -> Any:
-    """Return what a command line sets as `algorithm`, itself or in its file; None for learning from a dataset.
-
-    What is wrong with the command line is left to the parser that reads it next.
-    """
+def algorithm_of(line: CommandLine) -> Any:
+    """Return what a command line sets as `algorithm`, itself or in its file; None for learning from a dataset."""
+    if "algorithm" in line.options:
+        return line.options["algorithm"]
     try:
-        overrides = configuration.read_overrides(arguments)
-        if "algorithm" in overrides:
-            return overrides["algorithm"]
-        path = overrides.get(configuration.CONFIG_PATH)
-        file = None if path is None else config_file(Path(str(path)))
-        return None if file is None or file.suffix == ".json" else configuration.read_file(file).get("algorithm")
-    except ConfigError:
+        return None if line.path is None or line.path.suffix == ".json" else line.file.get("algorithm")
+    except ConfigError:  # a checkpoint's folder, or what is left to the parser that reads it next
         return None
+
+
+def _program(line: CommandLine) -> Program:
+    """Return what learns as a command line asks. Only that is imported: stable-baselines3 is an extra."""
+    algorithm = algorithm_of(line)
+    part = "" if algorithm is None else "dagger." if algorithm == "dagger" else "rl."
+    program: Program = importlib.import_module(f"bhd_lerobot.training.{part}train").PROGRAM
+    return program
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-train`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
     if arguments is None:  # as a program of its own, not within another
         keep_memory()
-        arguments = sys.argv[1:]
-    algorithm = algorithm_of(arguments)
-    # Only what is needed is imported: stable-baselines3 is an extra.
-    part = "" if algorithm is None else "dagger." if algorithm == "dagger" else "rl."
-    return int(importlib.import_module(f"bhd_lerobot.training.{part}train").main(arguments))
+    return run(_program, arguments)
 
 
 if __name__ == "__main__":

@@ -59,11 +59,7 @@ class BhdEnvConfig(EnvConfig):
     render_mode: str = "rgb_array"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be honoured, and work out the features.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse what cannot be honoured, and work out the features."""
         if self.vector not in VECTORS:
             raise ConfigError(unknown_name("env.vector", self.vector, VECTORS))
         if self.threads is not None and self.threads < 1:
@@ -99,15 +95,7 @@ class BhdEnvConfig(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return the environments in LeRobot's form.
-
-        Args:
-            n_envs: how many run side by side.
-            use_async_envs: without effect: `vector` says how.
-
-        Raises:
-            ConfigError: there are none.
-        """
+        """Return n environments in LeRobot's form; `vector` says how they run, whatever `use_async_envs` is."""
         if n_envs < 1:
             raise ConfigError(f"The number of environments (eval.batch_size) is {n_envs}; it must be at least 1.")
         mode = AutoresetMode.SAME_STEP

@@ -17,25 +17,7 @@ _END = 2**63  # infos of vector environments hold the numbers as int64
 
 
 class Course:
-    """The episodes of one environment, by their numbers in a run.
-
-    Attributes:
-        seed: the run's seed.
-        split: `train`, `validation` or `held_out`.
-        episode: number of the present episode; -1 before the first.
-        following: number of the next one.
-        stride: how many episodes further each one after it is.
-
-    Args:
-        seed: the run's seed.
-        split: which of the sets of episodes.
-        first: number of the first episode, if `advance` gets none; drawn at random below `STREAM` if None, so that
-            environments that do not know of each other run different ones.
-        stride: how many episodes further each next one is.
-
-    Raises:
-        ConfigError: there is no such split, or a number is out of range.
-    """
+    """The episodes of one environment: `episode` is the number of the present one, -1 before the first."""
 
     def __init__(self, seed: int = 0, split: Split = "train", first: int | None = None, stride: int = STREAM) -> None:
         first = int(np.random.default_rng().integers(STREAM)) if first is None else first
@@ -49,11 +31,7 @@ class Course:
         self.following = first
 
     def advance(self, episode: int | None = None) -> int:
-        """Go on to an episode, the next one if None; return its seed.
-
-        Raises:
-            ConfigError: the number is out of range.
-        """
+        """Go on to an episode, the next one if None; return its seed."""
         episode = self.following if episode is None else episode
         if not 0 <= episode < _END:
             raise ConfigError(f"The number of an episode is {episode}; it must be from 0 to 2**63 - 1.")

@@ -177,11 +177,7 @@ def end_info(outcome: Outcome) -> dict[str, Any]:
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """Return the render mode if there is such a one.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return the render mode if there is such a one."""
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise ConfigError(unknown_name("render_mode", render_mode, RENDER_MODES))
     return render_mode

@@ -7,18 +7,20 @@ Importing this module registers them, also as the part of an id before its colon
 from gymnasium.envs.registration import register as gymnasium_register
 from gymnasium.envs.registration import registry
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.registry import Registry
 
 NAMESPACE = "bhd_lerobot"
 
-# name -> type of the robot, type of the task
-ENVIRONMENTS: dict[str, tuple[str, str]] = {
-    "TurtleBot3Avoid-v0": ("turtlebot3", "avoid"),
-    "TurtleBot3Navigate-v0": ("turtlebot3", "navigate"),
-    "UR5Reach-v0": ("ur5", "reach"),
-    "UR5Pick-v0": ("ur5", "pick"),
-}
-"""Robot and task of each environment, by its name."""
+ENVIRONMENTS = Registry(
+    "environment",
+    {
+        "TurtleBot3Avoid-v0": ("turtlebot3", "avoid"),
+        "TurtleBot3Navigate-v0": ("turtlebot3", "navigate"),
+        "UR5Reach-v0": ("ur5", "reach"),
+        "UR5Pick-v0": ("ur5", "pick"),
+    },
+)
+"""The types of the robot and of the task of each environment."""
 
 
 def register_environment(name: str, robot: str, task: str) -> None:
@@ -32,8 +34,7 @@ def register_environment(name: str, robot: str, task: str) -> None:
     Raises:
         ConfigError: there is an environment of this name with another robot or task.
     """
-    if ENVIRONMENTS.setdefault(name, (robot, task)) != (robot, task):
-        raise ConfigError(f"There is an environment {name!r} already, of {' and '.join(ENVIRONMENTS[name])}.")
+    ENVIRONMENTS.register(name, (robot, task))
     full = f"{NAMESPACE}/{name}"
     if full not in registry:
         # No time limit here: the task knows when an episode's time is over.

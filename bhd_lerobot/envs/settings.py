@@ -8,8 +8,8 @@ from typing import Any
 
 from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.parse import decode
 from bhd_lerobot.registry import is_for, robot_configs, robot_of_task
-from bhd_lerobot.rollout.configuration import decode
 from bhd_lerobot.tasks.task import TaskConfig
 
 OBS_TYPES: dict[str, tuple[str, ...]] = {
@@ -24,14 +24,7 @@ OBS_TYPES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What an environment is made of.
-
-    Attributes:
-        name: the environment's name, without its namespace.
-        robot: the robot's configuration.
-        task: the task's configuration.
-        parts: what an observation holds: some of `agent_pos`, `environment_state` and `pixels`.
-    """
+    """What an environment is made of; `parts` are some of `agent_pos`, `environment_state` and `pixels`."""
 
     name: str
     robot: Any
@@ -47,19 +40,7 @@ def make_settings(
     cameras: bool | None = None,
     obs_type: str | None = None,
 ) -> Settings:
-    """Return what an environment is made of.
-
-    Args:
-        environment: its name, with or without the namespace.
-        robot: options of the robot that differ from their defaults, by name, nested where they are; or a whole
-            configuration.
-        task: the same of the task.
-        cameras: whether the robot's cameras are observed; the robot's own option if None.
-        obs_type: one of `OBS_TYPES`; all that there is if None.
-
-    Raises:
-        ConfigError: there is no such environment or option, or a value that cannot be honoured.
-    """
+    """Return what an environment is made of."""
     name = environment.removeprefix(f"{NAMESPACE}/") if isinstance(environment, str) else environment
     if name not in ENVIRONMENTS:
         raise ConfigError(unknown_name("environment", environment, ENVIRONMENTS))

@@ -41,15 +41,7 @@ def _state_space(simulation: Simulation) -> spaces.Box:
 
 
 class ActionScale:
-    """The actions' bounds, and how normalised actions become the robot's.
-
-    Attributes:
-        space: the space of one simulation's actions.
-
-    Args:
-        simulation: the robots.
-        normalise: whether actions are in [-1, 1], which is mapped to the bounds.
-    """
+    """The actions' bounds, and how actions in [-1, 1], if they are normalised, become the robot's."""
 
     def __init__(self, simulation: Simulation, *, normalise: bool) -> None:
         self.names = simulation.action_names
@@ -69,9 +61,6 @@ class ActionScale:
         Args:
             actions: shape (n, a); those of simulations that do not run mean nothing.
             running: the simulations that the actions are for, shape (n,).
-
-        Raises:
-            ActionError: another shape, not numbers, or a value that is not finite.
         """
         values = np.asarray(actions)
         shape = (len(running), len(self.names))

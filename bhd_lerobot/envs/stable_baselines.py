@@ -31,9 +31,6 @@ class BhdSb3VecEnv(VecEnv):
         env: with autoreset mode DISABLED.
         observation_space: of one environment; that of `env` if None.
         action_space: of one environment; that of `env` if None.
-
-    Raises:
-        ConfigError: the environment has another autoreset mode.
     """
 
     def __init__(

@@ -64,18 +64,10 @@ class Stage:
     """n simulations, each in an episode of its own, or idle.
 
     Attributes:
-        simulation: the robots.
-        task: what is to be achieved.
         frames: longest duration of an episode [frames].
         seeds: seed of the episode that each simulation is in, shape (n,).
         scenes: its scene, by simulation.
         limits: `Limit` flags of the last frame, shape (n,).
-
-    Args:
-        robot: the robot's configuration.
-        task: the task's configuration.
-        n: how many simulations.
-        threads: threads that step the physics; all processors if None.
     """
 
     def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:
@@ -138,9 +130,6 @@ class Stage:
 
         Args:
             actions: of each robot, shape (n, a), finite and of single precision.
-
-        Raises:
-            SimulationError: the physics diverged.
         """
         simulation = self.simulation
         report = simulation.step(actions)
@@ -162,11 +151,7 @@ class Stage:
         return "" if scene is None else self.task.instruction(scene)
 
     def render(self, sim: int) -> NDArray[np.uint8]:
-        """Return one simulation from outside, shape (240, 320, 3).
-
-        Raises:
-            RenderingError: no image can be rendered here.
-        """
+        """Return one simulation from outside, shape (240, 320, 3)."""
         if self._view is None:
             self._view = Camera(self.simulation.world, _VIEW_WIDTH, _VIEW_HEIGHT)
         return self._view.render(sim, self.simulation.view)

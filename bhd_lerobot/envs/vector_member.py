@@ -21,17 +21,7 @@ _SETTABLE = ("seed", "split", "stride", "render_mode")
 
 
 class Member:
-    """What `get_attr`, `call` and `set_attr` of a vector environment find: what a `BhdEnv` would have.
-
-    Attributes:
-        course: which episode comes next.
-
-    Args:
-        stage: all simulations.
-        sim: the number of this one.
-        course: its episodes.
-        vector: the vector environment.
-    """
+    """What `get_attr`, `call` and `set_attr` of a vector environment find: what a `BhdEnv` would have."""
 
     def __init__(self, stage: Stage, sim: int, course: Course, vector: Any) -> None:
         self.stage, self.course = stage, course
@@ -57,11 +47,7 @@ class Member:
         return None if self.render_mode is None else self.stage.render(self._sim)
 
     def set(self, name: str, value: Any) -> None:
-        """Set an attribute: `seed`, `split` or `stride` of the episodes to come, or `render_mode`.
-
-        Raises:
-            ConfigError: there is no such attribute, or the value cannot be honoured.
-        """
+        """Set an attribute: `seed`, `split` or `stride` of the episodes to come, or `render_mode`."""
         if name not in _SETTABLE:
             raise ConfigError(unknown_name("attribute that can be set", name, _SETTABLE))
         if name == "render_mode":

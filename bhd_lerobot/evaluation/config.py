@@ -76,11 +76,7 @@ class EvalConfig:
     output_dir: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         check_robot_and_task(self.robot, self.task, "bhd-eval")
         if self.brain is not None:
             name = str(self.brain.get_choice_name(type(self.brain)))

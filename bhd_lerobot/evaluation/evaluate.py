@@ -1,7 +1,6 @@
 """`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and videos."""
 
 import platform
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -26,13 +25,13 @@ from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent, perception_sentence
+from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
 from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import Host, describe
-from bhd_lerobot.rollout.configuration import encode, read_file, run
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import versions
-from bhd_lerobot.rollout.run_folder import CONFIG, run_folder
+from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 
 
@@ -133,15 +132,7 @@ class EvalResult:
 
 
 def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
-    """Run every brain on the same episodes, write results and report.
-
-    Args:
-        config: what to compare.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured; the message names the brain that does not fit.
-    """
+    """Run every brain on the same episodes, write results and report."""
     console = console or Console(stderr=True)
     _refuse_results(config)
     is_live = config.robot.clock == "realtime"
@@ -303,11 +294,7 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
 
 
 def _refuse_results(config: EvalConfig) -> None:
-    """Refuse a folder that holds the results of another evaluation, or of this one if it is complete.
-
-    Raises:
-        ConfigError: names the folder.
-    """
+    """Refuse a folder that holds the results of another evaluation, or of this one if it is complete."""
     folder = Path(config.output_dir or "").expanduser()
     if config.output_dir and (folder / RESULTS_NAME).is_file() and not _is_continued(config, folder):
         raise ConfigError(
@@ -321,17 +308,4 @@ def _is_continued(config: EvalConfig, folder: Path) -> bool:
     if config.record.repo_id is None:
         return False
     partial = read_file(folder / RESULTS_NAME).get("partial") is True
-    return partial and (folder / CONFIG).is_file() and read_file(folder / CONFIG) == encode(config)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-eval`; return the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    keys = [argument.partition("=")[0] for argument in arguments]
-    if "--brain.path" in keys and "--brain.type" not in keys:
-        arguments.append("--brain.type=learned")  # nothing else is somewhere on the disk
-    return run(lambda config: evaluate(config).exit_status, EvalConfig, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return partial and (folder / RUN_CONFIG).is_file() and read_file(folder / RUN_CONFIG) == encode(config)

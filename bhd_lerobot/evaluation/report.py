@@ -21,7 +21,7 @@ from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults
 from bhd_lerobot.evaluation.statistics import Estimate
 from bhd_lerobot.evaluation.text import number, percent, sentences
-from bhd_lerobot.rollout.configuration import encode
+from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
 VIDEO_BYTES = 12_000_000  # videos in the page; those beyond stay files beside it
@@ -30,13 +30,7 @@ LISTED = 100  # failed episodes of a brain that are listed
 
 @dataclass(frozen=True)
 class Video:
-    """A video of an episode.
-
-    Attributes:
-        label: the brain's name in the evaluation.
-        metrics: the episode.
-        path: the MP4 file.
-    """
+    """A video of a brain's episode."""
 
     label: str
     metrics: EpisodeMetrics
@@ -45,17 +39,7 @@ class Video:
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What a report is made of.
-
-    Attributes:
-        config: what was compared.
-        results: what was found out.
-        timing: what was measured on the wall clock.
-        trajectories: the episodes from above, by brain and number.
-        videos: videos of episodes.
-        no_videos: why there are none.
-        folder: where results and configuration lie.
-    """
+    """What a report is made of; `no_videos` says why there are none."""
 
     config: EvalConfig
     results: EvalResults

@@ -92,8 +92,6 @@ class EvalResults:
         config: what decides the numbers: robot, task, brains, episodes and seeds.
         versions: of the programs that made them.
         requested: how many episodes of each brain were requested.
-        episodes: all episodes, brain by brain, in their order.
-        brains: what each brain achieved.
         paired: the brains beside the baseline.
     """
 
@@ -133,16 +131,7 @@ def summarise(
     *,
     privileged: Collection[str] = (),
 ) -> EvalResults:
-    """Return the summaries of brains after some episodes.
-
-    Args:
-        config: what decides the numbers.
-        versions: of the programs.
-        episodes: of each brain, by its name.
-        requested: how many episodes of each brain were requested.
-        baseline: the brain that the others are compared with.
-        privileged: the brains that act on what no sensor tells.
-    """
+    """Return the summaries of brains after some episodes."""
     results = EvalResults(config, versions, requested)
     compared = max(1, len(episodes) - 1)
     for label, ran in episodes.items():

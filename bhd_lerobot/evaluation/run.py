@@ -86,17 +86,7 @@ class BrainRun:
 
 
 def prepare(config: EvalConfig, label: str, simulation: Host, pool: WorkerPool | None = None) -> BrainRun:
-    """Make a brain and what runs it: one that does not fit fails here, before any episode.
-
-    Args:
-        config: the evaluation.
-        label: the brain's name in it.
-        simulation: the robots.
-        pool: who runs the episodes, if not this process.
-
-    Raises:
-        BhdError: the message names the brain.
-    """
+    """Make a brain and what runs it: one that does not fit fails here, before any episode."""
     robot: Any = config.robot
     try:
         timed = TimedBrain(make_brain(config.brains[label]))
@@ -138,11 +128,7 @@ def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], sh
 
 
 def _rows_of(recorder: DatasetRecorder, specs: Sequence[EpisodeSpec]) -> dict[int, EpisodeSummary]:
-    """Return which of the episodes a dataset holds, by their numbers, in ascending order.
-
-    Raises:
-        DatasetMismatchError: they were recorded with other versions, with which the others would not be comparable.
-    """
+    """Return which of the episodes a dataset holds, by their numbers, in ascending order."""
     seeds = {spec.index: str(spec.seed) for spec in specs}
     rows = {int(row.metadata["episode"]): row for row in dataset_info(recorder.root).episodes}
     wanted = {number: row for number, row in sorted(rows.items()) if seeds.get(number) == row.metadata["seed"]}
@@ -167,9 +153,6 @@ def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[Dat
     """Open the dataset of a brain, written as `bhd-record` writes it and complete at the end; None if none is wanted.
 
     One that a stopped evaluation left is continued.
-
-    Raises:
-        DatasetError: there is one of another evaluation, or it cannot be written.
     """
     if config.record.repo_id is None:
         yield None

@@ -18,13 +18,7 @@ _FLAT = 1e-12  # of the values' size: a spread that is less is rounding
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval; NaN where it is not defined.
-
-    Attributes:
-        value: the estimate.
-        low: lower end of its interval.
-        high: upper end.
-    """
+    """A number with the lower and upper end of its interval; NaN where it is not defined."""
 
     value: float
     low: float
@@ -47,16 +41,7 @@ class Discordance:
 
 
 def wilson(successes: int, count: int, confidence: float = CONFIDENCE) -> Estimate:
-    """Return a share with its Wilson score interval.
-
-    Args:
-        successes: how many of them were a success.
-        count: number of independent trials; nothing is known after none: 0 to 1.
-        confidence: probability that the interval covers the truth.
-
-    Raises:
-        ValueError: more successes than trials, fewer than none, or a confidence that is not between 0 and 1.
-    """
+    """Return a share with its Wilson score interval; after no trials it is 0 to 1."""
     if not 0 <= successes <= count:
         raise ValueError(f"{successes} successes in {count} trials.")
     if not 0 < confidence < 1:
@@ -212,12 +197,7 @@ def rate_difference(successes: ArrayLike, baseline: ArrayLike, confidence: float
 
 
 def discordance(successes: ArrayLike, baseline: ArrayLike) -> Discordance:
-    """Return on how many episodes two brains differed in success, with McNemar's exact test.
-
-    Args:
-        successes: whether each episode was a success, shape (episodes,).
-        baseline: of the same episodes, in the same order.
-    """
+    """Return on how many episodes two brains differed in success, with McNemar's exact test."""
     one, two = _paired(np.asarray(successes, bool), np.asarray(baseline, bool))
     better, worse = int(np.sum(one & ~two)), int(np.sum(two & ~one))
     total = better + worse

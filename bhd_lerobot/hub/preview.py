@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode, video_frames
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
 from bhd_lerobot.datasets.format.summary import DatasetSummary
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.plugins import body_of
 
 SHOWN = 12  # episodes in an image from above
 FRAMES = 6  # of an episode, in an image from a camera

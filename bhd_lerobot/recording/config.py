@@ -104,11 +104,7 @@ class RecordConfig:
     display_compressed_images: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        """Refuse values that cannot be honoured."""
         if not self.dataset.repo_id:
             if self.dataset.push_to_hub:
                 raise ConfigError("dataset.push_to_hub is true: set --dataset.repo_id=user/name, or leave it out.")

@@ -52,11 +52,7 @@ class DisplayOptions(Protocol):
 
 
 def check_options(options: DisplayOptions) -> None:
-    """Refuse options that cannot be honoured. Imports nothing.
-
-    Raises:
-        ConfigError: names the value and the valid ones, or the package that is missing.
-    """
+    """Refuse options that cannot be honoured. Imports nothing."""
     if options.display_mode not in PACKAGES:
         raise ConfigError(unknown_name("display_mode", options.display_mode, PACKAGES))
     port = options.display_port
@@ -90,13 +86,6 @@ class LiveView:
         shown: frames that were shown.
         left_out: frames that were not, for want of time.
         problem: why nothing is shown any more, or an empty text.
-
-    Args:
-        options: where to show it.
-        simulation: what is shown.
-
-    Raises:
-        ConfigError: the view cannot be started.
     """
 
     def __init__(self, options: DisplayOptions, simulation: Host) -> None:
@@ -251,12 +240,7 @@ class RerunExtras:
         rerun.send_blueprint(log_rerun_data.blueprint)
 
     def flush(self) -> None:
-        """Send what waits to be sent.
-
-        Raises:
-            Exception: the viewer does not take it. Nothing more is sent then, not even at the end of the program, which
-                would wait for the viewer for ever.
-        """
+        """Send what waits; after an error nothing more is sent, or the end of the program would wait for ever."""
         recording = self._rerun.get_global_data_recording()
         try:
             if recording is not None:
@@ -303,11 +287,7 @@ def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
 
 @contextmanager
 def live_view(options: DisplayOptions, simulation: Host, console: Console) -> Iterator[LiveView | None]:
-    """Show a run live if `display_data` is set; at its end print how many frames were left out.
-
-    Raises:
-        ConfigError: the view cannot be started.
-    """
+    """Show a run live if `display_data` is set; at its end print how many frames were left out."""
     if not options.display_data:
         yield None
         return

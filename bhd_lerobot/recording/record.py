@@ -1,9 +1,8 @@
 """`bhd-record`: episodes of a simulated robot, driven by a brain, into a LeRobotDataset."""
 
 import os
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
@@ -30,17 +29,15 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetEditedError, RealtimeError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary, progress_bars
-from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.host import Host, describe
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
@@ -83,16 +80,7 @@ _ATTEMPTS = 3  # that an episode gets to be punctual
 
 
 def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
-    """Record the episodes that a configuration describes.
-
-    Args:
-        config: what to record.
-        console: where progress is shown; standard error if None.
-
-    Raises:
-        BhdError: the configuration cannot be honoured, or the dataset cannot be written. Episodes that were saved
-            before are intact.
-    """
+    """Record the episodes that a configuration describes; those that were saved before an error are intact."""
     if config.dataset.push_to_hub:
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
@@ -194,11 +182,7 @@ def _run(
 def _episodes(
     loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
 ) -> Iterator[Episode]:
-    """Run episodes; with `timing.reject`, those that were too unpunctual are run again.
-
-    Raises:
-        RealtimeError: an episode was too unpunctual every time.
-    """
+    """Run episodes; with `timing.reject`, those that were too unpunctual are run again."""
 
     def stop() -> bool:
         return bool(result.stopped_by)
@@ -230,11 +214,7 @@ def _episodes(
 
 
 def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Console) -> None:
-    """Let a signal and, in a terminal, a key press the emergency stop.
-
-    Raises:
-        ConfigError: `estop_key` is set where there is no terminal.
-    """
+    """Let a signal and, in a terminal, a key press the emergency stop."""
     is_live = config.robot.clock == "realtime"
     number = estop_signal(config.estop_signal)
     pressed.add_signal(number)
@@ -249,11 +229,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
 
 
 def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task, brain: Brain) -> DatasetRecorder:
-    """Open the dataset that a configuration asks for, or go on with it.
-
-    Raises:
-        BhdError: it exists and is not to be resumed, or holds something else.
-    """
+    """Open the dataset that a configuration asks for, or go on with it."""
     nq, nv = (part.shape[1] for part in simulation.physics)
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(
@@ -319,11 +295,6 @@ def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, 
     """Return options without those that a dataset is older than, if they are as they are by default.
 
     By default an option of a task leaves it as it was before there was that option.
-
-    Args:
-        asked: the options, as plain values.
-        recorded: those of the dataset; anything else than a mapping is left for the comparison to refuse.
-        kind: the dataclass that they are of.
     """
     if not isinstance(recorded, Mapping):
         return asked
@@ -432,22 +403,3 @@ def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
             console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
             raise
     console.print(escape(message), soft_wrap=True, highlight=False)
-
-
-def _main(config: RecordConfig, arguments: Sequence[str]) -> int:
-    try:
-        return record(config).exit_status
-    except DatasetEditedError as error:
-        for line in instead_of_resuming(config, arguments):
-            error.add_note(line)
-        raise
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-record`; return the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    return run(lambda config: _main(config, arguments), RecordConfig, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -18,13 +18,6 @@ def instead_of_resuming(config: RecordConfig, arguments: Sequence[str]) -> list[
 
     The seed is one of which the dataset has no episode: with the recorded one the same episodes would be recorded
     again.
-
-    Args:
-        config: of the run that was refused.
-        arguments: its command line.
-
-    Raises:
-        DatasetError: the dataset cannot be read.
     """
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
     episodes = dataset_info(root).episodes

@@ -1,12 +1,10 @@
-"""The loop of an episode, configurations and replay."""
+"""The loop of an episode, and replay."""
 
 __all__ = [
-    "configuration",
     "drivers",
     "episode",
     "images",
     "marks",
-    "options_help",
     "plots",
     "preview",
     "provenance",

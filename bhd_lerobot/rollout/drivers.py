@@ -16,13 +16,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Intervention:
-    """Frames of one intervention.
-
-    Attributes:
-        first: the first frame.
-        end: the frame after the last.
-        cause: why, in words.
-    """
+    """Frames `first` to `end` - 1, in which an expert or a person drove, and why, in words."""
 
     first: int
     end: int
@@ -30,18 +24,7 @@ class Intervention:
 
 
 class DriverLog:
-    """Who drives n simulations, from one decision of a brain to the next.
-
-    Attributes:
-        intervenes: whether an expert can take over in the brain.
-        is_mixed: whether it gives setpoints in some frames and goals in others.
-        gives_goals: whether it gives goals at all.
-
-    Args:
-        brain: the brain; an `Intervening` if an expert takes over in it.
-        n: number of simulations.
-        frames: longest episode, in frames.
-    """
+    """Who drives n simulations, from one decision of a brain to the next."""
 
     def __init__(self, brain: Any, n: int, frames: int) -> None:
         # Not isinstance: a brain may be wrapped in one that passes on what it does not know.
@@ -78,16 +61,12 @@ class DriverLog:
         self._fresh[:] = False
 
     def frame(self, running: NDArray[np.intp], length: NDArray[np.int64], *, is_missed: bool) -> tuple[Mask, Mask]:
-        """Note who drove in a frame that just ended.
+        """Return in which simulations an intervention was on, and which followed goals, in a frame; each of shape (n,).
 
         Args:
             running: the simulations that are in an episode.
             length: frames of each episode before this one, shape (n,).
-            is_missed: whether the frame went by, on the wall clock, during inference: the decision before was
-                still in force.
-
-        Returns:
-            In which simulations an intervention was on, and which followed goals, each of shape (n,).
+            is_missed: whether the frame went by during inference: the decision before was still in force.
         """
         taken, by_goals = self._before if is_missed else self._now
         rows = length[running]
@@ -126,11 +105,7 @@ def spans(mask: Mask) -> list[tuple[int, int]]:
 
 
 class TimedBrain:
-    """A brain whose calls are timed; everything else is the brain's own.
-
-    Attributes:
-        times: duration of each call of `act` [s].
-    """
+    """A brain whose calls are timed, in `times` [s]; everything else is the brain's own."""
 
     def __init__(self, brain: Brain) -> None:
         self._brain = brain

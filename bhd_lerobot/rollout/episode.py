@@ -39,14 +39,6 @@ class EpisodeLoop:
 
     Attributes:
         observer: receives every frame of every simulation, and every image; None if there is none.
-
-    Args:
-        simulation: the robots.
-        task: what is to be achieved.
-        brain: what drives them.
-        tolerance: how unpunctual a frame may be on the wall clock; the defaults if None.
-
-    Attributes:
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
         fault: whether a real robot's fault has.
         marks: takes the marks of a person for the running episodes.

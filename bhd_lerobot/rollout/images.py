@@ -18,14 +18,7 @@ and copy what it keeps; images come on another thread."""
 
 
 class EpisodeImages:
-    """Orders images of n simulations, each for its episode.
-
-    Attributes:
-        sinks: where the images of each simulation go: something with `add_image` and `discard`, or None.
-
-    Args:
-        simulation: the robots.
-    """
+    """Orders images of n simulations, and hands each to what takes those of its episode, or to nothing."""
 
     def __init__(self, simulation: Host) -> None:
         self._simulation = simulation

@@ -22,10 +22,6 @@ class Marks:
 
     An outcome ends the episode with the frame in which it is set. A frame of an intervention carries the
     event ``intervention``; what moves the robot meanwhile is not decided here.
-
-    Args:
-        n: number of simulations.
-        outcomes: what an episode can end with; see `bhd_lerobot.tasks.task.outcomes_of`.
     """
 
     def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES) -> None:
@@ -35,30 +31,14 @@ class Marks:
         self._driving: set[int] = set()
 
     def outcome(self, name: str, simulation: int = 0) -> None:
-        """Mark that the running episode ends now, and how.
-
-        Args:
-            name: one of `outcomes`, for example ``success``, ``failure`` or ``collision``.
-            simulation: whose episode.
-
-        Raises:
-            ConfigError: there is no such outcome or simulation.
-        """
+        """Mark that the running episode of a simulation ends now, and how: by one of the outcomes."""
         if name not in self._valid:
             raise ConfigError(unknown_name("outcome", name, self._valid))
         with self._lock:
             self._outcomes[self._checked(simulation)] = Event[name.upper()]
 
     def intervention(self, is_on: bool | None = None, simulation: int = 0) -> None:
-        """Mark that an intervention begins now, or ends.
-
-        Args:
-            is_on: whether it begins; toggled if None.
-            simulation: in whose episode.
-
-        Raises:
-            ConfigError: there is no such simulation.
-        """
+        """Mark that an intervention begins now, or ends; the other one if None."""
         with self._lock:
             if (self._checked(simulation) not in self._driving) if is_on is None else is_on:
                 self._driving.add(simulation)
@@ -83,15 +63,7 @@ class Marks:
                 self._driving.discard(simulation)
 
     def frame(self, event: NDArray[np.int64], running: Mask) -> tuple[NDArray[np.int64], Mask]:
-        """Return the events of a frame with the marks applied, and where interventions are on.
-
-        Args:
-            event: what happened, shape (n,).
-            running: which simulations run, shape (n,).
-
-        Returns:
-            Both of shape (n,).
-        """
+        """Return a frame's events with the marks applied, and where interventions are on, both of shape (n,)."""
         driven = np.zeros(self._n, np.bool_)
         with self._lock:
             if not self._outcomes and not self._driving:

@@ -42,11 +42,7 @@ class Trajectory:
 
 
 class TrajectoryAlbum:
-    """Collects the episodes of a run that are worth an image, in memory that does not grow with the run.
-
-    Attributes:
-        added: number of episodes that were added.
-    """
+    """Collects the episodes of a run that are worth an image, in memory that does not grow with the run."""
 
     def __init__(self) -> None:
         self.added = 0

@@ -17,14 +17,7 @@ GAP = 8  # between them [px]
 
 
 class Preview:
-    """Renders episodes from outside. Making one fails early where no image can be rendered.
-
-    Args:
-        simulation: one robot, for this alone.
-
-    Raises:
-        RenderingError: no image can be rendered here.
-    """
+    """Renders episodes from outside. Making one fails early where no image can be rendered."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
@@ -37,14 +30,7 @@ class Preview:
         return self._camera.render(0, self._simulation.view)
 
     def write(self, scene: Any, states: NDArray[np.float64], fps: int, path: Path) -> None:
-        """Write the video of an episode.
-
-        Args:
-            scene: where it was.
-            states: recorded physics states, shape (frames, nq + nv).
-            fps: recorded frames a second [Hz].
-            path: the MP4 file.
-        """
+        """Write an episode's video, at its frames a second [Hz], of its physics states, shape (frames, nq + nv)."""
         import av  # a run without a video does not need FFmpeg
 
         self._simulation.place(np.zeros(1, np.intp), [scene])
@@ -60,14 +46,7 @@ class Preview:
             container.mux(stream.encode())
 
     def write_strip(self, scene: Any, states: NDArray[np.float64], fps: int, path: Path) -> None:
-        """Write an image of an episode: some of its frames, evenly spaced, in rows, each with its time.
-
-        Args:
-            scene: where it was.
-            states: recorded physics states, shape (frames, nq + nv).
-            fps: recorded frames a second [Hz].
-            path: the PNG file.
-        """
+        """Write an image of some of an episode's frames, evenly spaced, in rows, each with its time."""
         from PIL import Image, ImageDraw
 
         self._simulation.place(np.zeros(1, np.intp), [scene])

@@ -67,16 +67,7 @@ _OF_AN_EPISODE = frozenset(
 
 
 def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], instruction: str) -> Episode:
-    """Return an episode that was recorded: what can be measured of it, without images, goals and interventions.
-
-    Args:
-        recorded: what `episode_metadata` returned when it was recorded.
-        columns: its columns in the dataset.
-        instruction: its task in the dataset.
-
-    Raises:
-        DatasetError: the metadata are not those of an episode of this version.
-    """
+    """Return a recorded episode from its metadata and columns: without images, goals and interventions."""
     try:
         details = {name: value for name, value in recorded.items() if name not in _OF_AN_EPISODE}
         event = Event[recorded["outcome"].upper()]
@@ -137,11 +128,7 @@ def scene_to_json(scene: Any) -> str:
 
 
 def scene_from_json(text: str) -> Any:
-    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`.
-
-    Raises:
-        DatasetError: the text is no scene.
-    """
+    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`."""
     try:
         scene = json.loads(text)
         if "shapes" in scene:

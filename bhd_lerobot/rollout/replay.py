@@ -5,8 +5,6 @@ the robot is put into each recorded physics state, and its sensors are read agai
 """
 
 import json
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,6 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.plots import draw_divergence
 from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
 
@@ -105,15 +102,7 @@ class Divergence:
 
 
 class Replay:
-    """One recorded episode and a simulation of its robot.
-
-    Args:
-        root: the dataset.
-        episode: the episode's number in it.
-
-    Raises:
-        DatasetError: the dataset, or what a replay needs of it, is missing.
-    """
+    """One recorded episode and a simulation of its robot."""
 
     def __init__(self, root: Path, episode: int) -> None:
         summary = dataset_info(root)
@@ -225,12 +214,7 @@ class Replay:
 
 
 def replay(config: ReplayConfig, console: Console | None = None) -> list[Divergence]:
-    """Replay an episode, print how far it diverges, and draw it.
-
-    Raises:
-        ConfigError: no dataset is given.
-        DatasetError: the dataset cannot be replayed.
-    """
+    """Replay an episode, print how far it diverges, and draw it."""
     console = console or Console(stderr=True)
     if config.dataset.root:
         root = Path(config.dataset.root).expanduser()
@@ -310,18 +294,3 @@ def _robot_config(recorded: dict[str, Any]) -> Any:
     recorded = {"jerk_limits": False, **recorded}  # what is older than these limits was recorded without them
     parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
     return kind(**{**parameters, "camera": False, "clock": "lockstep"})
-
-
-def _main(config: ReplayConfig) -> int:
-    results = replay(config)
-    worst = max(float(result.position_m.max()) for result in results)
-    return int(config.tolerance_m is not None and worst > config.tolerance_m)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-replay`; return the exit status: 1 if the replay differs by more than `tolerance_m`."""
-    return run(_main, ReplayConfig, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

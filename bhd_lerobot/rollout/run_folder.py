@@ -9,23 +9,14 @@ from typing import Any
 import yaml
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.rollout.configuration import encode
-
-CONFIG = "config.yaml"
+from bhd_lerobot.options.parse import RUN_CONFIG, encode
 
 
 @contextlib.contextmanager
 def run_folder(config: Any, kind: str) -> Iterator[Path]:
     """Make the folder of a run, with its resolved configuration; if the block fails, the run was refused.
 
-    A run that was refused leaves no folder; what was there before stays.
-
-    Args:
-        config: of the run, with `output_dir`, `robot` and `task`.
-        kind: of the run, for the default place: ``record`` or ``eval``.
-
-    Raises:
-        ConfigError: the folder cannot be written.
+    A run that was refused leaves no folder; what was there before stays. The default place is in ``outputs/<kind>``.
     """
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()
@@ -35,9 +26,9 @@ def run_folder(config: Any, kind: str) -> Iterator[Path]:
         folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / name
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        before = (folder / CONFIG).read_bytes() if (folder / CONFIG).is_file() else None
+        before = (folder / RUN_CONFIG).read_bytes() if (folder / RUN_CONFIG).is_file() else None
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
+        (folder / RUN_CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
     try:
@@ -45,9 +36,9 @@ def run_folder(config: Any, kind: str) -> Iterator[Path]:
     except BaseException:
         with contextlib.suppress(OSError):
             if before is None:
-                (folder / CONFIG).unlink()
+                (folder / RUN_CONFIG).unlink()
             else:
-                (folder / CONFIG).write_bytes(before)
+                (folder / RUN_CONFIG).write_bytes(before)
             for path in missing:
                 path.rmdir()
         raise

@@ -11,11 +11,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """Whether, and by which signal, the run was asked to end.
-
-    Attributes:
-        signal: the signal, or None.
-    """
+    """Whether, and by which `signal`, the run was asked to end."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None

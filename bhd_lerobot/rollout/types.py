@@ -14,12 +14,7 @@ from bhd_lerobot.tasks.task import Outcome
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """An episode to be run.
-
-    Attributes:
-        index: its number in the run; results come back in this order.
-        seed: decides everything that is random in it.
-    """
+    """An episode to be run: its number in the run, and the seed that decides everything random in it."""
 
     index: int
     seed: int

@@ -71,15 +71,10 @@ class AvoidTask(BaseTask):
     that the robot's centre visited before the first contact or the end, as a share of the free cells, those that it
     could have got into. The reward of a frame is what the frame adds to the score. Failures: `collision`, `stuck`, and
     `timeout` when the time is over and the path too short.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
     """
 
     name = "avoid"
+    never = (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE)
     needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     lasts = True
 

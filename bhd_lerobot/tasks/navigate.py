@@ -93,18 +93,10 @@ class NavigateTask(BaseTask):
 
     A shortest way keeps the robot's radius and `CLEARANCE` from all obstacles and goes in sixteen directions on a grid
     of 0.05 m, so it may be up to 2.8 % longer than the shortest one that there is.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
-
-    Raises:
-        ConfigError: a fixed arena has no place for such a goal.
     """
 
     name = "navigate"
+    never = (Event.WRONG_OBJECT, Event.DROPPED)
     needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     environment_names: tuple[str, ...] = ENVIRONMENT
 
@@ -128,9 +120,6 @@ class NavigateTask(BaseTask):
         """Return the arena and the goal of the episode with this seed.
 
         There is a way to the goal by construction: the robot's centre can get there with room to spare.
-
-        Raises:
-            ConfigError: the arena, or each of many random ones, has no place for such a goal.
         """
         config = self.config
         rng = np.random.default_rng(np.random.SeedSequence([0x60A1, int(seed)]))
@@ -166,11 +155,7 @@ class NavigateTask(BaseTask):
         return "Drive to the goal pose without touching anything."
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
-        """Start episodes: the robot stands at each arena's start.
-
-        Raises:
-            ConfigError: a scene has no goal, or one that is not finite or that no way leads to.
-        """
+        """Start episodes: the robot stands at each arena's start."""
         for sim, arena in zip(ids, scenes, strict=True):
             goal = arena.goal
             if goal is None or not np.isfinite(goal).all():

@@ -127,15 +127,10 @@ class PickTask(ArmTask):
     (another object was picked up), `dropped` (the right one was, and fell), `unreachable` (it was pushed out of reach)
     and `timeout`. Score: the greatest height of the object as a share of `lift_m`, at most 0.9; 1 for a success. The
     reward of a frame is what it adds to the score.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
     """
 
     name = "pick"
+    never = (Event.STUCK,)
     environment_names = ENVIRONMENT
 
     def __init__(self, config: PickConfig, n: int, fps: int, body: Body | None = None) -> None:

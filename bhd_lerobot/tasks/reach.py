@@ -64,15 +64,10 @@ class ReachTask(ArmTask):
     Success: the tool within the tolerances of the target for `hold_s`. Failures: `collision` (the arm touches the table
     or itself) and `timeout`. Score: the share of the way to the target that was covered in the end, 1 for a success.
     The reward of a frame is by how much the distance to the target fell, as a share of the distance at the start.
-
-    Args:
-        config: the parameters.
-        n: number of simulations.
-        fps: frames a second [Hz].
-        body: the robot's hardware.
     """
 
     name = "reach"
+    never = (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK)
     environment_names = ENVIRONMENT
     needs: frozenset[str] | None = frozenset({"tool_pose"})
 

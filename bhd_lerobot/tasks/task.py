@@ -12,10 +12,21 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import BURGER_RADIUS, Arena, make_arena
 from bhd_lerobot.bodies.body import Body, MobileBase
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.registry import Registry
 
 
 class TaskConfig(draccus.ChoiceRegistry):
     """Base class of task configurations."""
+
+
+_OWN: dict[str, Any] = {
+    "avoid": "bhd_lerobot.tasks.avoid:AvoidTask",
+    "navigate": "bhd_lerobot.tasks.navigate:NavigateTask",
+    "pick": "bhd_lerobot.tasks.pick:PickTask",
+    "reach": "bhd_lerobot.tasks.reach:ReachTask",
+}
+TASKS: Registry[Any] = Registry("task", _OWN, TaskConfig)
+"""The classes of the tasks, by name."""
 
 
 Split = Literal["train", "held_out", "validation"]
@@ -49,18 +60,6 @@ OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, 
 """The events that an episode can end with, by name."""
 
 
-NEVER: dict[str, tuple[Event, ...]] = {
-    "avoid": (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE),
-    "navigate": (Event.WRONG_OBJECT, Event.DROPPED),
-    "reach": (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK),
-    "pick": (Event.STUCK,),
-}
-"""What cannot happen in a task, by its type: a base holds nothing, and only a base gets stuck.
-
-Tasks of other packages are added when they are registered; an episode of one that is not known may end with anything.
-"""
-
-
 def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
     """Return what an episode can end with, by name, whoever says so.
 
@@ -69,7 +68,8 @@ def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
         body: the robot's hardware; None if it is not known.
     """
     grasping = (Event.WRONG_OBJECT, Event.DROPPED) if isinstance(body, MobileBase) else ()
-    never = {event.cause for event in (*NEVER.get(task or "", ()), *grasping)}
+    known = getattr(TASKS[task], "never", ()) if task and task in TASKS else ()  # of one that is not known, anything
+    never = {event.cause for event in (*known, *grasping)}
     return tuple(name for name in OUTCOMES if name not in never)
 
 
@@ -84,9 +84,6 @@ def episode_seed(seed: int, episode: int, split: Split) -> int:
         seed: the run's seed.
         episode: the episode's number in the run.
         split: which of the sets the episode belongs to.
-
-    Raises:
-        ConfigError: there is no such split, or a number is negative.
     """
     if split not in SPLITS:
         raise ConfigError(f"Unknown split {split!r}. Valid: {', '.join(SPLITS)}.")
@@ -273,10 +270,6 @@ class PathLengths:
     Attributes:
         total: in all [m], shape (n,).
         recent: in the last `window` frames [m], shape (n,).
-
-    Args:
-        n: number of robots.
-        window: how many frames `add` looks back.
     """
 
     def __init__(self, n: int, window: int) -> None:

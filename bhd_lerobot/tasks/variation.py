@@ -113,12 +113,7 @@ class RandomisationConfig:
 
 
 def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Variation:
-    """Return the world's variation of one episode.
-
-    Args:
-        config: the ranges.
-        rng: the episode's random numbers.
-    """
+    """Return the world's variation of one episode."""
     if not config.enabled:
         return Variation()
     uniform = rng.uniform

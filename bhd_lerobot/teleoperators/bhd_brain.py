@@ -187,11 +187,7 @@ class BhdBrain(Teleoperator):
         return dict(zip(robot.action_names, action.tolist(), strict=True))
 
     def _next_of_chunk(self, wanted: Chunk | None) -> NDArray[np.float64]:
-        """Return what a chunk asks for over the coming frame; when it is used up, its last.
-
-        Raises:
-            ConfigError: the brain goes on with a chunk that it never gave.
-        """
+        """Return what a chunk asks for over the coming frame; when it is used up, its last."""
         if wanted is not None:
             self._chunk = list(wanted.actions[:, 0])
         if not self._chunk:

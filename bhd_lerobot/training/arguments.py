@@ -4,7 +4,6 @@ Adds to `configuration.parse` what LeRobot's training knows beyond plain fields:
 configuration that lies in a checkpoint.
 """
 
-import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +18,8 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.policies.learned.contract import find_checkpoint
-from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig, plain
 
 
@@ -37,43 +36,29 @@ class Request:
     contract: str | None = None
 
 
-def parse_train(arguments: Sequence[str]) -> Request:
+def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> Request:
     """Return what a command line asks for.
 
-    Args:
-        arguments: `--config_path=FILE` and overrides `--a.b=value`; with `--resume=true`, FILE is a checkpoint's
-            `train_config.json`, or the folder of a checkpoint or of a run.
-
-    Raises:
-        ConfigError: an unknown key or policy, a value of the wrong type, or a file that cannot be read.
+    With `--resume=true`, its `--config_path` is a checkpoint's `train_config.json`, or the folder of a checkpoint or of
+    a run.
     """
-    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-    overrides = configuration.read_overrides(arguments)
-    path = overrides.pop(configuration.CONFIG_PATH, None)
-    resume = overrides.get("resume") is True
+    line = configuration.read_line(arguments)
     checkpoint: Path | None = None
-    if resume:
-        if path is None:
+    if line.options.get("resume") is True:
+        if line.path is None:
             raise ConfigError(f"resume needs --config_path, the {TRAIN_CONFIG_NAME} of a checkpoint or its folder.")
-        checkpoint = _resumed(Path(str(path)).expanduser(), overrides.get("output_dir"))
+        checkpoint = _resumed(line.path, line.options.get("output_dir"))
         values = _read_checkpoint(checkpoint)
         values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
     else:
-        values = configuration.read_file(Path(str(path)).expanduser()) if path is not None else {}
-    for key, value in overrides.items():
-        if key.startswith("policy.") and not isinstance(values.get("policy"), dict):
-            values["policy"] = {}
-        configuration.set_option(values, key, value)
-    return _decoded(values, checkpoint)
+        values = line.file
+    if any(key.startswith("policy.") for key in line.options) and not isinstance(values.get("policy"), dict):
+        values["policy"] = {}
+    return _decoded(line.over(values), checkpoint)
 
 
 def request_of(values: dict[str, Any]) -> Request:
-    """Return what plain values, nested, ask for.
-
-    Raises:
-        ConfigError: an unknown key or policy, or a value of the wrong type.
-    """
+    """Return what plain values, nested, ask for."""
     return _decoded(values, None)
 
 
@@ -91,11 +76,7 @@ def _resumed(path: Path, output_dir: Any) -> Path:
 
 
 def resumed_checkpoint(path: Path) -> Path:
-    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run.
-
-    Raises:
-        ConfigError: there is none; names what was looked for.
-    """
+    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run."""
     folder = path.parent if path.is_file() else path
     for one in (folder.parent, folder, folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK):
         if (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():

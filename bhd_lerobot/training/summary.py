@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.errors import counted, quoted
-from bhd_lerobot.plugins import module_to_name
+from bhd_lerobot.options.plugins import module_to_name
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.registry import robot_configs, tasks_for
 from bhd_lerobot.robots.host.host import LEFT_OUT_IF_OFF

@@ -1,7 +1,6 @@
 """`bhd-train`: a policy learns from a LeRobotDataset."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from rich.markup import escape
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.command import Program
 from bhd_lerobot.policies.learned.contract import PolicyContract
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training import checkpoint as train_checkpoint
 from bhd_lerobot.training.arguments import Request, parse_train
@@ -221,13 +220,12 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
     return agreed
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Train on a dataset; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
+PROGRAM = Program(
+    BhdTrainConfig,
+    lambda request: train(request).exit_status,
+    parse_train,
     # Ctrl-C before the first step, or a second time while a step or a checkpoint was under way.
-    interrupted = "Stopped; checkpoints that were written before are complete."
-    return run(
-        lambda request: train(request).exit_status, BhdTrainConfig, arguments, read=parse_train, interrupted=interrupted
-    )
+    "Stopped; checkpoints that were written before are complete.",
+)
 
-
-__all__ = ["TrainResult", "main", "resume_command", "train"]
+__all__ = ["PROGRAM", "TrainResult", "resume_command", "train"]

@@ -11,12 +11,13 @@ from PIL import Image
 
 from bhd_lerobot.apps import demo
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.cli.demo import main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.world import World
@@ -77,7 +78,7 @@ def done(tmp_path_factory):
         patch.setenv("COLUMNS", "160")
         printed: list[str] = []
         patch.setattr("sys.stdout", _Kept(printed))
-        assert demo.main([str(folder)]) == 0
+        assert main([str(folder)]) == 0
     return folder, "".join(printed)
 
 
@@ -161,7 +162,7 @@ def test_replays_are_the_recorded_ones(done):
 def test_a_folder_in_use_or_a_file_in_its_place_is_refused_and_nothing_changes(small, tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("precious")
     for place, message in ((tmp_path, "mine.txt"), (tmp_path / "mine.txt", "cannot be used")):
-        assert demo.main([str(place)]) == 2
+        assert main([str(place)]) == 2
         printed = capsys.readouterr().err
         assert message in printed
         assert str(place) in printed
@@ -171,7 +172,7 @@ def test_a_folder_in_use_or_a_file_in_its_place_is_refused_and_nothing_changes(s
 
 def test_unknown_options_end_with_status_2(capsys):
     with pytest.raises(SystemExit) as ended:
-        demo.main(["--steps=3"])
+        main(["--steps=3"])
     assert ended.value.code == 2
     assert "--steps" in capsys.readouterr().err
 
@@ -182,14 +183,14 @@ def test_a_signal_in_a_step_ends_the_demo_with_its_status(small, tmp_path, monke
     result = demo.record.RecordResult(tmp_path / "d", tmp_path / "o", stopped_by=stop)
     calls = []
     monkeypatch.setattr(demo.record, "record", lambda config, console: calls.append(config) or result)
-    assert demo.main([str(tmp_path / "run")]) == 128 + signal.SIGTERM
+    assert main([str(tmp_path / "run")]) == 128 + signal.SIGTERM
     assert len(calls) == 1
     assert "Stopped" in capsys.readouterr().err
 
 
 def test_a_failure_in_a_step_gives_its_message_and_status_2(small, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "LESSONS", (replace(PICK, options=("--task.max_objects=0",)),))
-    assert demo.main([str(tmp_path / "run")]) == 2
+    assert main([str(tmp_path / "run")]) == 2
     assert "max_objects" in capsys.readouterr().err
 
 

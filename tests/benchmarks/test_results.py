@@ -38,9 +38,9 @@ from bhd_lerobot import plugin  # noqa: F401 - registers our policies
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.statistics import wilson
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_task
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case

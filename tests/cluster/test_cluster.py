@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bhd_lerobot.cli.record import main
 from bhd_lerobot.cluster import loop
 from bhd_lerobot.cluster.cluster import describe_crowding
 from bhd_lerobot.cluster.config import RayConfig
@@ -26,7 +27,6 @@ from bhd_lerobot.datasets.format.video import count_frames
 from bhd_lerobot.errors import ActionError, ClusterError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.recording import record as record_module
-from bhd_lerobot.recording.record import main
 from tests.cluster import fakes
 from tests.evaluation.test_brains import checkpoint  # noqa: F401  (a fixture)
 from tests.evaluation.test_evaluate import FAILING, run_eval

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies
-from bhd_lerobot.apps.monitor import monitor
+from bhd_lerobot.cli import monitor
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
@@ -57,7 +57,7 @@ def test_an_option_without_a_description_is_found() -> None:
         mode: str = "both"
 
     with pytest.raises(SystemExit, match="does not describe 'mode'"):
-        list(script._options(Undocumented, ""))
+        list(script._options(Undocumented, "", {}))
 
 
 # --- links and files -------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def parse_training(arguments: list[str]) -> None:
     """Parse the arguments of `bhd-train`; checkpoints of earlier commands need not be there."""
-    algorithm = algorithm_of(arguments)
+    algorithm = algorithm_of(read_line(arguments))
     if algorithm == "dagger":
         read_stages(parse_aggregation(arguments))
         return

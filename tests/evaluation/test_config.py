@@ -6,9 +6,9 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
-from bhd_lerobot.rollout.configuration import encode, parse
 from tests.cases import each_case
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))

@@ -13,16 +13,17 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetMismatchError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.evaluation import run as evaluation_run
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate, main
+from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.rollout import provenance
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.task import episode_seed
 from tests.forks import Fork
 from tests.recording.support import data_columns, episode_rows, run_record
@@ -306,7 +307,7 @@ def test_fail_below_is_about_the_lower_end_of_the_interval(tmp_path):
 
 def test_a_path_alone_is_a_checkpoint(monkeypatch):
     seen = []
-    monkeypatch.setattr(evaluate_module, "run", lambda main, kind, arguments: seen.append(arguments) or 0)
+    monkeypatch.setattr("bhd_lerobot.cli.evaluate.run", lambda program, arguments: seen.append(arguments) or 0)
     main(["--brain.path=outputs/x"])
     main(["--brain.path", "outputs/x", "--brain.type=other"])
     assert seen[0] == ["--brain.path=outputs/x", "--brain.type=learned"]

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from bhd_lerobot.cli import record
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
@@ -20,7 +21,6 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import DatasetError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
-from bhd_lerobot.recording import record
 from bhd_lerobot.rollout.replay import Replay
 from tests.forks import Fork
 from tests.waiting import until

@@ -20,11 +20,10 @@ from pathlib import Path
 from lerobot.scripts import lerobot_teleoperate
 from bhd_lerobot.apps.view.dataset import ViewedDataset
 from bhd_lerobot.apps.view.packing import unpack
+from bhd_lerobot.cli import evaluate, record
 from bhd_lerobot.cli.data import main as data
-from bhd_lerobot.evaluation import evaluate
-from bhd_lerobot.recording import record
 from bhd_lerobot.rollout import replay
-from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.options.parse import parse
 
 folder = Path(sys.argv[1])
 chosen = ["--robot.type=rover", "--robot.beams=36", "--task.type=corridor"]

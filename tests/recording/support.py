@@ -11,12 +11,13 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from rich.console import Console
 
+from bhd_lerobot.cli.record import main
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import main, record
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
-from bhd_lerobot.rollout.configuration import parse
 from tests.forks import Fork
 from tests.waiting import until
 

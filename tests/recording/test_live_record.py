@@ -15,15 +15,16 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from bhd_lerobot.cli.record import main
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime.shared_memory import names, sweep
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import main, record
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import ESTOP_STATUS, RecordResult
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
 from tests.forks import Fork

@@ -14,16 +14,16 @@ import pytest
 from lerobot.utils import visualization_utils as helpers
 from rich.console import Console
 
+from bhd_lerobot.cli.record import main
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording import live_view as module
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import PACKAGES, LiveView, check_options, live_view, points
-from bhd_lerobot.recording.record import main
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.rollout.configuration import parse
 from tests.forks import Fork
 from tests.recording.support import data_columns, options, run_record
 

@@ -3,11 +3,11 @@
 import shlex
 from pathlib import Path
 
+from bhd_lerobot.cli import record
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.datasets.edit.edits import delete
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.recording import record
 from tests.recording.support import options
 
 

@@ -7,10 +7,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.rollout.provenance import scene_from_json
 from bhd_lerobot.rollout.replay import Replay
-from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, run_record, start
 
 PICK = {
@@ -187,35 +186,6 @@ def test_cameras_are_recorded(tmp_path):
     for camera in ("scene", "wrist"):
         assert features[f"observation.images.{camera}"]["shape"] == [48, 64, 3]
     assert len(list(root.rglob("*.mp4"))) == 2
-
-
-@each_case(
-    ("change", "message"),
-    [
-        ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
-        (
-            {"brain__type": "gap_follower"},
-            "Brains for it: blanked, dagger, language, learned, noop, pick, pick_servo, random, reach, reach_servo",
-        ),
-        ({"brain__type": "reach"}, "target_x"),
-        ({"task__max_objects": 6}, "max_objects is 6"),
-        ({"task__language": "fr"}, "task.language"),
-        ({"task__randomisation__size": 1.5}, "randomisation.size is 1.5"),
-        ({"brain__max_velocity": 99}, r"brain\.max_velocity is 99"),
-        ({"brain__attempts": 0}, "brain.attempts is 0"),
-        ({"robot__action_space": "joints"}, "Did you mean 'joint'"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, message):
-    root = tmp_path / "d"
-    with pytest.raises(ConfigError, match=message):
-        run_record(root, **{**{key: value for key, value in PICK.items() if "randomisation" not in key}, **change})
-    assert not root.exists()
-
-
-def test_the_base_is_still_recorded(tmp_path):
-    result, _ = run_record(tmp_path / "d", dataset__num_episodes=1)
-    assert result.episodes == 1
 
 
 def test_pytorch_collates_its_frames(tmp_path):

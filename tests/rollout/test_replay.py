@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.cli.replay import main
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.rollout import replay as module
-from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.rollout.replay import Replay, ReplayConfig
 from tests.recording.support import run_record
 
@@ -66,7 +66,7 @@ def test_a_quaternion_and_its_negative_are_the_same_orientation(recorded):
 
 @pytest.mark.figures
 def test_the_command_draws_and_reports(recorded, tmp_path, capsys):
-    status = module.main([f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--tolerance_m=0"])
+    status = main([f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--tolerance_m=0"])
     text = capsys.readouterr().err
     assert status == 0
     assert text.count("identical") == 2
@@ -83,8 +83,8 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
 
     monkeypatch.setattr(Replay, "open_loop", disturbed)
     arguments = [f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--mode=open_loop"]
-    assert module.main([*arguments, "--tolerance_m=1e-6"]) == 1
-    assert module.main([*arguments, "--tolerance_m=100"]) == 0
+    assert main([*arguments, "--tolerance_m=1e-6"]) == 1
+    assert main([*arguments, "--tolerance_m=100"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -101,12 +101,12 @@ def test_bad_options(options, message):
 
 
 def test_a_dataset_is_to_be_named(capsys):
-    assert module.main([]) == 2
+    assert main([]) == 2
     assert "No dataset is given; set --dataset.root=FOLDER" in capsys.readouterr().err
 
 
 def test_an_episode_that_does_not_exist(recorded, capsys):
-    assert module.main([f"--dataset.root={recorded}", "--dataset.episode=9"]) == 2
+    assert main([f"--dataset.root={recorded}", "--dataset.episode=9"]) == 2
     assert "from 0 to 3" in capsys.readouterr().err
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.run_folder import run_folder
 from tests.evaluation.test_evaluate import run_eval
 from tests.recording.support import options, run_record

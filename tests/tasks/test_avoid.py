@@ -14,42 +14,23 @@ from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.tasks.avoid import TRAIL, AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import BaseTruth, Event
 from tests.cases import each_case
+from tests.tasks.support import Judged
 
 FPS = 10
 made = functools.cache(random_arena)
 EMPTY = make_arena("empty", 0)  # 6 m by 6 m, start in the middle
 
 
-class Run:
-    """One or more episodes, and what came of them."""
-
+class Run(Judged):
     def __init__(self, config: AvoidConfig, arenas: Sequence = (EMPTY,)) -> None:
-        self.n = len(arenas)
-        self.task = AvoidTask(config, self.n, FPS)
-        self.task.begin(np.arange(self.n), arenas)
+        super().__init__(AvoidTask(config, len(arenas), FPS), arenas)
         self.pose = np.array([arena.start for arena in arenas], float)
-        self.running = np.ones(self.n, np.bool_)
         self.first = [self.task.outcome(sim, Event.NOTHING).score for sim in range(self.n)]
-        self.rewards = np.zeros(self.n)
-        self.events = np.zeros(self.n, int)
-        self.frames = np.zeros(self.n, int)
 
     def frame(self, positions: np.ndarray, touched: np.ndarray | bool = False) -> np.ndarray:
-        """Judge a frame; an episode that ended is not running any more."""
+        """Judge a frame with the robots at these positions [m]."""
         self.pose[:, :2] = positions
-        reward, event = self.task.judge(
-            BaseTruth(self.pose.copy(), np.broadcast_to(touched, (self.n,)).copy()), self.running.copy()
-        )
-        assert (reward[~self.running] == 0).all()
-        assert (event[~self.running] == Event.NOTHING).all()
-        self.frames += self.running
-        self.rewards += reward
-        self.events = np.where(self.running, event, self.events)
-        self.running &= event == Event.NOTHING
-        return reward
-
-    def outcome(self, sim: int = 0):
-        return self.task.outcome(sim, Event(int(self.events[sim])))
+        return self.judge(BaseTruth(self.pose.copy(), np.broadcast_to(touched, (self.n,)).copy()))
 
 
 def on_circle(frame: int, speed: float) -> np.ndarray:
@@ -196,42 +177,6 @@ def test_outside_the_arena_is_no_cell(place: tuple[float, float]) -> None:
     assert run.outcome().details["cells_visited"] == 1
 
 
-def test_episodes_are_independent() -> None:
-    """Three arenas of different size at once, each begun and ended at its own time, and the same three alone."""
-    arenas = [made(4), EMPTY, made(6)]
-    config = AvoidConfig(duration_s=5.0, min_path_m=0.5, stuck_time_s=2.0)
-    together, alone = Run(config, arenas), [Run(config, [arena]) for arena in arenas]
-    rngs = [np.random.default_rng(sim) for sim in range(3)]
-    for frame in range(1, 51):
-        steps = np.array([rng.normal(0, 0.05, 2) for rng in rngs])
-        steps[1] *= 0.001 if frame > 10 else 1.0  # gets stuck
-        touched = np.array([frame == 30, False, False])
-        before = together.pose[:, :2].copy()
-        reward = together.frame(before + steps, touched)
-        for sim, run in enumerate(alone):
-            assert run.frame((before + steps)[sim : sim + 1], touched[sim])[0] == reward[sim]
-    assert together.events.tolist() == [int(run.events[0]) for run in alone]
-    assert together.events.tolist() == [Event.COLLISION, Event.STUCK, Event.SUCCESS]
-    for sim, run in enumerate(alone):
-        assert together.outcome(sim) == run.outcome()
-
-
-def test_a_new_episode_starts_from_nothing() -> None:
-    arenas = [made(1), EMPTY]
-    used, fresh = Run(AvoidConfig(), arenas), Run(AvoidConfig(), [EMPTY, EMPTY])
-    for frame in range(1, 60):
-        used.frame(np.repeat(on_circle(frame, 0.3), 2, axis=0))
-    kept = used.task.outcome(1, Event.NOTHING)
-    used.task.begin(np.array([0]), [EMPTY])
-    assert used.task.outcome(0, Event.NOTHING) == fresh.task.outcome(0, Event.NOTHING)
-    assert used.task.outcome(1, Event.NOTHING) == kept
-    used.pose[0] = EMPTY.start
-    for frame in range(1, 60):
-        positions = np.repeat(on_circle(frame, 0.2), 2, axis=0)
-        assert used.frame(positions)[0] == fresh.frame(positions)[0]
-    assert used.task.outcome(0, Event.NOTHING) == fresh.task.outcome(0, Event.NOTHING)
-
-
 def test_a_long_path_in_the_episode_before_does_not_make_a_robot_stuck() -> None:
     run = Run(AvoidConfig())
     for frame in range(1, 300):
@@ -240,15 +185,6 @@ def test_a_long_path_in_the_episode_before_does_not_make_a_robot_stuck() -> None
     for frame in range(1, 150):
         run.frame(on_circle(frame, 0.1))
     assert run.events[0] == Event.NOTHING
-
-
-@each_case("arena", ["random", "turtlebot3_world", "empty"])
-@each_case("random_start", [False, True])
-def test_equal_seeds_give_equal_episodes(arena: str, random_start: bool) -> None:
-    task = AvoidTask(AvoidConfig(arena=arena, random_start=random_start), 1, FPS)
-    for seed in (0, 1, 2**62 + 1):
-        assert task.sample(seed) == task.sample(seed)
-        assert (task.sample(seed) != task.sample(seed + 1)) == (arena == "random" or random_start)
 
 
 def trail(task: AvoidTask, pose: np.ndarray) -> np.ndarray:

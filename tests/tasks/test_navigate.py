@@ -16,41 +16,24 @@ from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
 from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
 from bhd_lerobot.tasks.task import BaseTruth, Event
 from tests.cases import each_case
+from tests.tasks.support import Judged
 
 FPS = 10
 GOAL = (2.025, 0.025, 1.0)  # a grid point
 OPEN = replace(make_arena("empty", 0), start=(-0.025, 0.025, 0.0), goal=GOAL)
 
 
-class Run:
-    """Episodes in the open, and what came of them."""
-
+class Run(Judged):
     def __init__(self, config: NavigateConfig | None = None, *scenes: Arena) -> None:
         scenes = scenes or (OPEN,)
-        self.n = len(scenes)
-        self.task = NavigateTask(config or NavigateConfig(), self.n, FPS)
-        self.task.begin(np.arange(self.n), scenes)
-        self.running = np.ones(self.n, np.bool_)
-        self.rewards, self.events = np.zeros(self.n), np.zeros(self.n, int)
-        self.frames = 0
+        super().__init__(NavigateTask(config or NavigateConfig(), len(scenes), FPS), scenes)
 
     def frame(self, *poses: tuple[float, float, float], touched: bool = False) -> np.ndarray:
-        truth = BaseTruth(np.array(poses, float), np.full(self.n, touched))
-        reward, event = self.task.judge(truth, self.running.copy())
-        assert (reward[~self.running] == 0).all()
-        assert (event[~self.running] == Event.NOTHING).all()
-        self.frames += 1
-        self.rewards += reward
-        self.events = np.where(self.running, event, self.events)
-        self.running &= event == Event.NOTHING
-        return reward
+        return self.judge(BaseTruth(np.array(poses, float), np.full(self.n, touched)))
 
     def until_done(self, *poses: tuple[float, float, float]) -> None:
         while self.running.any():
             self.frame(*poses)
-
-    def outcome(self, sim: int = 0):
-        return self.task.outcome(sim, Event(int(self.events[sim])))
 
 
 def drive_to_goal(run: Run, steps: int = 50) -> None:
@@ -83,14 +66,6 @@ def test_goals_are_reachable_far_enough_and_free(config: NavigateConfig) -> None
         task.begin(np.array([0]), [scene])  # refuses a goal without a way
         shortest = task.outcome(0, Event.NOTHING).details["shortest_m"]
         assert np.hypot(*(goal - start)[:2]) - 0.05 <= shortest < 20
-
-
-@each_case("arena", ["random", "turtlebot3_world", "empty"])
-def test_equal_seeds_give_equal_scenes_and_others_do_not(arena: str) -> None:
-    one, other = (NavigateTask(NavigateConfig(arena=arena), n, FPS) for n in (1, 3))
-    for seed in (0, 1, 2**62 + 1):
-        assert one.sample(seed) == other.sample(seed)
-        assert one.sample(seed).goal != one.sample(seed + 1).goal
 
 
 def test_the_arena_of_a_seed_is_that_of_the_avoid_task() -> None:
@@ -170,7 +145,7 @@ def test_success_needs_place_heading_rest_and_time() -> None:
     assert run.events[0] == Event.SUCCESS
     outcome = run.outcome()
     assert outcome.success
-    assert outcome.details["time_s"] == pytest.approx(run.frames / FPS)
+    assert outcome.details["time_s"] == pytest.approx(run.frames[0] / FPS)
     assert outcome.details["error_m"] == outcome.details["error_rad"] == 0
 
 
@@ -218,10 +193,10 @@ def test_the_end_of_time_is_a_time_out_and_standing_still_is_stuck() -> None:
     run = Run(NavigateConfig(duration_s=5.0))
     for frame in range(50):
         run.frame((-0.025 + 0.01 * frame, 0.025, 0.0))
-    assert (run.frames, run.events[0]) == (50, Event.TIMEOUT)
+    assert (run.frames[0], run.events[0]) == (50, Event.TIMEOUT)
     run = Run()
     run.until_done(OPEN.start)
-    assert (run.frames, run.events[0]) == (100, Event.STUCK)
+    assert (run.frames[0], run.events[0]) == (100, Event.STUCK)
 
 
 def test_score_is_success_weighted_by_path_length() -> None:
@@ -283,23 +258,6 @@ def test_near_the_goal_turning_to_its_heading_is_rewarded() -> None:
     drive_to_goal(run)
     assert run.frame((*GOAL[:2], 0.5))[0] > 0.005
     assert run.frame((*GOAL[:2], 0.0))[0] < -0.005
-
-
-def test_episodes_are_independent() -> None:
-    scenes = [NavigateTask(NavigateConfig(), 1, FPS).sample(seed) for seed in range(2)] + [OPEN]
-    together, alone = Run(None, *scenes), [Run(None, scene) for scene in scenes]
-    rng = np.random.default_rng(0)
-    poses = np.array([scene.start for scene in scenes])
-    for frame in range(40):
-        poses = poses + rng.normal(0, 0.03, poses.shape)
-        if frame == 20:
-            for run in (together, alone[0]):
-                run.task.begin(np.array([0]), scenes[1:2])
-        reward = together.frame(*poses)
-        for sim, run in enumerate(alone):
-            assert run.frame(poses[sim])[0] == reward[sim]
-    for sim, run in enumerate(alone):
-        assert together.outcome(sim) == run.outcome()
 
 
 # --- shortest ways ---------------------------------------------------------------------------------------------------

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.parse import parse as parse_configuration
 from bhd_lerobot.policies.language.instruction import RulePlanner, parse
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
 from bhd_lerobot.policies.manipulation.skills import scene_object
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse as parse_configuration
 from bhd_lerobot.tasks.pick import (
     HELD_OUT_INSTRUCTIONS,
     HELD_OUT_NAMES,
@@ -28,6 +28,7 @@ from bhd_lerobot.tasks.pick import (
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
+from tests.tasks.support import Judged
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "record"
 
@@ -64,15 +65,9 @@ def truth_of(scenes: list[TableScene], **flags: bool) -> ArmTruth:
     )
 
 
-class Run:
-    """Episodes with one scene, and what came of them."""
-
+class Run(Judged):
     def __init__(self, config: PickConfig | None = None, n: int = 1) -> None:
-        self.n, self.scenes = n, [SCENE] * n
-        self.task = PickTask(config or PickConfig(), n, FPS)
-        self.task.begin(np.arange(n), self.scenes)
-        self.running = np.ones(n, np.bool_)
-        self.rewards, self.events, self.frames = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
+        super().__init__(PickTask(config or PickConfig(), n, FPS), [SCENE] * n)
 
     def frame(
         self,
@@ -89,17 +84,7 @@ class Run:
         if at is not None:
             truth.object_poses[:, TARGET, :2] = at
         truth.fingers_on_object[:, TARGET] = gripped
-        reward, event = self.task.judge(truth, self.running.copy())
-        assert (reward[~self.running] == 0).all()
-        assert (event[~self.running] == Event.NOTHING).all()
-        self.rewards += reward
-        self.events = np.where(self.running, event, self.events)
-        self.frames += self.running
-        self.running &= event == Event.NOTHING
-        return reward
-
-    def outcome(self, sim: int = 0):
-        return self.task.outcome(sim, Event(int(self.events[sim])))
+        return self.judge(truth)
 
 
 # --- scenes ----------------------------------------------------------------------------------------------------------
@@ -154,13 +139,6 @@ def test_every_object_can_be_grasped_without_touching_another(randomisation: Ran
             grasp = plan_grasp(one, [other for other in objects if other.index != one.index], MAX_OPENING)
             assert grasp is not None
             assert grasp.room > 0
-
-
-def test_equal_seeds_give_equal_episodes_and_others_others() -> None:
-    for config in (PickConfig(), PickConfig(language="any", randomisation=WILD)):
-        scenes = [PickTask(config, 1, FPS).sample(seed) for seed in (0, 1, 2**62 + 1)]
-        assert scenes == [PickTask(config, 3, 25).sample(seed) for seed in (0, 1, 2**62 + 1)]
-        assert len({scene.objects for scene in scenes}) == 3
 
 
 @each_case(("least", "most"), [(1, 1), (3, 3), (2, 5)])
@@ -365,20 +343,6 @@ def test_places_without_an_object_lie_at_the_origin_and_are_nobody_s_business() 
     truth.object_poses[:, 3:, 2] = 5.0
     _, event = run.task.judge(truth, run.running)
     assert event[0] == Event.NOTHING
-
-
-def test_episodes_are_independent_and_start_from_nothing() -> None:
-    run = Run(n=3)
-    for _ in range(5):
-        run.frame(np.array([0.08, 0.0, 0.12]))
-    run.task.begin(np.array([0]), [SCENE])
-    fresh = Run()
-    for lift in (0.0, 0.02, *(0.12,) * 10):
-        reward = run.frame(np.array([lift, 0.0, 0.12]))
-        assert reward[0] == fresh.frame(lift)[0]
-        assert run.running[0] == fresh.running[0]
-    assert run.events.tolist() == [Event.SUCCESS, Event.NOTHING, Event.SUCCESS]
-    assert run.frames.tolist() == [17, 17, 10]
 
 
 # --- configuration ---------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
+from tests.tasks.support import Judged
 
 FPS = 20
 ARM = ur5()
@@ -26,15 +27,9 @@ TARGET = (0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0)
 SCENE = TableScene("reach", (), ARM.home, target_pose=TARGET)
 
 
-class Run:
-    """n episodes to the same target, and what came of them."""
-
+class Run(Judged):
     def __init__(self, config: ReachConfig | None = None, n: int = 1) -> None:
-        self.n, self.task = n, ReachTask(config or ReachConfig(), n, FPS)
-        self.task.begin(np.arange(n), [SCENE] * n)
-        self.running = np.ones(n, np.bool_)
-        self.rewards, self.events = np.zeros(n), np.zeros(n, int)
-        self.frames = np.zeros(n, int)
+        super().__init__(ReachTask(config or ReachConfig(), n, FPS), [SCENE] * n)
 
     def frame(self, away: float | np.ndarray = 0.0, degrees: float = 0.0, **touched: bool) -> np.ndarray:
         """Judge a frame with the tool this far from the target [m, deg]."""
@@ -54,27 +49,10 @@ class Run:
             fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
             **flags,
         )
-        reward, event = self.task.judge(truth, self.running.copy())
-        assert (reward[~self.running] == 0).all()
-        assert (event[~self.running] == Event.NOTHING).all()
-        self.rewards += reward
-        self.events = np.where(self.running, event, self.events)
-        self.frames += self.running
-        self.running &= event == Event.NOTHING
-        return reward
-
-    def outcome(self, sim: int = 0):
-        return self.task.outcome(sim, Event(int(self.events[sim])))
+        return self.judge(truth)
 
 
 # --- scenes ----------------------------------------------------------------------------------------------------------
-
-
-def test_equal_seeds_give_equal_episodes_and_others_others() -> None:
-    task = ReachTask(ReachConfig(), 1, FPS)
-    scenes = [task.sample(seed) for seed in (0, 1, 2**62 + 1)]
-    assert scenes == [ReachTask(ReachConfig(), 4, 10).sample(seed) for seed in (0, 1, 2**62 + 1)]
-    assert len({scene.target_pose for scene in scenes}) == len({scene.posture for scene in scenes}) == 3
 
 
 def test_every_target_can_be_reached_and_every_start_is_free() -> None:
@@ -218,19 +196,6 @@ def test_the_rewards_sum_to_the_share_of_the_way(path: list[float]) -> None:
     assert run.rewards[0] == pytest.approx(1 - path[-1] / path[0], abs=1e-9)
     assert run.outcome().score == pytest.approx(min(1.0, max(0.0, run.rewards[0])), abs=1e-9)
     assert run.outcome().details["error_m"] == pytest.approx(path[-1])
-
-
-def test_episodes_are_independent_and_start_from_nothing() -> None:
-    run = Run(ReachConfig(hold_s=0.25), n=3)
-    for _ in range(3):
-        run.frame(np.array([0.0, 0.3, 0.1]))
-    run.task.begin(np.array([0]), [SCENE])
-    fresh = Run(ReachConfig(hold_s=0.25))
-    for away in (0.2, 0.1, 0.0, 0.0, 0.0, 0.0):
-        reward = run.frame(np.array([away, 0.3, 0.0]))
-        assert reward[0] == fresh.frame(away)[0]
-        assert run.running[0] == fresh.running[0]
-    assert run.events.tolist() == [Event.NOTHING, Event.NOTHING, Event.SUCCESS]
 
 
 # --- configuration ---------------------------------------------------------------------------------------------------

@@ -1,8 +1,98 @@
+"""What holds of every task: its episodes follow from seeds, and none depends on another."""
+
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.arenas import ARENAS
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.tasks.task import SPLITS, Event, episode_seed
+from bhd_lerobot.registry import make_task
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.navigate import NavigateConfig
+from bhd_lerobot.tasks.pick import PickConfig
+from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.task import SPLITS, ArmTruth, BaseTruth, Event, TaskConfig, episode_seed
+from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
+from tests.tasks.support import Judged
+
+WILD = RandomisationConfig(enabled=True)
+# A configuration, and in what its scenes of different seeds differ.
+SCENES: list[tuple[TaskConfig, tuple[str, ...]]] = [
+    *((AvoidConfig(arena=arena), ("shapes",) if arena == "random" else ()) for arena in ARENAS),
+    *((AvoidConfig(arena=arena, random_start=True), ("start",)) for arena in ARENAS),
+    *((NavigateConfig(arena=arena), ("goal",)) for arena in ARENAS),
+    (PickConfig(), ("objects",)),
+    (PickConfig(language="any", randomisation=WILD), ("objects",)),
+    (ReachConfig(), ("target_pose", "posture")),
+]
+
+
+@each_case(("config", "differing"), SCENES)
+def test_equal_seeds_give_equal_episodes_and_others_others(config: TaskConfig, differing: tuple[str, ...]) -> None:
+    one, other = make_task(config, 1, 10), make_task(config, 3, 25)
+    for seed in (0, 1, 2**62 + 1):
+        scene, next_one = one.sample(seed), one.sample(seed + 1)
+        assert scene == other.sample(seed)
+        assert (scene == next_one) == (not differing)
+        assert all(getattr(scene, name) != getattr(next_one, name) for name in differing)
+
+
+class _Moving:
+    """Truth of a robot that moves at random."""
+
+    def __init__(self, scene: Any, seed: int) -> None:
+        self.scene, self.rng = scene, np.random.default_rng(seed)
+        self.pose = np.array(getattr(scene, "start", None) or (0.0, 0.0, 0.0))
+
+    def frame(self) -> BaseTruth | ArmTruth:
+        if hasattr(self.scene, "start"):
+            self.pose = self.pose + self.rng.normal(0, 0.04, 3) * self.rng.integers(2)
+            return BaseTruth(self.pose[None].copy(), self.rng.random(1) < 0.02)
+        tool = np.array([self.scene.target_pose or (0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0)])
+        tool[:, 0] += 0.2 * (self.rng.random() < 0.3)
+        poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (1, MAX_OBJECTS, 1))
+        for number, one in enumerate(self.scene.objects):
+            lift = 0.12 * (number == self.scene.target_object and self.rng.random() < 0.8)
+            yaw = (math.cos(one.yaw / 2), 0, 0, math.sin(one.yaw / 2))
+            poses[0, number] = (one.x, one.y, one.height / 2 + lift, *yaw)
+        touches = self.rng.random((3, 1)) < 0.02
+        return ArmTruth(tool, poses, np.zeros(1), *touches, np.ones((1, MAX_OBJECTS), np.bool_))
+
+
+def _together(truths: list[Any]) -> Any:
+    fields = zip(*(vars(one).values() for one in truths), strict=True)
+    return type(truths[0])(*map(np.concatenate, fields))
+
+
+@each_case(
+    "config",
+    [
+        AvoidConfig(duration_s=5.0, min_path_m=0.5, stuck_time_s=2.0),
+        NavigateConfig(duration_s=4.0, stuck_time_s=2.0),
+        PickConfig(hold_s=0.3),
+        ReachConfig(hold_s=0.3),
+    ],
+)
+def test_an_episode_does_not_depend_on_those_beside_and_before_it(config: TaskConfig) -> None:
+    scenes = [make_task(config, 1, 10).sample(seed) for seed in range(4)]
+    together = Judged(make_task(config, 4, 10), scenes)
+    alone = [Judged(make_task(config, 1, 10), [scene]) for scene in scenes]
+    moving = [_Moving(scene, sim) for sim, scene in enumerate(scenes)]
+    for frame in range(60):
+        if frame == 25:
+            together.task.begin(np.array([0]), scenes[1:2])
+            together.running[0], together.events[0] = True, Event.NOTHING
+            alone[0], moving[0] = Judged(make_task(config, 1, 10), scenes[1:2]), _Moving(scenes[1], 7)
+        truths = [one.frame() for one in moving]
+        reward = together.judge(_together(truths))
+        assert [one.judge(truth)[0] for one, truth in zip(alone, truths, strict=True)] == reward.tolist()
+    assert together.events.any()
+    assert together.events.tolist() == [one.events[0] for one in alone]
+    assert [together.outcome(sim) for sim in range(4)] == [one.outcome() for one in alone]
 
 
 def test_training_and_held_out_seeds_never_meet() -> None:

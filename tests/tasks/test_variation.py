@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, Variation
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
@@ -22,7 +23,6 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec

@@ -13,13 +13,13 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
+from bhd_lerobot.cli.train import main
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.training import output
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import MetricsFile
 from bhd_lerobot.training.setup import has_bfloat16, refuse_unsupported
-from bhd_lerobot.training.train import main
 from tests.cases import each_case
 from tests.training.support import ACT, MLP, curve, make_dataset, options, poison, run_train
 

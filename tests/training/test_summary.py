@@ -8,13 +8,13 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import is_for, robot_of_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.host import describe
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig

@@ -13,10 +13,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 
+from bhd_lerobot.cli.train import main
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.log import MetricsFile
-from bhd_lerobot.training.train import main
 from tests.forks import Fork
 from tests.hub_server.server import HubServer
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,26 +14,12 @@ from rich.table import Table
 from bhd_lerobot.apps.doctor import checks
 from bhd_lerobot.apps.doctor.checks import Finding, Status
 from bhd_lerobot.apps.doctor.trials import TIMEOUT_S, Outcome, run_trials
-from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import ConfigError
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
 _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}
 
 RunTrials = Callable[[Sequence[Sequence[Any]], float], list[Outcome]]
-
-
-def _parser() -> Parser:
-    parser = Parser(
-        prog="bhd-doctor",
-        description="Check this machine; print symptom, cause and remedy of what is wrong. Exit status 1: a problem.",
-    )
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
-    parser.add_argument("--realtime", action="store_true", help="latency test: how late a real-time process wakes up")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of the latency test [s] (default: 10)")
-    parser.add_argument("--rate", type=int, default=1000, help="wake-ups a second [Hz] (default: 1000)")
-    return parser
 
 
 def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
@@ -64,7 +49,7 @@ def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
 
 def robot_rates() -> dict[str, int]:
     """Return the default control rate of each robot [Hz]."""
-    from bhd_lerobot.plugins import BODIES
+    from bhd_lerobot.bodies.registry import BODIES
 
     return {name: body().control_hz for name, body in BODIES.items()}
 
@@ -115,12 +100,8 @@ def _print_latency(measured: dict[str, Any], console: Console) -> None:
         console.print(f"{upper:>10} {count:>8} {bar}", highlight=False)
 
 
-def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
-    """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
-    return exit_status(lambda: _main(_parser().parse(arguments), run))
-
-
-def _main(options: argparse.Namespace, run: RunTrials) -> int:
+def examine_and_print(options: argparse.Namespace, run: RunTrials) -> int:
+    """Check this machine as the options ask; return the exit status."""
     root = options.root.expanduser() if options.root else None
     if root is None:
         from bhd_lerobot.datasets.format.identity import default_root
@@ -147,7 +128,3 @@ def _main(options: argparse.Namespace, run: RunTrials) -> int:
             _print_latency(measured, console)
         _print_remedies(findings, console)
     return int(any(finding.status is Status.PROBLEM for finding in findings))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

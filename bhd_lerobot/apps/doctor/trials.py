@@ -159,7 +159,8 @@ def list_plugins() -> dict[str, list[str]]:
     from lerobot.robots.config import RobotConfig
     from lerobot.teleoperators.config import TeleoperatorConfig
 
-    from bhd_lerobot.plugins import BODIES, import_plugins, misnamed
+    from bhd_lerobot.bodies.registry import BODIES
+    from bhd_lerobot.options.plugins import import_plugins, misnamed
     from bhd_lerobot.policies.brain import BrainConfig
     from bhd_lerobot.stock import register_third_party_plugins
     from bhd_lerobot.tasks.task import TaskConfig

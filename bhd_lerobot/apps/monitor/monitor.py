@@ -8,7 +8,7 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -17,7 +17,6 @@ from rich.live import Live
 
 from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
 from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
-from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock
@@ -26,20 +25,6 @@ from bhd_lerobot.realtime.shared_memory import names
 _REFRESH_S = 0.125
 _SNAPSHOT_S = 0.5  # that a single snapshot measures rates over
 _LINE_S = 1.0  # between two lines where there is no terminal
-
-
-def _parser() -> Parser:
-    parser = Parser(
-        prog="bhd-monitor",
-        description="Watch a robot that runs on the wall clock (--robot.clock=realtime). Keys: e or space is an "
-        "emergency stop, at once and without a question; q quits. Exit status: 0, 1 if the robot was killed or lost "
-        "its brain meanwhile, 2 if there is no such robot.",
-    )
-    parser.add_argument("id", nargs="?", metavar="ID", help="robot.id of the robot; the only one that runs if left out")
-    parser.add_argument("--once", action="store_true", help="print one snapshot and leave")
-    parser.add_argument("--json", action="store_true", help="as JSON: one snapshot, or one a second with --seconds")
-    parser.add_argument("--seconds", type=float, help="leave after so long [s]")
-    return parser
 
 
 def running() -> list[LiveBlock]:
@@ -200,12 +185,8 @@ def _end(seconds: float | None) -> float:
     return time.monotonic() + seconds if seconds is not None else math.inf
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-monitor`; return the exit status."""
-    return exit_status(lambda: _main(_parser().parse(arguments)))
-
-
-def _main(options: argparse.Namespace) -> int:
+def monitor(options: argparse.Namespace) -> int:
+    """Watch a robot as the options ask; return the exit status."""
     console = Console(highlight=False)
     if options.seconds is not None and not 0 < options.seconds < math.inf:
         raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
@@ -223,7 +204,3 @@ def _main(options: argparse.Namespace) -> int:
         return 0
     print(f"The robot {block.name!r} {'has ended.' if ended == 'ended' else f'{ended}.'}", file=sys.stderr)
     return 0 if ended == "ended" else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

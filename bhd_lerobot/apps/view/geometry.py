@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.apps.view.groups import names_of, scan_of
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
-from bhd_lerobot.plugins import body_of
 
 Arrays = dict[str, NDArray]
 _AWAY_M = 10.0  # an object this high is absent: it floats out of sight

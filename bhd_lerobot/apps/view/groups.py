@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.plugins import body_of
 
 MAX_LINES = 8  # in one plot; more cannot be distinguished
 _SCAN = re.compile(r"scan_\d+\.pos")

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.bodies.body import Arm, PositionLimits
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import is_being_written
@@ -19,7 +20,6 @@ from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.datasets.validate.values import Limits
 from bhd_lerobot.errors import DatasetLockedError, counted
-from bhd_lerobot.plugins import body_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
@@ -44,19 +44,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:
-    """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not.
-
-    Args:
-        root: the dataset.
-        console: where it is printed.
-        as_json: print plain values.
-        is_strict: a warning makes it invalid, too.
-        videos: read the videos, too.
-
-    Raises:
-        DatasetLockedError: it is being recorded or changed.
-        DatasetError: there is no dataset that could be checked.
-    """
+    """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not."""
     if is_being_written(root):
         raise DatasetLockedError(
             f"{root} is being recorded or changed at this moment, so it is neither valid nor not. Check it when "

@@ -19,30 +19,14 @@ class Terminal(Console):
     """Where a command prints. The program handles a pipe that is read no longer, as of ``| head -1``."""
 
     def on_broken_pipe(self) -> None:
-        """Do not end with status 1, which has another meaning for some commands.
-
-        Raises:
-            BrokenPipeError: always.
-        """
+        """Do not end with status 1, which has another meaning for some commands."""
         raise BrokenPipeError
 
 
 def add_command(
     commands: Commands, name: str, help_text: str, run: Run, *, names_dataset: bool = True, takes_several: bool = False
 ) -> argparse.ArgumentParser:
-    """Add a command.
-
-    Args:
-        commands: to these.
-        name: what the user types.
-        help_text: one line.
-        run: what carries it out. Where Ctrl-C does not leave everything as it was, set the default ``stopped``.
-        names_dataset: whether it takes a dataset, as a folder or by name; `root_of` reads it.
-        takes_several: whether it takes more than one folder; `roots_of` reads them.
-
-    Returns:
-        Its parser, for its own arguments.
-    """
+    """Add a command; where Ctrl-C does not leave everything as it was, set its default ``stopped``."""
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run, stopped="nothing was changed", command_parser=command)
     if names_dataset:

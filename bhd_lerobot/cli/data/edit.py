@@ -89,16 +89,7 @@ def _split(options: argparse.Namespace) -> int:
 
 
 def parts_of(text: str, total: int, shuffle_seed: int | None = None) -> dict[str, list[int]]:
-    """Return the episodes of each part.
-
-    Args:
-        text: names with shares, separated by commas, or with episodes, separated by semicolons.
-        total: number of episodes of the dataset.
-        shuffle_seed: deal shares out in an order drawn with this seed; in the order of the dataset if None.
-
-    Raises:
-        ConfigError: it is neither, a name is no name of a folder, or shares are more than the whole.
-    """
+    """Return the episodes of each part."""
     named: dict[str, str] = {}
     separator = ";" if ";" in text else ","
     for part in text.split(separator):

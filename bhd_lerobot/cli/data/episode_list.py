@@ -10,11 +10,7 @@ _MOST = 1_000_000  # numbers in a range: a slip of the finger shall not fill the
 
 
 def parse_episodes(text: str) -> list[int]:
-    """Return the numbers in `text`: single ones and ranges, separated by commas, brackets around them or not.
-
-    Raises:
-        ConfigError: something else is in it, a range runs backwards or has no end, or a number is there twice.
-    """
+    """Return the numbers in `text`: single ones and ranges, separated by commas, brackets around them or not."""
     numbers: list[int] = []
     for part in re.split(r"[,\s]+", text.strip().removeprefix("[").removesuffix("]").strip()):
         match = re.fullmatch(r"([0-9]{1,12})(?:-([0-9]{1,12}))?", part)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain, MobileBase, WheelDrive
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
@@ -18,7 +19,6 @@ from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, counted
-from bhd_lerobot.plugins import body_of
 from bhd_lerobot.rosbag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.rosbag.exporter.export import export_bags
 from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME
@@ -80,12 +80,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
-    """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing.
-
-    Args:
-        robot_type: the robot of the dataset.
-        recording: the identity of its recording. If its robot was simulated, the noise is known.
-    """
+    """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing."""
     if robot_type == "turtlebot3":
         robot = (recording or {}).get("robot")
         return _turtlebot3(is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)

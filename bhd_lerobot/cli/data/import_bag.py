@@ -112,11 +112,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _wanted_of_exported(options: argparse.Namespace, episode: ExportedEpisode, bag: Bag) -> ImportOptions:
-    """Return how exported bags are to be read.
-
-    Raises:
-        ConfigError: a value that cannot be honoured, or an option for bags of a real robot.
-    """
+    """Return how exported bags are to be read."""
     if given := [name for name in _REAL if getattr(options, name) is not None]:
         raise ConfigError(
             f"--{given[0]} is for bags of a real robot; this one was written by bhd-data export, and describes what "
@@ -144,11 +140,7 @@ def _wanted_of_exported(options: argparse.Namespace, episode: ExportedEpisode, b
 
 
 def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, Any]:
-    """Return the times that frames and episodes keep to, by their names in `ImportOptions`.
-
-    Raises:
-        ConfigError: one, or another option that all bags have, cannot be honoured.
-    """
+    """Return the times that frames and episodes keep to, by their names in `ImportOptions`."""
     if options.task == "":
         raise ConfigError("--task is empty; it must be a sentence.")
     if options.stamps not in _STAMPS:
@@ -179,11 +171,7 @@ def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, Any
 
 
 def _wanted(options: argparse.Namespace) -> ImportOptions:
-    """Return how a real robot's bags are to be read.
-
-    Raises:
-        ConfigError: a value that cannot be honoured.
-    """
+    """Return how a real robot's bags are to be read."""
     robot = options.robot or ROBOTS[0]
     if robot not in ROBOTS:
         raise ConfigError(f"{unknown_name('robot', robot, ROBOTS)} Only bags of this robot can be imported.")

@@ -87,11 +87,7 @@ def _outcomes(summary: DatasetSummary) -> str:
 
 
 def info(root: Path, console: Console) -> None:
-    """Print what is in a dataset.
-
-    Raises:
-        DatasetError: there is none, or a file cannot be read.
-    """
+    """Print what is in a dataset."""
     summary = dataset_info(root)
     state = _unfinished(summary) or "finalised"
     table = Table(title=escape(str(summary.root)), title_justify="left", show_header=False)

@@ -5,9 +5,9 @@ import sys
 from collections.abc import Sequence
 
 from bhd_lerobot.cli.start import leaving_on_interrupt
-from bhd_lerobot.command_line import FAILED, Parser, exit_status
 from bhd_lerobot.datasets.storage.atomic import noting_what_is_done
-from bhd_lerobot.plugins import load_named
+from bhd_lerobot.options.command import FAILED, Parser, exit_status
+from bhd_lerobot.options.plugins import load_named
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (

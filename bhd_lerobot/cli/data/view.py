@@ -31,18 +31,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> int:
-    """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that says which.
-
-    Args:
-        root: the dataset.
-        console: where the address is printed.
-        port: on 127.0.0.1; 0 for any free one.
-        open_browser: open the page, if there is a display.
-
-    Raises:
-        DatasetError: there is no dataset, it is being recorded, or it cannot be read.
-        ConfigError: the port cannot be had.
-    """
+    """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that says which."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port is {port}; it must be between 0 and 65535. 0 takes any that is free.")
     try:

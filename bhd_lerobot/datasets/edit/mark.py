@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.edit.edits import Change, EditReport, OnDone, check_episodes, rewrite
 from bhd_lerobot.datasets.format import features as keys
@@ -17,7 +18,6 @@ from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, 
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.plugins import body_of
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 
 _REASON = "marked afterwards"

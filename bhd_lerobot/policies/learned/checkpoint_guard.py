@@ -17,7 +17,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.plugins import PREFIXES
+from bhd_lerobot.options.plugins import PREFIXES
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE
 
 PROCESSOR_FILES = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")

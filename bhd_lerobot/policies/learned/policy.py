@@ -21,10 +21,12 @@ from lerobot.utils.constants import (
 )
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.plugins import POLICIES, load_plugins
+from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
 from bhd_lerobot.stock import get_policy_class, is_torch_device_available, make_pre_post_processors
+
+_OWN = ("bhd_cnn", "bhd_mlp", "bhd_perception", "bhd_pixels")
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,8 @@ def _config(folder: Path, device: str) -> Any:
         kind = values["type"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file} cannot be read ({error!r}). Copy the checkpoint again.") from error
-    if kind in POLICIES:
-        importlib.import_module(POLICIES[kind])
+    if kind in _OWN:
+        importlib.import_module(f"bhd_lerobot.policies.{kind[4:]}.processor_{kind[4:]}")
     elif kind not in PreTrainedConfig.get_known_choices():
         load_plugins()
     if kind not in PreTrainedConfig.get_known_choices():

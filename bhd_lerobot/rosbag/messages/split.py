@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import UnsupportedDatasetError
-from bhd_lerobot.plugins import body_of
 from bhd_lerobot.rosbag.messages.arm import TOOL, JointsPart, PosePart
 from bhd_lerobot.rosbag.messages.base import (
     GYRO,

@@ -7,14 +7,14 @@ from typing import Any
 
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.arguments import parse_train
 
 ALGORITHM = "dagger"
-CONFIG, FILES = "config.yaml", "files.yaml"
-"""What a run's folder keeps: the configuration, and what the files in it say."""
+FILES = "files.yaml"
+"""What the files say that the configuration of a run names, in the run's folder."""
 OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
@@ -178,13 +178,13 @@ def _names(stage: StageConfig) -> set[str]:
     return {option.removeprefix("--").partition("=")[0] for option in stage.options}
 
 
-def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
+def parse_aggregation(arguments: Sequence[str] | configuration.CommandLine) -> AggregationConfig:
     """Return what a command line asks for."""
-    config = configuration.parse(AggregationConfig, arguments)
-    given = configuration.read_overrides(arguments)
-    file = Path(str(given.get(configuration.CONFIG_PATH, ""))).expanduser()
-    if "output_dir" not in given and file.name == CONFIG and (file.parent / FILES).is_file():
-        config.output_dir = str(file.parent)  # it is that of a run, which may have been moved
+    line = configuration.read_line(arguments)
+    config = configuration.parse(AggregationConfig, line)
+    run = line.path.parent if line.path is not None and line.path.name == configuration.RUN_CONFIG else None
+    if run is not None and "output_dir" not in line.options and (run / FILES).is_file():
+        config.output_dir = str(run)  # it may have been moved
     return config
 
 
@@ -193,7 +193,7 @@ def kept(folder: Path) -> AggregationConfig | None:
 
     An option that was not there yet when they were made has its default.
     """
-    file = folder / CONFIG
+    file = folder / configuration.RUN_CONFIG
     if not file.is_file():
         return None
     return parse_aggregation([f"--{configuration.CONFIG_PATH}={file}"])

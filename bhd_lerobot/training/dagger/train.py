@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from bhd_lerobot.datasets.format.features import EXPERT_ACTION
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
-from bhd_lerobot.evaluation import evaluate
-from bhd_lerobot.recording import record
-from bhd_lerobot.rollout.configuration import encode, read_file, run
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
-    CONFIG,
     FILES,
     OWN,
     AggregationConfig,
@@ -43,9 +46,9 @@ _DONE = "done.json"
 _OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _SIGNALLED = 128  # what an exit status is above if a signal stopped the program
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
-    "bhd-record": record.main,
-    "bhd-train": training.main,
-    "bhd-eval": evaluate.main,
+    "bhd-record": partial(run, Program(RecordConfig, lambda config: record(config).exit_status)),
+    "bhd-train": partial(run, training.PROGRAM),
+    "bhd-eval": partial(run, Program(EvalConfig, lambda config: evaluate(config).exit_status)),
 }
 
 
@@ -118,7 +121,7 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         _check_same(folder, before, config, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, what in ((CONFIG, encode(config)), (FILES, files)):
+        for name, what in ((RUN_CONFIG, encode(config)), (FILES, files)):
             Disk().publish(folder / name, yaml.safe_dump(what, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
@@ -402,7 +405,5 @@ def _interval(one: dict[str, float]) -> str:
     return f"{one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f})"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Learn in rounds; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    interrupted = "Stopped; what is done is kept, and the same command goes on there."
-    return run(train, AggregationConfig, arguments, read=parse_aggregation, interrupted=interrupted)
+_KEPT = "Stopped; what is done is kept, and the same command goes on there."
+PROGRAM = Program(AggregationConfig, train, parse_aggregation, _KEPT)

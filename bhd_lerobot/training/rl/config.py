@@ -5,20 +5,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
-from pathlib import Path
 
 from lerobot.robots.config import RobotConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 from bhd_lerobot.registry import is_for, kind_of_robot, robot_of_task, robots_of
-from bhd_lerobot.rollout import configuration
 from bhd_lerobot.tasks.task import Event, TaskConfig
-
-CONFIG_NAME = "config.yaml"
 
 _CHOICES = {
     "algorithm": ("ppo",),
@@ -284,21 +281,11 @@ class RlConfig:
                             raise ConfigError(f"{name}{key and '.'}{key} is {number}; it must be {what}.")
 
 
-def parse_rl(arguments: Sequence[str]) -> RlConfig:
-    """Return what a command line asks for."""
-    prefix = f"--{configuration.CONFIG_PATH}="
-    found = [
-        f"{prefix}{config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument
-        for argument in arguments
-    ]
-    config = configuration.parse(RlConfig, found)
-    given = configuration.read_overrides(found)
-    run = Path(str(given.get(configuration.CONFIG_PATH, ""))).parent
-    if config.resume and "output_dir" not in given and (run / CHECKPOINTS_DIR).is_dir():
+def parse_rl(arguments: Sequence[str] | CommandLine) -> RlConfig:
+    """Return what a command line asks for; to resume, its `config_path` may be the run's folder."""
+    line = read_line(arguments)
+    config = parse(RlConfig, line)
+    run = line.path if line.path is None or line.path.is_dir() else line.path.parent
+    if config.resume and "output_dir" not in line.options and run is not None and (run / CHECKPOINTS_DIR).is_dir():
         config.output_dir = str(run)  # it may have been moved
     return config
-
-
-def config_file(path: Path) -> Path:
-    """Return a configuration file, or that of a run's folder."""
-    return path / CONFIG_NAME if path.is_dir() else path

@@ -3,7 +3,6 @@
 import json
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -19,14 +18,15 @@ from rich.markup import escape
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
+from bhd_lerobot.options import parse as configuration
+from bhd_lerobot.options.command import Program
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
 from bhd_lerobot.policies.learned.inference import use_threads
-from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training.checkpoint import clean, point
 from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, RunProgress, format_numbers, read_metrics
 from bhd_lerobot.training.rl import checkpoint as checkpoints
-from bhd_lerobot.training.rl.config import CONFIG_NAME, RlConfig, parse_rl
+from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 from bhd_lerobot.training.rl.log import PLOT_NAME, SHOWN, Row, draw_curve
 from bhd_lerobot.training.rl.parts import make_parts
 from bhd_lerobot.training.rl.validation import Validation, level
@@ -109,7 +109,7 @@ def _write_config(config: RlConfig, folder: Path) -> None:
     """Write the resolved configuration."""
     values = {**configuration.encode(config), "resume": False}
     text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
-    (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
+    (folder / configuration.RUN_CONFIG).write_text(text, encoding="utf-8")
 
 
 class _Run:
@@ -275,12 +275,9 @@ def _text(row: Row) -> str:
     return "score {val_score:.4f}, success {val_success:.3f}, return {val_return:.4f}".format_map(row)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run `bhd-train` with `algorithm: ppo`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    return configuration.run(
-        lambda config: train(config).stopped_by.exit_status,
-        RlConfig,
-        arguments,
-        read=parse_rl,
-        interrupted="Stopped; checkpoints that were written before are complete.",
-    )
+PROGRAM = Program(
+    RlConfig,
+    lambda config: train(config).stopped_by.exit_status,
+    parse_rl,
+    "Stopped; checkpoints that were written before are complete.",
+)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.apps.doctor import checks, doctor, latency_test, trials
 from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status, markdown_table, wrong
 from bhd_lerobot.apps.doctor.trials import Outcome, run_trials
+from bhd_lerobot.cli.doctor import main
 from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH
 from tests.cases import each_case
 
@@ -468,7 +469,7 @@ class FakeTrials:
 def run(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, *arguments: str, answers: dict[str, Outcome] | None = None
 ) -> tuple[int, dict[str, Any]]:
-    status = doctor.main(["--json", f"--root={tmp_path}", *arguments], FakeTrials(answers))
+    status = main(["--json", f"--root={tmp_path}", *arguments], FakeTrials(answers))
     return status, json.loads(capsys.readouterr().out)
 
 
@@ -526,7 +527,7 @@ def test_the_printed_report_has_findings_histogram_and_remedies(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     fake = FakeTrials({"rights": grants(scheduler="ask"), "opengl": failed("crash", "[E] ended by SIGSEGV")})
-    assert doctor.main([f"--root={tmp_path}", "--realtime"], fake) == 1
+    assert main([f"--root={tmp_path}", "--realtime"], fake) == 1
     assert fake.requested == ["latency test", "rights", "ffmpeg", "opengl", "plug-ins"]
     text = capsys.readouterr().out
     lines = text.splitlines()
@@ -559,7 +560,7 @@ def test_a_measurement_that_fails_is_a_problem(capsys: pytest.CaptureFixture[str
 )
 def test_wrong_options_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     fake = FakeTrials()
-    assert doctor.main(["--realtime", *arguments], fake) == 2
+    assert main(["--realtime", *arguments], fake) == 2
     assert message in capsys.readouterr().err
     assert fake.requested == []
 
@@ -568,6 +569,6 @@ def test_the_default_folder_is_lerobots(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "datasets"))
-    doctor.main(["--json"], FakeTrials())
+    main(["--json"], FakeTrials())
     disk = next(one for one in json.loads(capsys.readouterr().out)["findings"] if one["check"] == "disk")
     assert str(tmp_path) in disk["found"] + disk["cause"]

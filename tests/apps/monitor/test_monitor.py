@@ -18,13 +18,15 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.monitor import monitor
-from bhd_lerobot.apps.monitor.monitor import Keys, find, main, watch
+from bhd_lerobot.apps.monitor.monitor import Keys, find, watch
 from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Sampler, cells
+from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import encode_feedback
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime import shared_memory
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
@@ -32,7 +34,6 @@ from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
-from bhd_lerobot.rollout.configuration import parse
 from tests.recording.support import options
 from tests.waiting import until
 
@@ -427,7 +428,7 @@ def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
 # It is to be its controlling terminal, in whose foreground it is.
 LOGIN = (
     "import os, sys; os.login_tty(int(sys.argv[1]))\n"
-    "from bhd_lerobot.apps.monitor.monitor import main; sys.exit(main(sys.argv[2:]))"
+    "from bhd_lerobot.cli.monitor import main; sys.exit(main(sys.argv[2:]))"
 )
 
 
@@ -515,6 +516,6 @@ def test_a_stop_does_not_wait_for_an_image() -> None:
 
 def test_it_starts_fast_because_it_imports_little() -> None:
     heavy = "{'torch', 'lerobot', 'mujoco'}"
-    code = f"import sys; from bhd_lerobot.apps.monitor import monitor; print(*sorted({heavy} & set(sys.modules)))"
+    code = f"import sys; from bhd_lerobot.cli import monitor; print(*sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

@@ -10,7 +10,7 @@ import pytest
 
 from bhd_lerobot.cli.data import check, main, repair
 from bhd_lerobot.cli.data.check import limits_of
-from bhd_lerobot.registry import ROBOTS
+from bhd_lerobot.registry import robot_configs
 from tests.recording.support import run_record
 
 
@@ -63,9 +63,9 @@ def test_no_dataset_is_status_2(tmp_path: Path, capsys) -> None:
 
 
 def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
-    for kind in ROBOTS:
+    for name, kind in robot_configs().items():
         limits = kind().body().limits
-        ranges = limits_of(kind.get_choice_name(kind))["control.applied_action"]
+        ranges = limits_of(name)["control.applied_action"]
         assert list(ranges) == list(limits.names)
         for index, (low, high) in enumerate(ranges.values()):
             arm = hasattr(limits, "upper")

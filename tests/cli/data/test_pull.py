@@ -9,7 +9,7 @@ import pytest
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.training.config import BhdTrainConfig
 from tests.hub_server.server import HubServer
 from tests.training.support import make_dataset

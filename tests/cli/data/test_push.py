@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
+from bhd_lerobot.cli import record as record_module
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.data.check import limits_of
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -23,7 +24,6 @@ from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.hub.transfer import repeat_line
-from bhd_lerobot.recording import record as record_module
 from tests.datasets.support import snapshot as content
 from tests.hub_server.server import Fault, HubServer
 from tests.recording.support import options as record_options

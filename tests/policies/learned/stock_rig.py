@@ -13,8 +13,8 @@ import pytest
 from lerobot.scripts import lerobot_eval, lerobot_rollout, lerobot_train
 from numpy.typing import NDArray
 
+from bhd_lerobot.cli import evaluate
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
 

@@ -13,11 +13,9 @@ import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline
 
+from bhd_lerobot.cli import evaluate, record, train
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.policies.learned.checkpoint_guard import PROCESSOR_FILES, check_checkpoint
-from bhd_lerobot.recording import record
-from bhd_lerobot.training import train
 from bhd_lerobot.training.rl.parts import _from_checkpoint
 from tests.policies.learned import rig
 from tests.training.support import MLP, make_dataset, options, run_train

@@ -13,12 +13,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import action_names_of, brains_for, make_brain, robot_of_brain
-from bhd_lerobot.rollout.configuration import parse
 from tests.cases import each_case
 from tests.policies.learned import rig
 

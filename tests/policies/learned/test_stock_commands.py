@@ -15,12 +15,12 @@ import torch
 from lerobot.datasets import LeRobotDataset
 
 import bhd_lerobot
+from bhd_lerobot.cli import train
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.robots.simulated_robot import connected_robots
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
-from bhd_lerobot.training import train
 from tests.policies.learned.rig import save_policy
 from tests.policies.learned.stock_rig import (
     arguments,

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.evaluate import evaluate, main
+from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
 from bhd_lerobot.registry import make_brain
-from bhd_lerobot.rollout.configuration import parse
 from tests.cases import each_case
 from tests.policies.learned.rig import save_policy
 from tests.recording.support import run_record

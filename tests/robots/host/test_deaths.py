@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
+from bhd_lerobot.cli.record import main
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.shared_memory import sweep
-from bhd_lerobot.recording.record import main
 from bhd_lerobot.robots.host import link
 from tests.recording.support import options
 from tests.robots.host.support import (

@@ -13,6 +13,7 @@ import yaml
 from bhd_lerobot.cli.train import algorithm_of, main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.options.parse import read_line
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.dagger import train as dagger
@@ -392,11 +393,11 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path, capsys: pyte
 
 
 def test_the_algorithm_decides_which_training_is_asked_for(tmp_path: Path) -> None:
-    assert algorithm_of(["--algorithm=ppo"]) == "ppo"
-    assert algorithm_of(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"]) == "ppo"
-    assert algorithm_of(["--config_path=configs/train/dagger_turtlebot3_avoid.yaml"]) == "dagger"
-    assert algorithm_of(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"]) is None
-    assert algorithm_of([f"--config_path={tmp_path / 'missing.yaml'}"]) is None
+    assert algorithm_of(read_line(["--algorithm=ppo"])) == "ppo"
+    assert algorithm_of(read_line(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"])) == "ppo"
+    assert algorithm_of(read_line(["--config_path=configs/train/dagger_turtlebot3_avoid.yaml"])) == "dagger"
+    assert algorithm_of(read_line(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"])) is None
+    assert algorithm_of(read_line([f"--config_path={tmp_path / 'missing.yaml'}"])) is None
     other = tmp_path / "bc.yaml"
     other.write_text(yaml.safe_dump({"dataset": {"repo_id": "a/b"}}))
-    assert algorithm_of([f"--config_path={other}"]) is None
+    assert algorithm_of(read_line([f"--config_path={other}"])) is None

@@ -17,6 +17,7 @@ from rich.console import Console
 
 pytest.importorskip("stable_baselines3")
 
+from bhd_lerobot.cli.train import main
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -33,7 +34,7 @@ from bhd_lerobot.training.rl.features import in_units
 from bhd_lerobot.training.rl.learner import ActionHead, ActorHead, make_learner
 from bhd_lerobot.training.rl.log import draw_curve
 from bhd_lerobot.training.rl.parts import make_parts, single_action
-from bhd_lerobot.training.rl.train import RlResult, main, train
+from bhd_lerobot.training.rl.train import RlResult, train
 from tests.forks import Fork
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
@@ -385,11 +386,9 @@ def test_the_shipped_configurations_are_valid(name: str) -> None:
 
 
 def test_bhd_train_with_an_algorithm_runs_reinforcement_learning(tmp_path: Path, capsys) -> None:
-    from bhd_lerobot.cli.train import main as bhd_train
-
-    assert bhd_train(options(tmp_path / "run", steps=0)) == 2
+    assert main(options(tmp_path / "run", steps=0)) == 2
     assert "steps is 0" in capsys.readouterr().err
-    assert bhd_train(options(tmp_path / "run", steps=32)) == 0
+    assert main(options(tmp_path / "run", steps=32)) == 0
     assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
 
 

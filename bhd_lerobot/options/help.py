@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bhd_lerobot.rollout.configuration import choices_of, entries_of, options_of
+from bhd_lerobot.options.parse import choices_of, entries_of, options_of
 
 _INDENT = 26  # [characters] where meanings begin
 # What LeRobot's own classes say nowhere; where a class says it, that counts.
@@ -112,12 +112,7 @@ def type_word(kind: Any) -> str:
 
 
 def help_of(config_class: type, chosen: Mapping[str, str]) -> str:
-    """Return the help of a program: its options in groups, each with its meaning and its default.
-
-    Args:
-        config_class: the program's configuration.
-        chosen: types that were chosen on the command line, by option; only the options of these are listed.
-    """
+    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option."""
     width = max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
     lines = textwrap.wrap(summary_of(config_class), width)
     lines += ["", "Options are written --key=value, or nested in a YAML file: --config_path=FILE.", ""]

@@ -13,9 +13,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.bodies.body import Arm, MobileBase
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 
 ENTRY_POINTS = "bhd_lerobot.plugins"
@@ -24,31 +21,14 @@ ENTRY_POINTS = "bhd_lerobot.plugins"
 PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
 """How the names of distributions begin that LeRobot imports."""
 
-BODIES: dict[str, Callable[[], MobileBase | Arm]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
-"""What makes the body of a robot with the options that it has by default, by the robot's type."""
-
-POLICIES = {
-    "bhd_cnn": "bhd_lerobot.policies.cnn.processor_cnn",
-    "bhd_mlp": "bhd_lerobot.policies.mlp.processor_mlp",
-    "bhd_perception": "bhd_lerobot.policies.perception.processor_perception",
-    "bhd_pixels": "bhd_lerobot.policies.pixels.processor_pixels",
-}
-"""The modules that register this package's own types of policies, with their steps of processing."""
-
 _OPTION = "discover_packages_path"
 # This distribution, for LeRobot's commands. Ours register what they need; our environments take seconds to import.
 _OURS = "lerobot_robot_bhd"
 _imported: set[str] = set()
-_unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
 
 
 def load_plugins(report: Callable[[str], object] | None = None) -> None:
-    """Import every plug-in that is installed, once.
-
-    Args:
-        report: called with a sentence for each that cannot be imported, the others are imported all the same; printed
-            on standard error if None.
-    """
+    """Import every plug-in that is installed, once; report those that fail, on standard error if None."""
     for name, reason in import_plugins():
         if reason:
             text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
@@ -79,14 +59,7 @@ def misnamed() -> list[tuple[str, str]]:
 
 
 def load_named(arguments: Sequence[str]) -> list[str]:
-    """Import the modules that a command line names; return its other arguments.
-
-    Args:
-        arguments: of the command line; ``--robot.discover_packages_path=my_robots`` names one, by any option in front.
-
-    Raises:
-        ConfigError: a module cannot be imported.
-    """
+    """Import the modules that options ``--….discover_packages_path=MODULE`` name; return the other arguments."""
     left: list[str] = []
     rest = list(arguments)
     while rest:
@@ -115,20 +88,6 @@ def module_to_name(kind: type) -> str | None:
     own = kind.__module__.partition(".")[0]
     installed = {name.partition(":")[0].partition(".")[0] for name, _ in _installed()}
     return None if own in {__name__.partition(".")[0], "lerobot", *installed} else kind.__module__
-
-
-def body_of(robot_type: str | None) -> MobileBase | Arm | None:
-    """Return the body of a robot, for whoever reads its data and makes no robot; None if there is no such robot.
-
-    Args:
-        robot_type: as a dataset names it; None if it does not.
-    """
-    if robot_type is None:
-        return None
-    if robot_type not in BODIES and robot_type not in _unknown:
-        load_plugins()
-        _unknown.add(robot_type)
-    return BODIES[robot_type]() if robot_type in BODIES else None
 
 
 def _installed() -> list[tuple[str, Callable[[], Any]]]:

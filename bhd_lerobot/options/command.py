@@ -4,15 +4,20 @@ It imports nothing that takes time: a command begins with it.
 """
 
 import argparse
+import logging
 import os
 import re
 import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from bhd_lerobot.errors import BhdError, unknown_name
+from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+
+if TYPE_CHECKING:
+    from bhd_lerobot.options.parse import CommandLine
 
 FAILED = 2
 """The exit status after an error with a message."""
@@ -22,14 +27,11 @@ INTERRUPTED = 128 + signal.SIGINT
 
 
 def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[], str] = "Stopped.") -> int:
-    """Run a program; return its exit status.
+    """Run a program, whose exit status may be None for 0; return the status.
 
-    An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C gives
-    130, and the status is that of other programs where nobody reads what is printed, as of ``| head -1``.
-
-    Args:
-        program: returns its exit status; None is 0.
-        interrupted: what is printed after Ctrl-C.
+    An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C prints
+    `interrupted` and gives 130, and the status is that of other programs where nobody reads what is printed, as of
+    ``| head -1``.
     """
     try:
         try:
@@ -65,9 +67,57 @@ def _is_unread() -> bool:
     return True
 
 
-def asks_for_help(arguments: Sequence[str]) -> bool:
-    """Return whether a command line asks for help."""
-    return any(argument in ("-h", "--help") for argument in arguments)
+@dataclass(frozen=True)
+class Program:
+    """What a command does with its configuration.
+
+    Attributes:
+        config_class: a dataclass.
+        main: gets the configuration, and returns the exit status; None is 0.
+        read: what makes the configuration of a command line; `parse` if None.
+        interrupted: what is printed after Ctrl-C.
+    """
+
+    config_class: type
+    main: Callable[[Any], int | None]
+    read: "Callable[[CommandLine], Any] | None" = None
+    interrupted: str = "Stopped."
+
+
+def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequence[str] | None = None) -> int:
+    """Run a program, or that which a command line chooses, with the arguments of this process if None.
+
+    Returns:
+        The exit status; 0 after the help.
+    """
+    from bhd_lerobot.options.help import help_of
+    from bhd_lerobot.options.parse import CommandLine, parse, read_line
+    from bhd_lerobot.options.plugins import load_named, load_plugins
+
+    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    interrupted = "Stopped."
+
+    def configured() -> int | None:
+        nonlocal interrupted
+        load_plugins()
+        given = load_named(sys.argv[1:] if arguments is None else arguments)
+        left = [argument for argument in given if argument not in ("-h", "--help")]
+        try:
+            line = read_line(left)
+        except ConfigError:
+            if left == given:
+                raise
+            line = CommandLine({})  # help is printed whatever else is missing or wrong
+        chosen = program if isinstance(program, Program) else program(line)
+        interrupted = chosen.interrupted
+        if left != given:
+            types = re.findall(r"^--([\w.]+\.type)[=\n](\S+)$", "\n".join(left), re.MULTILINE)
+            print(help_of(chosen.config_class, dict(types)))
+            return 0
+        return chosen.main(chosen.read(line) if chosen.read else parse(chosen.config_class, line))
+
+    return exit_status(configured, lambda: interrupted)
 
 
 class Parser(argparse.ArgumentParser):
@@ -80,7 +130,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
-        """Return what a command line asks for."""
+        """Return what a command line asks for; end with status 2 if it has what is not known."""
         options, unknown = self.parse_known_args(arguments)
         if unknown:
             command: argparse.ArgumentParser = getattr(options, "command_parser", self)

@@ -6,9 +6,9 @@ import lerobot.policies  # noqa: F401  registers LeRobot's policies
 import pytest
 
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.help import help_of, meanings_of
+from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import choices_of, options_of
-from bhd_lerobot.rollout.options_help import help_of, meanings_of
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.rl.config import RlConfig

@@ -3,9 +3,10 @@
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import encode, parse, run
-from bhd_lerobot.rollout.options_help import help_of
+from bhd_lerobot.training.rl.config import RlConfig
 from tests.cases import each_case
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
@@ -75,17 +76,20 @@ def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(cap
     def bug(config):
         raise RuntimeError("a bug")
 
-    assert run(fail, RecordConfig, REQUIRED) == 2
+    assert run(Program(RecordConfig, fail), REQUIRED) == 2
     assert capsys.readouterr().err == "error: a sentence\n"
     with pytest.raises(RuntimeError):
-        run(bug, RecordConfig, REQUIRED)
+        run(Program(RecordConfig, bug), REQUIRED)
 
 
-def test_help_lists_every_option():
-    chosen = {"robot.type": "turtlebot3", "brain.type": "avoidance", "task.type": "avoid"}
-    text = help_of(RecordConfig, chosen)
-    for option in ("--robot.beams", "--dataset.episode_time_s", "--brain.safe_distance_m", "--task.arena", "--resume"):
-        assert option in text
+def test_help_is_that_of_what_the_command_line_chooses_whatever_else_is_wrong_with_it(capsys):
+    def choose(line):
+        return Program(RlConfig if "algorithm" in line.options else RecordConfig, lambda _: pytest.fail("it ran"))
+
+    for given, option in ((["--algorithm=ppo", "--help"], "--ppo.lr"), (["-h", "--robot.type=ur5", "x"], "--robot.id")):
+        assert run(choose, given) == 0
+        assert option in capsys.readouterr().out
+    assert run(choose, ["x"]) == 2
 
 
 @each_case(
@@ -112,5 +116,5 @@ def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
     def stopped(config):
         raise KeyboardInterrupt
 
-    assert run(stopped, RecordConfig, REQUIRED) == 130
+    assert run(Program(RecordConfig, stopped), REQUIRED) == 130
     assert capsys.readouterr().err == "Stopped.\n"

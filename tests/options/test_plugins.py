@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot import plugins, registry
+from bhd_lerobot import registry
+from bhd_lerobot.bodies import registry as bodies
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options import plugins
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.task import TaskConfig
 from tests.recording.support import options
 
@@ -50,13 +52,12 @@ class Installer:
 def installer(tmp_path, monkeypatch):
     """Return where a test installs plug-ins; afterwards nothing of them is known."""
     choices = [(kind, dict(kind._choice_registry)) for kind in (BrainConfig, TaskConfig)]
-    brains, modules = dict(registry.BRAINS), set(sys.modules)
+    modules = set(sys.modules)
+    monkeypatch.setattr(registry.BRAINS, "_table", dict(registry.BRAINS._table))
     yield Installer(tmp_path, monkeypatch)
     for kind, known in choices:
         kind._choice_registry.clear()
         kind._choice_registry.update(known)
-    registry.BRAINS.clear()
-    registry.BRAINS.update(brains)
     for name in set(sys.modules) - modules:
         if name.startswith("lerobot_"):
             del sys.modules[name]
@@ -131,9 +132,9 @@ def test_a_robot_that_no_plug_in_has_is_looked_for_once(installer, monkeypatch) 
     looked = []
     installed = plugins._installed
     monkeypatch.setattr(plugins, "_installed", lambda: looked.append(1) or installed())
-    monkeypatch.setattr(plugins, "_unknown", set())
-    monkeypatch.setattr(plugins, "BODIES", dict(plugins.BODIES))
-    assert [plugins.body_of("toy") for _ in range(5)] == [None] * 5
+    monkeypatch.setattr(bodies, "_unknown", set())
+    monkeypatch.setattr(bodies.BODIES, "_table", dict(bodies.BODIES._table))
+    assert [bodies.body_of("toy") for _ in range(5)] == [None] * 5
     assert len(looked) == 1
-    plugins.BODIES["toy"] = plugins.BODIES["ur5"]
-    assert plugins.body_of("toy") is not None
+    bodies.BODIES.register("toy", bodies.BODIES["ur5"])
+    assert bodies.body_of("toy") is not None

@@ -5,56 +5,103 @@ key, the nearest one that exists, and the valid ones on that level. Both read th
 `--a.b=value`, with `type` choosing among registered classes.
 """
 
+import copy
 import dataclasses
 import json
 import keyword
-import logging
 import re
-import sys
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import draccus
 import yaml
 
-from bhd_lerobot.command_line import asks_for_help, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
-from bhd_lerobot.plugins import load_named, load_plugins
 
 CONFIG_PATH = "config_path"
+RUN_CONFIG = "config.yaml"
+"""What the configuration of a run is called in its folder."""
 
 
-def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
-    """Return the configuration that a command line describes.
+@dataclasses.dataclass
+class CommandLine:
+    """What a command line says, read once.
 
-    Args:
-        config_class: a dataclass.
-        arguments: ``--config_path=FILE`` and overrides ``--a.b=value`` or ``--a.b value``; values are YAML.
-
-    Raises:
-        ConfigError: an unknown key, a value of the wrong type, or a file that cannot be read.
+    Attributes:
+        options: values, by the full names of their options; without `config_path`.
+        path: what `config_path` names: a configuration file, or the folder of a run, which holds one.
     """
-    overrides = read_overrides(arguments)
-    path = overrides.pop(CONFIG_PATH, None)
-    values: dict[str, Any] = read_file(Path(str(path)).expanduser()) if path is not None else {}
-    for key, value in overrides.items():
-        set_option(values, key, value)
-    return decode(config_class, values)
+
+    options: dict[str, Any]
+    path: Path | None = None
+
+    @cached_property
+    def file(self) -> dict[str, Any]:
+        """What the file holds; nothing if none is named."""
+        if self.path is None:
+            return {}
+        inside = self.path / RUN_CONFIG
+        return read_file(inside if inside.is_file() else self.path)
+
+    def over(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return nested values, those of the file for example, with the options in their place."""
+        result = copy.deepcopy(dict(values))
+        for name, value in self.options.items():
+            *keys, last = name.split(".")
+            inner: Any = result
+            for key in keys:
+                inner = inner.setdefault(key, {})
+                if not isinstance(inner, dict):
+                    raise ConfigError(f"Option --{name} sets a key of {key!r}, which is a plain value.")
+            inner[last] = value
+        return result
+
+
+def read_line(arguments: Sequence[str] | CommandLine) -> CommandLine:
+    """Return what a command line says: ``--config_path=FILE``, ``--a.b=value`` or ``--a.b value``; values are YAML.
+
+    One that was read before is returned as it is.
+    """
+    if isinstance(arguments, CommandLine):
+        return arguments
+    options: dict[str, Any] = {}
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        if not argument.startswith("--"):
+            raise ConfigError(f"Unexpected argument {argument!r}; options are written --key=value.")
+        key, sign, text = argument[2:].partition("=")
+        if not sign:
+            if not rest or rest[0].startswith("--"):
+                raise ConfigError(f"Option --{key} has no value; write --{key}=value.")
+            text = rest.pop(0)
+        if key in options:
+            raise ConfigError(f"Option --{key} was given twice.")
+        try:
+            options[key] = text if key == CONFIG_PATH else yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
+    path = options.pop(CONFIG_PATH, None)
+    return CommandLine(options, None if path is None else Path(path).expanduser())
+
+
+def parse[T](config_class: type[T], arguments: Sequence[str] | CommandLine) -> T:
+    """Return the configuration that a command line describes."""
+    line = read_line(arguments)
+    return decode(config_class, line.over(line.file))
 
 
 def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -> T:
-    """Return the configuration that plain values stand for.
+    """Return the configuration that plain values, nested, stand for.
 
     Args:
         config_class: a dataclass.
-        values: by the names of its fields, nested; values with an exponent and entries that are nothing are replaced.
+        values: by the names of its fields; values with an exponent and entries that are nothing are replaced.
         prefix: what stands before the fields' names in messages, ``"robot."``, for example.
-
-    Raises:
-        ConfigError: an unknown or missing key, or a value that cannot be honoured.
     """
     _check_keys(config_class, values, prefix)
     try:
@@ -68,12 +115,7 @@ def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -
 
 
 def from_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return keyword arguments as plain values, nested, as a file would hold them.
-
-    Args:
-        options: values by name; configurations, paths and tuples may stand where a file has dictionaries, texts and
-            lists.
-    """
+    """Return keyword arguments, with configurations, paths and tuples among them, as a file would hold them."""
     return {name: _plain(value) for name, value in options.items()}
 
 
@@ -92,78 +134,8 @@ def encode(config: Any) -> dict[str, Any]:
     return draccus.encode(config)
 
 
-def run(
-    main: Callable[[Any], int | None],
-    config_class: type,
-    arguments: Sequence[str] | None = None,
-    *,
-    read: Callable[[Sequence[str]], Any] | None = None,
-    interrupted: str = "Stopped.",
-) -> int:
-    """Run a program on the configuration of a command line, or print its help; return the exit status.
-
-    Args:
-        main: gets the configuration, and returns its exit status; None is 0.
-        config_class: a dataclass.
-        arguments: of the command line; those of this process if None.
-        read: returns what `main` gets; `parse` if None.
-        interrupted: what is printed after Ctrl-C.
-    """
-    from bhd_lerobot.rollout.options_help import help_of
-
-    given = sys.argv[1:] if arguments is None else arguments
-    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-
-    def program() -> int | None:
-        load_plugins()
-        left = load_named(given)
-        if asks_for_help(left):
-            print(help_of(config_class, _chosen_types(left)))
-            return 0
-        return main(read(left) if read else parse(config_class, left))
-
-    return exit_status(program, interrupted)
-
-
-def _chosen_types(arguments: Sequence[str]) -> dict[str, str]:
-    """Return the options of a command line that choose a type; all others may still be missing or wrong."""
-    written = "\n".join(arguments)
-    return dict(re.findall(r"^--([\w.]+\.type)[=\n](\S+)$", written, re.MULTILINE))
-
-
-def read_overrides(arguments: Sequence[str]) -> dict[str, Any]:
-    """Return the options of a command line, by their full names; their values are YAML, that of `config_path` is not.
-
-    Raises:
-        ConfigError: an argument that is no option, an option without a value or given twice, or what is no YAML.
-    """
-    result: dict[str, Any] = {}
-    rest = list(arguments)
-    while rest:
-        argument = rest.pop(0)
-        if not argument.startswith("--"):
-            raise ConfigError(f"Unexpected argument {argument!r}; options are written --key=value.")
-        key, sign, text = argument[2:].partition("=")
-        if not sign:
-            if not rest or rest[0].startswith("--"):
-                raise ConfigError(f"Option --{key} has no value; write --{key}=value.")
-            text = rest.pop(0)
-        if key in result:
-            raise ConfigError(f"Option --{key} was given twice.")
-        try:
-            result[key] = text if key == CONFIG_PATH else yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
-    return result
-
-
 def read_file(path: Path) -> dict[str, Any]:
-    """Return what a YAML or JSON file holds.
-
-    Raises:
-        ConfigError: it cannot be read, or holds no keys and values.
-    """
+    """Return what a YAML or JSON file holds."""
     try:
         text = path.read_text(encoding="utf-8")
         values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)  # JSON's 1e-05 is text in YAML
@@ -178,20 +150,6 @@ def read_file(path: Path) -> dict[str, Any]:
         found = "nothing" if values is None else type(values).__name__
         raise ConfigError(f"{path} must hold keys and values at its top level, found {found}.")
     return values
-
-
-def set_option(values: dict[str, Any], name: str, value: Any) -> None:
-    """Set an option in nested values by its full name, such as ``robot.type``.
-
-    Raises:
-        ConfigError: what it is an option of is a plain value.
-    """
-    *keys, last = name.split(".")
-    for key in keys:
-        values = values.setdefault(key, {})
-        if not isinstance(values, dict):
-            raise ConfigError(f"Option --{name} sets a key of {key!r}, which is a plain value.")
-    values[last] = value
 
 
 def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:

@@ -1,0 +1,31 @@
+"""`bhd-doctor`: can this machine do what the package needs, and if not, what is to be done."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bhd_lerobot.apps.doctor.doctor import RunTrials, examine_and_print
+from bhd_lerobot.apps.doctor.trials import run_trials
+from bhd_lerobot.options.command import Parser, exit_status
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="bhd-doctor",
+        description="Check this machine; print symptom, cause and remedy of what is wrong. Exit status 1: a problem.",
+    )
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
+    parser.add_argument("--realtime", action="store_true", help="latency test: how late a real-time process wakes up")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the latency test [s] (default: 10)")
+    parser.add_argument("--rate", type=int, default=1000, help="wake-ups a second [Hz] (default: 1000)")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
+    """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
+    return exit_status(lambda: examine_and_print(_parser().parse(arguments), run))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,21 @@
+"""`bhd-replay`: replay recorded episodes in simulation, and measure how far they diverge from the recording."""
+
+import sys
+from collections.abc import Sequence
+
+from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.rollout.replay import ReplayConfig, replay
+
+
+def _replay(config: ReplayConfig) -> int:
+    worst = max(float(result.position_m.max()) for result in replay(config))
+    return int(config.tolerance_m is not None and worst > config.tolerance_m)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-replay`; return the exit status: 1 if the replay differs by more than `tolerance_m`."""
+    return run(Program(ReplayConfig, _replay), arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
