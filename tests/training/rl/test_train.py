@@ -316,7 +316,6 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
     ({"reward.frame": ".nan"}, "reward.frame is nan"),
     ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
-    ({"anchor.coef": 1}, "anchor was removed"),
     ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
     ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
     ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
