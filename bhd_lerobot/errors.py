@@ -137,7 +137,7 @@ def check_positive(prefix: str, config: object, names: Iterable[str], *, or_zero
 
 
 def install_extra(extra: str) -> str:
-    """Return how an extra is installed. The package is on no index: its name there could be somebody else's."""
+    """Return how an extra is installed. The package is on no index: its name there could be someone else's."""
     return (
         f"In the folder of this project: `make venv`, or `pip install -e '.[{extra}]'` in an environment of your own."
     )

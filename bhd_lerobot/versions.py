@@ -42,7 +42,7 @@ def check_version(name: str, version_of: Callable[[str], str] = metadata.version
     try:
         required = required_versions().get(name, SpecifierSet())
     except metadata.PackageNotFoundError:
-        return  # a copy of the source that nobody installed: nothing says what it requires
+        return  # a copy of the source that nobody installed: nothing states what it requires
     try:
         found = version_of(name)
     except metadata.PackageNotFoundError as error:

@@ -46,7 +46,7 @@ class Lesson:
 
     Attributes:
         name: of its folder, and of its dataset: `bhd/demo_NAME`.
-        what: what the robot does, in words.
+        what: what the robot does, as text.
         world: options of robot and task, for recording and evaluating alike.
         brain: type of the brain that drives.
         episodes: how many.
@@ -60,7 +60,7 @@ class Lesson:
         early_steps: step of another checkpoint that is compared, too; none if 0.
         trials: held-out episodes of each brain in the evaluation.
         yardstick: type of a brain that is compared, too; none if nothing.
-        score: what the task's score is, in words.
+        score: what the task's score is, as text.
         recipe: configuration of a training that is not as short.
     """
 
@@ -164,7 +164,7 @@ AVOID = Lesson(
         "--policy.chunk_size=1",
         "--policy.hidden_dims=[256,256]",
         "--policy.scan.transform=inverse",
-        "--policy.ignore=['*.vel']",  # docs/reference/policies.md says what happens otherwise
+        "--policy.ignore=['*.vel']",  # docs/reference/policies.md states what happens otherwise
     ),
     steps=3000,
     yardstick="random",
@@ -226,7 +226,7 @@ class StoppedError(BhdError):
     """A signal ended a step.
 
     Args:
-        status: the exit status that says which.
+        status: the exit status that states which.
     """
 
     def __init__(self, status: int) -> None:
@@ -373,7 +373,7 @@ class Demo:
 
     @contextmanager
     def _step(self, lesson: Lesson, doing: str) -> Iterator[list[str]]:
-        """Show that something is going on, then how long it took, and the lines that the step gave."""
+        """Show that something is continuing, then how long it took, and the lines that the step gave."""
         lines: list[str] = []
         started = time.perf_counter()
         with self._console.status(f"{lesson.name} {doing}"):

@@ -1,4 +1,4 @@
-"""`bhd-doctor`: can this machine do what the package needs, and if not, what is to be done."""
+"""`bhd-doctor`: can this machine do what the package needs, and if not, what to do."""
 
 import sys
 from collections.abc import Sequence

@@ -187,13 +187,13 @@ def describe_crowding(config: RayConfig, workers: int) -> str:
 
 
 def size_of(config: RayConfig) -> str:
-    """Return the size of a worker in words."""
+    """Return the size of a worker as text."""
     cpus, gpus = config.cpus_per_worker, config.gpus_per_worker
     return f"{cpus} CPU{'' if cpus == 1 else 's'}" + (f" and {gpus:g} GPU{'' if gpus == 1 else 's'}" if gpus else "")
 
 
 def describe_machines() -> str:
-    """Return the machines of the cluster in words, for a message."""
+    """Return the machines of the cluster as text, for a message."""
     machines = [f"{name} with {r.get('CPU', 0):g} CPUs and {r.get('GPU', 0):g} GPUs" for name, r in _machines().items()]
     return "; ".join(machines[:8] + (["…"] if len(machines) > 8 else [])) or "none"
 

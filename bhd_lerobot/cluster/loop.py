@@ -71,7 +71,7 @@ class ClusterLoop(EpisodeLoop):
         The arguments are those of `EpisodeLoop.run`.
 
         Raises:
-            ClusterError: the cluster cannot go on, or the emergency stop was pressed.
+            ClusterError: the cluster cannot continue, or the emergency stop was pressed.
             Exception: what the brain, the task or the simulation raised in a worker.
         """
         if not specs:

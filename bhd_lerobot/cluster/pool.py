@@ -19,7 +19,7 @@ from bhd_lerobot.cluster.task import Call, Task, Worker, cause_of, error_of
 from bhd_lerobot.errors import ClusterError
 
 CONTINUE = "What was recorded is saved; the same command runs the rest, bhd-record with --resume=true."
-_QUEUED = 2  # tasks that a worker has at a time: it goes on with the next while a result travels
+_QUEUED = 2  # tasks that a worker has at a time: it continues with the next while a result travels
 _WINDOW = 4  # tasks for each worker, finished or not, by which the run may be ahead of the oldest that is missing
 _DEATHS = 3  # of workers, with the same task in hand
 _STARTS = 5  # of workers that are lost before they are ready, in a row

@@ -1,4 +1,4 @@
-"""Episodes on their way through a cluster: who has them, and what became of them."""
+"""Episodes on their way through a cluster: who has them, and the outcome of them."""
 
 import pickle
 from collections import deque
@@ -28,7 +28,7 @@ class Task:
     deaths: int = field(default=0, compare=False)
 
     def __str__(self) -> str:
-        """The episodes in words."""
+        """The episodes as text."""
         first, last = self.specs[0][0], self.specs[-1][0]
         return f"episode {first}" if first == last else f"episodes {first} to {last}"
 

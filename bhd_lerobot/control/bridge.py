@@ -19,7 +19,7 @@ class ModeRequests(ABC):
 
     @abstractmethod
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Request a change of mode of some simulations, of all if None; return what became of it."""
+        """Request a change of mode of some simulations, of all if None; return the outcome of it."""
 
     def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Leave UNCONFIGURED: odometry starts here."""

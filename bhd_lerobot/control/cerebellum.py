@@ -269,7 +269,7 @@ class Cerebellum:
         """
         stopped = self.controller.protective_stop
         if np.count_nonzero(stopped):
-            # Whatever moved it there would go on pressing.
+            # Whatever moved it there would keep pressing.
             self._watchdog |= stopped
             self._set_mode((stopped != 0) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
         busy = self.controller.busy

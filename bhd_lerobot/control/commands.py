@@ -164,7 +164,7 @@ class CommandResult:
         task_id: the goal's.
         success: whether the target was reached.
         code: how it ended.
-        message: what happened, in words, with the offending value where there is one.
+        message: what happened, as text, with the offending value where there is one.
     """
 
     task_id: str

@@ -50,7 +50,7 @@ class Controller(ABC):
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
         """Head for rest: as in normal motion, or as hard as possible if the cause is `ESTOP` or `FAULT`.
 
-        May be called again while the stop goes on, and must not make it a gentler one.
+        May be called again while the stop continues, and must not make it a gentler one.
 
         Args:
             mask: the robots, shape (n,).
@@ -84,7 +84,7 @@ class Controller(ABC):
         """Take the joints as they are for the start."""
 
     def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Go on at rest from where the joints are: somebody else has stopped the robots there."""
+        """Continue at rest from where the joints are: someone else has stopped the robots there."""
         return
 
     @abstractmethod

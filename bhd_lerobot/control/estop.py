@@ -86,7 +86,7 @@ class EstopInputs:
         on_key: gets the terminal's keys that do not press, from the thread that waits for them; must not block either.
 
     Attributes:
-        causes: what has pressed so far, in words, each once, in the order of the first time.
+        causes: what has pressed so far, as text, each once, in the order of the first time.
     """
 
     def __init__(self, press: Callable[[], None], on_key: Callable[[bytes], None] = lambda keys: None) -> None:

@@ -1,4 +1,4 @@
-"""The last check before the wire: what is really written to the actuators, whoever computed it."""
+"""The last check before the wire: what is really written to the actuators, whatever computed it."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -139,7 +139,7 @@ class Guard:
         return self._rate
 
     def start(self, actuators: Array, position: Array) -> None:
-        """Start from where the robots are, because somebody else held them there.
+        """Start from where the robots are, because someone else held them there.
 
         Args:
             actuators: the first commands, shape (n, actuators).
@@ -154,7 +154,7 @@ class Guard:
         """Check commands, and take those that are safe over into `written`.
 
         Args:
-            actuators: what is to be written, shape (n, actuators).
+            actuators: what will be written, shape (n, actuators).
             position: of the joints, shape (n, joints).
             ticks: how many ticks the last commands are old.
 
@@ -186,7 +186,7 @@ class Guard:
         return unsafe
 
     def _slow_down(self, change: Array, actuators: Array) -> NDArray[np.bool_] | None:
-        """Take safe commands over; let those of other robots go on from the last safe ones, at a falling speed."""
+        """Take safe commands over; let those of other robots continue from the last safe ones, at a falling speed."""
         good: NDArray[np.bool_] = np.asarray(self._flags.all(axis=(0, 2)))
         limits, bend, rate = self.limits, self.limits.bend, self.rate
         slower = rate - np.minimum(np.maximum(rate, -bend), bend)

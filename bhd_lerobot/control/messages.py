@@ -167,7 +167,7 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class SendResult:
-    """What became of a setpoint in each simulation.
+    """The outcome of a setpoint in each simulation.
 
     Attributes:
         reasons: a `Reason` for each simulation, shape (n,).

@@ -69,7 +69,7 @@ class Plant(Protocol):
     n: int
 
     def open(self) -> None:
-        """Connect to the robot. Raises whatever says why that is impossible."""
+        """Connect to the robot. Raises whatever reports why that is impossible."""
         return
 
     def enable(self) -> None:

@@ -28,7 +28,7 @@ class ReadingCheck:
     Attributes:
         oldest_ns: largest age of a reading [ns].
         ahead_ns: by how much a stamp may be ahead of the tick's time [ns].
-        problem: why the last reading that was refused was no measurement, in words.
+        problem: why the last reading that was refused was no measurement, as text.
 
     Args:
         control_hz: ticks a second [Hz].
@@ -122,7 +122,7 @@ class ReadingCheck:
 
 
 def ahead_of_time(ahead_ns: int) -> str:
-    """Return in words that a stamp is from the future."""
+    """Return as text that a stamp is from the future."""
     return (
         f"a stamp is {ahead_ns / NANOSECONDS:.3f} s ahead of now: of another clock. Stamps are of the monotonic clock "
         "of this machine (time.monotonic_ns)"

@@ -95,7 +95,7 @@ class BhdEnvConfig(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return n environments in LeRobot's form; `vector` says how they run, whatever `use_async_envs` is."""
+        """Return n environments in LeRobot's form; `vector` states how they run, whatever `use_async_envs` is."""
         if n_envs < 1:
             raise ConfigError(f"The number of environments (eval.batch_size) is {n_envs}; it must be at least 1.")
         mode = AutoresetMode.SAME_STEP

@@ -31,7 +31,7 @@ class Course:
         self.following = first
 
     def advance(self, episode: int | None = None) -> int:
-        """Go on to an episode, the next one if None; return its seed."""
+        """Continue to an episode, the next one if None; return its seed."""
         episode = self.following if episode is None else episode
         if not 0 <= episode < _END:
             raise ConfigError(f"The number of an episode is {episode}; it must be from 0 to 2**63 - 1.")

@@ -24,7 +24,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     One step is one frame: the action goes to the cerebellum, which controls the robot at its own rate meanwhile.
     Observation: `agent_pos`, `environment_state` and `pixels`, LeRobot's names, as far as there are any. Action: the
     robot's action features, in SI units. `reset(seed=k)` starts episode k of the run `seed`; each `reset()` after it
-    goes on to an episode that no other seed below 2**32 leads to.
+    continues to an episode that no other seed below 2**32 leads to.
 
     An episode is terminated by what happens in it and truncated by the end of its time. `info` holds `is_success`,
     `event`, `episode_index` and `seed` (the episode's), and at the end `score` and the task's `details`.

@@ -20,7 +20,7 @@ class BhdSb3VecEnv(VecEnv):
     """A `BhdVectorEnv` as stable-baselines3's `VecEnv`: with 16 simulations a fifth of the time of 16 single ones.
 
     An episode that ended begins anew in the same step. Its last observation is in `infos[i]["terminal_observation"]`,
-    and `infos[i]["TimeLimit.truncated"]` says whether only its time was over, so that the learner adds the value of
+    and `infos[i]["TimeLimit.truncated"]` reports whether only its time was over, so that the learner adds the value of
     what would have come. `infos[i]["episode"]` holds the task's return `r` and the length `l` [frames]; besides there
     are `is_success`, `event` and `score`.
 

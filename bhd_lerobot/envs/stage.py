@@ -126,7 +126,7 @@ class Stage:
         return Seen(state, reported, images)
 
     def step(self, actions: NDArray[np.float64]) -> Stepped:
-        """Let one frame go by. Simulations whose episodes ended go on running until `rest` or `reset`.
+        """Let one frame go by. Simulations whose episodes ended continue running until `rest` or `reset`.
 
         Args:
             actions: of each robot, shape (n, a), finite and of single precision.

@@ -106,8 +106,8 @@ class EvalResult:
         report: the HTML report.
         missed: brains whose interval of success begins below `fail_below`.
         stopped_by: the signal that ended the run early, or None.
-        fault: why a real robot's fault ended the run, in words; None if none did.
-        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
+        fault: why a real robot's fault ended the run, as text; None if none did.
+        estop: what pressed the emergency stop that ended the run, as text; None if there was none.
     """
 
     output_dir: Path

@@ -33,7 +33,7 @@ class JerkMeasure:
         columns: of the actions.
         order: how often they are differentiated.
         unit: of the result.
-        what: in words.
+        what: as text.
     """
 
     columns: tuple[int, ...]
@@ -91,7 +91,7 @@ class EpisodeMetrics:
         watchdogs: frames in which a watchdog noticed something, by kind.
         estops: 1 if an emergency stop was latched in it, else 0.
         faults: 1 if a fault was latched in it, else 0.
-        problem: why the brain gave up, in words, if it did and says so.
+        problem: why the brain gave up, as text, if it did and says so.
         details: further numbers of the task.
         perception: how well the brain saw, see `assess`; empty if it does not see for itself.
         initial_state: a digest of the simulator's complete state at the start, the same for all brains; empty without a

@@ -185,7 +185,7 @@ def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def _draw_rows(axes: Axes, estimates: Mapping[str, Estimate], title: str, reference: float) -> None:
-    """Draw a row for each estimate: a mark, its interval, and the numbers in words."""
+    """Draw a row for each estimate: a mark, its interval, and the numbers as text."""
     if math.isfinite(reference):
         axes.axvline(reference, color=_FAINT, linestyle=(0, (4, 3)), linewidth=1.2, zorder=0)
     for row, one in enumerate(estimates.values()):

@@ -39,7 +39,7 @@ class Video:
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What a report is made of; `no_videos` says why there are none."""
+    """What a report is made of; `no_videos` reports why there are none."""
 
     config: EvalConfig
     results: EvalResults

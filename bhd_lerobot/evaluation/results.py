@@ -27,7 +27,7 @@ class BrainSummary:
 
     Attributes:
         brain: its name in the evaluation.
-        privileged: whether it acts on what no sensor tells: on the environment state that the task reports.
+        privileged: whether it acts on what no sensor measures: on the environment state that the task reports.
         episodes: how many it ran.
         successes: how many of them were a success.
         success: its success rate with its Wilson interval.

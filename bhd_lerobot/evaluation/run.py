@@ -66,7 +66,7 @@ class BrainRun:
 
     @property
     def is_privileged(self) -> bool:
-        """Whether the brain acts on what no sensor tells."""
+        """Whether the brain acts on what no sensor measures."""
         return is_privileged(self.loop.brain, self.loop.task.environment_names)
 
     def timing(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""An evaluation's numbers in words, for the terminal and for the report."""
+"""An evaluation's numbers as text, for the terminal and for the report."""
 
 import math
 
@@ -46,7 +46,7 @@ def sentences(results: EvalResults) -> list[str]:
 
 
 def verdict(pair: PairedSummary) -> str:
-    """Return whether a brain is better than the baseline, in words, by the intervals of success and of score."""
+    """Return whether a brain is better than the baseline, as text, by the intervals of success and of score."""
     rate = _direction(pair.success, "more often", "less often", "")
     score = _direction(pair.score, "a higher score", "a lower score", "")
     times = "" if math.isnan(pair.ratio.value) else f", {pair.ratio.value:.2f} times the mean"
@@ -66,7 +66,7 @@ def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:
 
 
 def perception_sentence(one: PerceptionSummary) -> str:
-    """Return the summary in words."""
+    """Return the summary as text."""
     chose = f"chose an object in {percent(one.chosen)} of {one.episodes} episodes"
     if one.chosen.value == 0:
         return chose

@@ -55,7 +55,7 @@ def push_command(root: Path, target: str, *, private: bool = False, tags: Sequen
 
 
 def left_by_interrupt(root: Path, again: str) -> str:
-    """Return what an interrupted push leaves, and how to go on."""
+    """Return what an interrupted push leaves, and how to continue."""
     return f"the dataset at {root} is unchanged. Go on with:\n  {again}"
 
 

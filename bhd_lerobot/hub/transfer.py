@@ -105,10 +105,10 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
     so that the process may end at any.
 
     Args:
-        stopped: what is left, and how to go on; printed if the process ends here, else by the code that
+        stopped: what is left, and how to continue; printed if the process ends here, else by the code that
             catches the `KeyboardInterrupt`.
     """
-    is_hosted = hasattr(sys, "ps1") or "ipykernel" in sys.modules  # by a shell or a notebook, which goes on
+    is_hosted = hasattr(sys, "ps1") or "ipykernel" in sys.modules  # by a shell or a notebook, which continues
     if is_hosted or threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""What every command line does alike: errors, exit statuses, Ctrl-C, a pipe that nobody reads, unknown options.
+"""What every command line does alike: errors, exit statuses, Ctrl-C, a pipe that nothing reads, unknown options.
 
 It imports nothing that takes time: a command begins with it.
 """
@@ -30,7 +30,7 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
     """Run a program, whose exit status may be None for 0; return the status.
 
     An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C prints
-    `interrupted` and gives 130, and the status is that of other programs where nobody reads what is printed, as of
+    `interrupted` and gives 130, and the status is that of other programs where nothing reads what is printed, as of
     ``| head -1``.
     """
     try:
@@ -38,7 +38,7 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
             return program() or 0
         finally:
             if sys.stdout is not None:
-                sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
+                sys.stdout.flush()  # a pipe that nothing reads shows now, not when Python ends
     except BhdError as error:
         print("\n  ".join([f"error: {error}", *getattr(error, "__notes__", ())]), file=sys.stderr)
         return FAILED
@@ -56,7 +56,7 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
 
 
 def _is_unread() -> bool:
-    """Return whether nobody reads standard output any more; then Python does not try to write it when it ends."""
+    """Return whether nothing reads standard output any more; then Python does not try to write it when it ends."""
     if sys.stdout is None:
         return False
     poll = select.poll()

@@ -282,7 +282,7 @@ def choices_of(kind: Any) -> dict[str, type]:
 
 
 def _cause(error: BaseException) -> BaseException:
-    """Return what says why a class could not be made; draccus only says that it could not."""
+    """Return what reports why a class could not be made; draccus only states that it could not."""
     while error.__cause__ is not None and "Couldn't instantiate" in str(error):
         error = error.__cause__
     return error

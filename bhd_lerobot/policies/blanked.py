@@ -76,7 +76,7 @@ class BlankedBrain:
 
     @property
     def uses_privileged_state(self) -> bool:
-        """Whether the brain uses what no sensor tells."""
+        """Whether the brain uses what no sensor measures."""
         return uses_privileged_state(self._brain)
 
     def bind(self, robot: RobotFeatures) -> None:

@@ -116,7 +116,7 @@ class Brain(Protocol):
 
     @property
     def uses_privileged_state(self) -> bool:
-        """Whether `act` uses the observation's `environment_state`, which no sensor tells. If not, it gets none."""
+        """Whether `act` uses the observation's `environment_state`, which no sensor measures. If not, it gets none."""
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot it will drive.
@@ -136,7 +136,7 @@ class Brain(Protocol):
         """
 
     def subtasks(self) -> Sequence[str]:
-        """Return what the brain is doing in each simulation, in words; of a brain that `has_plan`."""
+        """Return what the brain is doing in each simulation, as text; of a brain that `has_plan`."""
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
@@ -205,13 +205,13 @@ class Looking(Protocol):
 
 
 class Intervening(Protocol):
-    """A brain in which somebody sometimes takes over; what it says is about the frame that `act` decided last."""
+    """A brain in which someone sometimes takes over; what it says is about the frame that `act` decided last."""
 
     def interventions(self) -> NDArray[np.bool_]:
         """Return which robots are driven by the one who takes over, shape (n,)."""
 
     def causes(self) -> Sequence[str]:
-        """Return why, in words, of each simulation; empty without a takeover in this episode."""
+        """Return why, as text, of each simulation; empty without a takeover in this episode."""
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:

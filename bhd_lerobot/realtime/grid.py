@@ -7,7 +7,7 @@ from bhd_lerobot.errors import ConfigError
 
 @dataclass(frozen=True)
 class Slot:
-    """A tick that is to be run now.
+    """A tick to be run now.
 
     Attributes:
         index: its number on the grid.

@@ -38,7 +38,7 @@ class LoopLimits:
 
 
 Advance = Callable[[int], None]
-"""Lets the plant go on by a number of ticks."""
+"""Lets the plant continue by a number of ticks."""
 Serve = Callable[[int], None]
 """Answers requests of the bridge, at a time of the cerebellum [ns]."""
 Publish = Callable[[Slot, int, int, TickGrid], None]

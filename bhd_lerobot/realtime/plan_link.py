@@ -1,7 +1,7 @@
 """Planning in another process: requests and plans through shared memory.
 
 The cerebellum's side writes a request, and the planner's side writes the rows of the plan into one of two blocks, from
-which they are played where they lie. The request says which block may be written to: never the one that is played.
+which they are played where they lie. The request states which block may be written to: never the one that is played.
 """
 
 import logging

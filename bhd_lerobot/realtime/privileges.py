@@ -134,9 +134,9 @@ class RealtimeSettings:
         priority: priority under SCHED_FIFO, 1 to 99, larger is more urgent. The kernel's own interrupt threads have 50.
         lock_memory: keep all pages in memory, so that none has to be fetched within a tick.
         hold_cpu_latency: keep processors out of sleep states that take time to leave. Costs power.
-        freeze_collector: keep the garbage collector from running; reference counting goes on.
+        freeze_collector: keep the garbage collector from running; reference counting continues.
         affinity: processors to run on; those of the parent if empty.
-        require: raise an error where SCHED_FIFO is refused, instead of going on without it.
+        require: raise an error where SCHED_FIFO is refused, instead of continuing without it.
 
     Raises:
         ConfigError: the priority or a processor is not one that there is.
@@ -198,7 +198,7 @@ class Privileges:
         self._calls = calls or SystemCalls()
         self._undo = ExitStack()
         self.grants: list[Grant] = []
-        """What became of each request of `acquire`."""
+        """The outcome of each request of `acquire`."""
 
     def acquire(self, settings: RealtimeSettings) -> list[Grant]:
         """Request everything, each independently of the others.

@@ -173,7 +173,7 @@ class RequestClient:
         self._results: list[CommandResult] = []
 
     def request(self, request: Request) -> Reason:
-        """Ask for a change of mode, and return what became of it."""
+        """Ask for a change of mode, and return the outcome of it."""
         return Reason(int(self._ask(RequestKind.MODE, mode=request)["code"]))
 
     def submit(self, command: BrainCommand) -> CommandResult | None:

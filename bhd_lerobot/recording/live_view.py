@@ -80,7 +80,7 @@ class LiveView:
     - observation: the robot's floats by their names, but the scan, which is one array ``scan`` [m]; ``pose.…`` of the
       base or the tool at the start of the frame, in the world, from the simulator [m, quaternion wxyz];
       ``environment_state``; the columns ``control.…`` and ``next.reward`` as in the dataset; images;
-    - in Rerun also ``scan_points``, the scan as points in the robot's frame with ahead upwards, and ``mode`` in words.
+    - in Rerun also ``scan_points``, the scan as points in the robot's frame with ahead upwards, and ``mode`` as text.
 
     Attributes:
         shown: frames that were shown.
@@ -116,7 +116,7 @@ class LiveView:
     def _start(self, options: DisplayOptions) -> None:
         try:
             if options.display_mode == "rerun" and options.display_ip is not None:
-                # Rerun would go on looking for its viewer in silence.
+                # Rerun would continue looking for its viewer in silence.
                 socket.create_connection((options.display_ip, options.display_port or 0), _END_S).close()
             from bhd_lerobot.stock import visualization_utils as helpers
 
@@ -204,7 +204,7 @@ class LiveView:
 
 
 class RerunExtras:
-    """What only Rerun can show: the scan as points, the mode in words, views that put things side by side.
+    """What only Rerun can show: the scan as points, the mode as text, views that put things side by side.
 
     Args:
         cameras: the cameras.

@@ -87,7 +87,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
     if config.resume and not is_free(root):
         _keep_to(root, config.robot, console)
-    is_here = config.engine == "local"  # otherwise one simulation, which only says what is recorded
+    is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
     n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
@@ -229,7 +229,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
 
 
 def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task, brain: Brain) -> DatasetRecorder:
-    """Open the dataset that a configuration asks for, or go on with it."""
+    """Open the dataset that a configuration asks for, or continue with it."""
     nq, nv = (part.shape[1] for part in simulation.physics)
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(
@@ -283,7 +283,7 @@ def _judged_task(config: RecordConfig, robots: Host, console: Console) -> Task:
 
 
 def _keep_to(root: Path, robot: Any, console: Console) -> None:
-    """Go on as a dataset began that is older than the jerk limits."""
+    """Continue as a dataset began that is older than the jerk limits."""
     info = _info(root)
     recorded = info.recording.get("robot", {}) if info else {}
     if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
@@ -333,7 +333,7 @@ def _info(root: Path) -> DatasetSummary | None:
 
 
 def _check_expert(brain: Any) -> None:
-    """Raise if nobody says what an expert would do."""
+    """Raise if nobody states what an expert would do."""
     advice = getattr(brain, "gives_advice", None)
     if advice is None and brain.name != "learned":
         return  # a rule is its own expert

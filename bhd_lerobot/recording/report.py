@@ -33,13 +33,13 @@ class RecordResult:
         successes: how many of them were a success.
         outcomes: how many ended how.
         scores: their scores.
-        problems: why brains gave up, in words, of the episodes that were no success.
+        problems: why brains gave up, as text, of the episodes that were no success.
         frames: frames that this run added.
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
-        fault: why a real robot's fault ended the run, in words; None if none did.
-        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
+        fault: why a real robot's fault ended the run, as text; None if none did.
+        estop: what pressed the emergency stop that ended the run, as text; None if there was none.
     """
 
     root: Path
@@ -104,7 +104,7 @@ def print_refusals(simulation: Host, console: Console) -> None:
 
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
-    """Print what the run did; `video` says whether it left a video."""
+    """Print what the run did; `video` reports whether it left a video."""
     robot: Any = config.robot
     table = Table(title="Recorded", show_header=False, title_justify="left")
     table.add_row("dataset", f"{result.root} ({counted(result.episodes, 'episode')})")

@@ -91,7 +91,7 @@ class SimulatedRobotConfig(RobotConfig):
 
 @dataclass(kw_only=True)
 class MobileBaseConfig(SimulatedRobotConfig):
-    """Options of every base on two driven wheels with a lidar. A subclass says what it is made of, in `body`.
+    """Options of every base on two driven wheels with a lidar. A subclass states what it is made of, in `body`.
 
     Attributes:
         arena: where the robot is when it is used by itself: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``. In a

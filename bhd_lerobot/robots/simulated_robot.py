@@ -200,7 +200,7 @@ class SimulatedRobot(Robot):
             DeviceNotConnectedError: the robot is not connected.
             ActionError: a key is missing or unknown, or a value is not a finite number. Nothing happened.
             CommandRefusedError: the robot does not take commands in its present mode, after an emergency stop for
-                example. Time went on by a frame all the same: a robot that is stopping goes on stopping.
+                example. Time went on by a frame all the same: a robot that is stopping continues stopping.
         """
         simulation = self.simulation
         values = self.action_array(action)

@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Intervention:
-    """Frames `first` to `end` - 1, in which an expert or a person drove, and why, in words."""
+    """Frames `first` to `end` - 1, in which an expert or a person drove, and why, as text."""
 
     first: int
     end: int

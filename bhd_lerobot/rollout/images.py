@@ -1,4 +1,4 @@
-"""The images of running episodes: ordered when a frame begins, delivered while it goes on."""
+"""The images of running episodes: ordered when a frame begins, delivered while it runs."""
 
 from collections.abc import Callable, Mapping
 from concurrent import futures
@@ -28,7 +28,7 @@ class EpisodeImages:
     def order_all(self, observer: Observer | None, wanted: NDArray[np.bool_]) -> dict[str, Image]:
         """Order the images of the running simulations that anybody looks at; return those that are wanted.
 
-        A brain that does not use images does not wait for them: they are made while the frame goes on.
+        A brain that does not use images does not wait for them: they are made while the frame continues.
 
         Args:
             observer: is shown them, too.

@@ -27,7 +27,7 @@ class StopRequest:
 
     @property
     def exit_status(self) -> int:
-        """The exit status that says which signal ended the run, 0 if none did."""
+        """The exit status that states which signal ended the run, 0 if none did."""
         return 0 if self.signal is None else 128 + self.signal
 
 

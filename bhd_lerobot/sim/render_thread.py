@@ -1,4 +1,4 @@
-"""Images made while the simulation goes on."""
+"""Images made while the simulation continues."""
 
 import queue
 from collections.abc import Callable

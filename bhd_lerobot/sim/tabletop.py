@@ -37,7 +37,7 @@ class _Form(NamedTuple):
 
 
 class Tabletop:
-    """Lays the tables of a world's simulations, and says what lies where and what touches what.
+    """Lays the tables of a world's simulations, and states what lies where and what touches what.
 
     Flags and the tool's pose are of the last physics step's beginning, like every reading of a sensor; `World.forward`
     brings them up to date.

@@ -64,7 +64,7 @@ _WARNING_COUNT = 1  # the last axis of Batch.warning: last info, count
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that decides how simulations go on: restoring it continues bit-exactly.
+    """Everything that decides how simulations continue: restoring it continues bit-exactly.
 
     Attributes:
         state: MuJoCo's integration state, shape (k, nstate).
@@ -266,7 +266,7 @@ class World:
             )
 
     def snapshot(self, ids: Ids = None) -> Snapshot:
-        """Return a copy of everything that decides how simulations go on."""
+        """Return a copy of everything that decides how simulations continue."""
         ids = self.selected(ids)
         fields = {name: values[ids].copy() for name, values in self._fields.items()}
         return Snapshot(self._batch.state[ids].copy(), fields, self._constants)

@@ -106,7 +106,7 @@ class AvoidTask(BaseTask):
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
         """Return `TRAIL` if the configuration asks for it, shape (n, 128); else nothing, shape (n, 0).
 
-        `config.report` says what is wrong with the pose that it is drawn around; which cells were visited is true.
+        `config.report` states what is wrong with the pose that it is drawn around; which cells were visited is true.
         """
         if not self.config.trail:
             return np.zeros((len(truth.touched), 0))

@@ -41,7 +41,7 @@ class NavigateConfig(TaskConfig):
         hold_s: time that the robot must be there and at rest [s].
         stuck_path_m: a path shorter than this in `stuck_time_s` means stuck [m].
         stuck_time_s: see `stuck_path_m` [s].
-        report: what is wrong with what the task tells of the goal.
+        report: what is wrong with what the task reports of the goal.
     """
 
     arena: str = "random"

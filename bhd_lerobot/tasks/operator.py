@@ -1,4 +1,4 @@
-"""A task whose episodes a person judges, because the robot cannot tell what became of them."""
+"""A task whose episodes a person judges, because the robot cannot tell the outcome of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from bhd_lerobot.tasks.task import Event, Outcome, Task
 class OperatorTask:
     """A task in front of a real robot that does not measure what the task is judged by.
 
-    An episode ends when a person says how (`bhd_lerobot.rollout.marks`), or when its time is over. The brain is told
+    An episode ends when a person states how (`bhd_lerobot.rollout.marks`), or when its time is over. The brain is told
     nothing of the scene, and there is no reward. What the task asks for stays the same.
 
     Args:

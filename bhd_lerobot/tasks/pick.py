@@ -70,11 +70,11 @@ class PickConfig(TaskConfig):
         names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
             ``"held_out"``, where it is asked for one of these four.
         objects: ``"known"``; or ``"unseen"``: smaller and larger than those, of another style and of other shades.
-        order: of the objects in what the task tells: ``"target"``: the target first, then the nearest to it; or
+        order: of the objects in what the task reports: ``"target"``: the target first, then the nearest to it; or
             ``"random"``, where only the column `target` tells which it is.
         swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
-        report: what is wrong with what the task tells of the objects.
+        report: what is wrong with what the task reports of the objects.
     """
 
     duration_s: float = 20.0
@@ -208,7 +208,7 @@ class PickTask(ArmTask):
         Unless `config.order` is `random`, the first is the target; the others follow, at the start the nearest to it
         first. Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
-        places without one. `config.report` says what is wrong with it.
+        places without one. `config.report` states what is wrong with it.
         """
         state = self._fixed.copy()
         state[self._present, 3:10] = truth.object_poses[self._present]

@@ -41,7 +41,7 @@ class ReachConfig(TaskConfig):
         hold_s: time that the tool must stay there [s].
         start_spread_rad: every joint starts at home plus or minus up to this [rad].
         randomisation: how much one episode's world differs from the next.
-        report: what is wrong with what the task tells of the target.
+        report: what is wrong with what the task reports of the target.
     """
 
     duration_s: float = 10.0
@@ -114,7 +114,7 @@ class ReachTask(ArmTask):
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7).
 
-        `config.report` says what is wrong with it.
+        `config.report` states what is wrong with it.
         """
         reported = self._target.copy()
         reported[:, :3] += self._camera_error

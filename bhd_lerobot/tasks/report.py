@@ -1,4 +1,4 @@
-"""What may be wrong with what a task tells a brain: noise, delay and gaps, as of a real robot's tracker."""
+"""What may be wrong with what a task reports a brain: noise, delay and gaps, as of a real robot's tracker."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _MOST_NOISE_M, _LONGEST_DELAY_S = 100.0, 3600.0  # what no tracker is worse than
 
 @dataclass
 class ReportConfig:
-    """What is wrong with what the task tells; nothing by default: then it is the truth.
+    """What is wrong with what the task reports; nothing by default: then it is the truth.
 
     Attributes:
         noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame, at most 100 [m].

@@ -61,7 +61,7 @@ OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, 
 
 
 def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
-    """Return what an episode can end with, by name, whoever says so.
+    """Return what an episode can end with, by name, whatever ended it.
 
     Args:
         task: the task's type; None if it is not known.
@@ -181,7 +181,7 @@ class Task(Protocol):
     def privileged_state(self) -> NDArray[np.float64]:
         """Return what decides an outcome and no brain is told, numbers around 1, shape (n, any); for a critic.
 
-        How much time is left is not among it: an episode whose time is over is truncated, and its value goes on.
+        How much time is left is not among it: an episode whose time is over is truncated, and its value continues.
         """
 
     def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

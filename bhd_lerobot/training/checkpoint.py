@@ -67,7 +67,7 @@ def clean(output_dir: Path) -> None:
 
 
 def resume_command(checkpoint: Path) -> str:
-    """Return the command that goes on from a run's last checkpoint."""
+    """Return the command that continues from a run's last checkpoint."""
     last = checkpoint.parent / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / "train_config.json"
     return f"bhd-train --resume=true --config_path={quoted(last)}"
 

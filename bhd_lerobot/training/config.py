@@ -30,9 +30,9 @@ class SelectionConfig:
         outcome: episodes that ended so: `all`, or events that an episode can end with, such as `success`.
         min_score: episodes with at least this score, 0 to 1; any if nothing.
         exclude_late: leave out episodes with more late frames than their recording tolerated.
-        intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
+        intervention_weight: how often frames in which someone intervened are drawn, compared with others; 0 drops
             them.
-        learner_weight: how often frames are drawn that a learner drove while somebody could have intervened, compared
+        learner_weight: how often frames are drawn that a learner drove while someone could have intervened, compared
             with others; 0 drops them: what is learned is what the expert did.
         expert_action: learn what the expert would have done in every frame, `expert.action`, in place of what was done.
         hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,

@@ -30,7 +30,7 @@ class TrainingData:
         frames: samples in an epoch.
         episodes: number of episodes that are learned from.
         held_out_episodes: those that are not, by number.
-        how: how the batches are served, in words.
+        how: how the batches are served, as text.
     """
 
     train: Loader

@@ -38,7 +38,7 @@ class EnvEvaluation:
         self._before, self._after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
 
     def run(self, step: int) -> Row:
-        """Evaluate after a step; the training goes on as if that had not happened.
+        """Evaluate after a step; the training continues as if that had not happened.
 
         Returns:
             `success` [%], `sum_reward` and `eval_s`, the time that it took [s].

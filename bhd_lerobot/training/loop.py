@@ -125,7 +125,7 @@ class TrainingLoop:
         }
 
     def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
-        """Go on after `step` steps."""
+        """Continue after `step` steps."""
         if state.get("frames", self.options.frames) != self.options.frames:
             raise BhdError(
                 f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "

@@ -29,7 +29,7 @@ class RunOutput:
     def __init__(
         self, config: BhdTrainConfig, parts: TrainingParts, step: int, *, is_main: bool = True, processes: int = 1
     ) -> None:
-        """Open the folder, with the metrics up to the step that a resumed run goes on from."""
+        """Open the folder, with the metrics up to the step that a resumed run continues from."""
         self.folder, self.checkpoint = Path(str(config.output_dir)), config.checkpoint_path
         policy: Any = config.policy
         if is_main and policy is not None and (policy.push_to_hub or config.save_checkpoint_to_hub):
@@ -74,7 +74,7 @@ class RunOutput:
             self._wandb.log_policy(self.checkpoint)
 
     def draw(self, step: int) -> None:
-        """Draw the curve. Where that fails, what was learned is worth more than its image: the run goes on."""
+        """Draw the curve. Where that fails, what was learned is worth more than its image: the run continues."""
         if self._metrics is None or self._drawn == (step, len(self._metrics.rows)):
             return
         config = self._config

@@ -208,7 +208,7 @@ _NAMED = 20  # parameters that a message names
 
 
 def fit_camera(policy: Any, loader: Loader, prepare: Callable[[Batch], Batch], *, processes: int) -> str:
-    """Let a policy find out where its camera stands; return what it found, in words. The loader stays where it is."""
+    """Let a policy find out where its camera stands; return what it found, as text. The loader stays where it is."""
     if not hasattr(policy, "fit_camera"):
         raise ConfigError(
             f"fine_tune_camera is true, but a {policy.config.type!r} does not know where its camera stands; a "

@@ -100,7 +100,7 @@ class Learner:
         """Return the mean loss over samples that are not learned from.
 
         Dropout is off, and what a policy draws, it draws from `seed`: the same in every evaluation, and the training
-        goes on as if there had been none.
+        continues as if there had been none.
         """
         device = self._accelerator.device
         total, count = torch.zeros((), dtype=torch.float64, device=device), 0

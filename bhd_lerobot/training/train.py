@@ -39,7 +39,7 @@ from bhd_lerobot.training.summary import print_start, print_summary
 
 @dataclass
 class TrainResult:
-    """What became of a training run.
+    """The outcome of a training run.
 
     Attributes:
         output_dir: the run's folder.

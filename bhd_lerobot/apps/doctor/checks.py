@@ -374,7 +374,7 @@ def check_plugins(outcome: Outcome) -> list[Finding]:
 
 
 def check_opengl(outcome: Outcome) -> list[Finding]:
-    """Judge what became of `trials.render`."""
+    """Judge the outcome of `trials.render`."""
     if outcome.kind in ("crash", "timeout"):
         return [wrong("opengl.crash", outcome.error, error=_error(outcome))]
     if outcome.kind == "error":
@@ -386,7 +386,7 @@ def check_opengl(outcome: Outcome) -> list[Finding]:
 
 
 def check_ffmpeg(outcome: Outcome) -> list[Finding]:
-    """Judge what became of `trials.encode`."""
+    """Judge the outcome of `trials.encode`."""
     if outcome.kind != "value" or outcome.value["bytes"] == 0:
         return [wrong("ffmpeg", "no video", error=_error(outcome) or "it wrote nothing")]
     found = outcome.value
@@ -510,7 +510,7 @@ def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) ->
     """Compare a measurement with what robots need: its latest wake-up, because one is enough to stop a robot.
 
     Args:
-        outcome: what became of `latency_test.measure`.
+        outcome: the outcome of `latency_test.measure`.
         robots: control rate of each [Hz].
         timeout_s: how long a plant waits for a command [s].
     """

@@ -1,4 +1,4 @@
-"""`bhd-doctor`: can this machine do what the package needs, and if not, what is to be done."""
+"""`bhd-doctor`: can this machine do what the package needs, and if not, what to do."""
 
 import argparse
 import json
@@ -95,7 +95,7 @@ def _print_latency(measured: dict[str, Any], console: Console) -> None:
     most = max(measured["histogram"])
     edges = [*(f"≤ {edge} µs" for edge in measured["bins_us"]), "later"]
     for upper, count in zip(edges, measured["histogram"], strict=True):
-        # Any wake-up is to be seen, be it one in a million.
+        # Any wake-up is visible, be it one in a million.
         bar = "█" * max(round(40 * count / most), int(count > 0))
         console.print(f"{upper:>10} {count:>8} {bar}", highlight=False)
 
@@ -111,7 +111,7 @@ def examine_and_print(options: argparse.Namespace, run: RunTrials) -> int:
     with Console(stderr=True).status("Checking this machine; half a minute …"):
         if options.realtime:
             _check_options(options.rate, options.seconds)
-            # First, while nothing else goes on.
+            # First, while nothing else continues.
             [tested] = run([["latency test", options.rate, options.seconds]], options.seconds + 60.0)
             measured = tested.value
         findings = examine(root, run)

@@ -72,7 +72,7 @@ def measure(rate: int, seconds: float) -> dict[str, Any]:
         seconds: length of the measurement [s].
 
     Returns:
-        The values of `summarise`, and `grants`, what became of each request for privileges.
+        The values of `summarise`, and `grants`, the outcome of each request for privileges.
     """
     points, period_ns = max(1, round(rate * seconds)), round(1e9 / rate)
     with Privileges() as privileges:

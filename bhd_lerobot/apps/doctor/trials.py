@@ -101,7 +101,7 @@ def main(trials: Sequence[str]) -> None:
 
 
 def ask_rights() -> list[dict[str, Any]]:
-    """Ask for real-time privileges; return what became of each request, as the fields of a `Grant`."""
+    """Ask for real-time privileges; return the outcome of each request, as the fields of a `Grant`."""
     with Privileges() as privileges:
         return [grant.as_dict() for grant in privileges.acquire(RealtimeSettings())]
 

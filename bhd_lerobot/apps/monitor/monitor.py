@@ -131,7 +131,7 @@ class Keys:
 def watch(
     sampler: Sampler, show: Callable[[MonitorState], None], keys: Keys, period_s: float, end: float
 ) -> str | None:
-    """Show states until the user leaves, time is up, or the robot ends; return in words how it ended, or None.
+    """Show states until the user leaves, time is up, or the robot ends; return as text how it ended, or None.
 
     Args:
         sampler: where states come from.

@@ -185,7 +185,7 @@ class Sampler:
         self._spreads: tuple[Spread | None, Spread | None] = (None, None)
 
     def end(self) -> str | None:
-        """Return in words how the robot ended, ``"ended"`` if that was in order, or None if it still runs."""
+        """Return as text how the robot ended, ``"ended"`` if that was in order, or None if it still runs."""
         words = self._block.words
         if words[Word.PHASE] == Phase.ENDED:
             # The brain's process asks for both; a loop that finds itself alone has at most one of them.

@@ -119,7 +119,7 @@ def _spread(label: str, spread: Spread | None) -> Text:
 
 
 def bars(histogram: Sequence[int]) -> str:
-    """Return a histogram as a line of bars, whose heights are logarithmic: one tick in a million is to be seen."""
+    """Return a histogram as a line of bars, whose heights are logarithmic: one tick in a million is visible."""
     most = max(histogram, default=0)
     if most < 1:
         return " " * len(histogram)

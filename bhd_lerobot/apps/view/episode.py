@@ -77,7 +77,7 @@ def _not_finite(values: NDArray) -> int:
 
 
 def _bands(table: pa.Table, fps: float) -> list[dict[str, Any]]:
-    """Return what was going on, in words: for every text column its runs of equal text."""
+    """Return what was continuing, as text: for every text column its runs of equal text."""
     bands = []
     for key in table.column_names:
         if pa.types.is_string(table[key].type) or pa.types.is_large_string(table[key].type):

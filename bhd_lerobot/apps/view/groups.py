@@ -77,7 +77,7 @@ def unit_of(name: str, robot: str | None) -> str:
 def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str | None) -> list[dict[str, Any]]:
     """Return what is plotted: sections with a title, each a list of plots, each a list of lines.
 
-    A line has a label and says which number of which column it is; ``applied`` marks the command that was carried out
+    A line has a label and states which number of which column it is; ``applied`` marks the command that was carried out
     beside the requested one.
 
     Args:

@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> int:
-    """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that says which."""
+    """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that states which."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port is {port}; it must be between 0 and 65535. 0 takes any that is free.")
     try:

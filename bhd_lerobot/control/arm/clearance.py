@@ -10,7 +10,7 @@ from bhd_lerobot.control.geometry.collision import CollisionModel
 
 Array = NDArray[np.float64]
 
-_LOOKS = 2  # a frame: between two, an arm goes on at the speed that the first permitted
+_LOOKS = 2  # a frame: between two, an arm continues at the speed that the first permitted
 _SAMPLES = 4
 _TIMES = (np.arange(1, _SAMPLES + 1) / _SAMPLES)[:, None, None]  # of a stop at which distances are checked
 # An arm that approaches has to stay so much further away than the least distance, for each metre that it needs to stop:
@@ -142,7 +142,7 @@ class SetpointClearance:
         return shares
 
     def _ways(self, velocity: Array, speed: Array) -> tuple[Array, Array, Array]:
-        """Return how far joints turn that go on until the next check, and then stop.
+        """Return how far joints turn that continue until the next check, and then stop.
 
         Args:
             velocity: of the joints [rad/s], shape (k, dof).

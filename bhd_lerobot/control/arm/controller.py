@@ -350,7 +350,7 @@ class ArmController(Controller):
         self.velocity[ids] = self.acceleration[ids] = 0.0
 
     def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Go on from the posture that the arms are in; what they grip is not let go of."""
+        """Continue from the posture that the arms are in; what they grip is not let go of."""
         opening = self.command[ids, -1]
         self.configure(ids, reading)
         self.command[ids, -1] = self.actuators[ids, -1] = opening
@@ -465,7 +465,7 @@ class _Trail:
         """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`.
 
         What it hit may have thrown it back: it was then also away from its reference. One that has gone back already
-        goes on from there.
+        continues from there.
         """
         ages = np.arange(self._gone_back[sim], len(self._rows))
         rows = self._rows[(self._count[sim] - 1 - ages) % len(self._rows), sim]

@@ -26,7 +26,7 @@ _LEAST_TORQUE = 10.0  # [N m] where no joint feels more, nothing is estimated: 1
 
 
 class ForceLimit:
-    """Estimates the forces on the tools of n arms, and says which are too large.
+    """Estimates the forces on the tools of n arms, and states which are too large.
 
     The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs. A force
     elsewhere on the arm counts with the force on the tool that would load the joints alike: half-way to the tool, about
@@ -110,7 +110,7 @@ class ForceLimit:
         return bool(np.count_nonzero(self.exceeded))
 
     def explain(self) -> str:
-        """Return in words which force was too large."""
+        """Return as text which force was too large."""
         if (self._hung >= self._most_hung).any():
             return (
                 f"About {self._load + self._pull.max() / _GRAVITY:.1f} kg hang on the tool, or it presses upwards; "

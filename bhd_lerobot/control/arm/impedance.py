@@ -167,7 +167,7 @@ class ImpedanceController(Controller):
             self._held |= mask
 
     def go_back(self, mask: NDArray[np.bool_], actuators: Array, rate: Array) -> None:
-        """Put the equilibrium where the tool is, and go on from the torques that the motors have."""
+        """Put the equilibrium where the tool is, and continue from the torques that the motors have."""
         ids = np.flatnonzero(mask)
         self.actuators[ids] = actuators[ids]
         self.equilibrium.place_opening(ids, actuators[ids, -1])

@@ -1,4 +1,4 @@
-"""Keeps bases from driving into what their scans show, whoever commands them."""
+"""Keeps bases from driving into what their scans show, whatever commands them."""
 
 import math
 
@@ -124,7 +124,7 @@ class CollisionMonitor:
         """Take away speed and yaw rate, in place.
 
         Args:
-            twist: forward speeds [m/s] and yaw rates [rad/s] that are to be applied, shape (n, 2).
+            twist: forward speeds [m/s] and yaw rates [rad/s] to be applied, shape (n, 2).
             before: what was applied a tick ago, shape (n, 2).
             pose: x, y [m] and yaw [rad] of the bases now, by odometry, shape (n, 3).
 

@@ -88,7 +88,7 @@ class BaseController(Controller):
         self._asked, self._position = np.zeros((n, self.joints)), np.zeros((n, self.joints))
         self._least_turn = _LEAST_SPEED * self._look_ticks / control_hz
         self._stalls = np.zeros((n, self.joints), np.int64)
-        # How far the gyroscope says that the bases turned since the last look, and looks that found otherwise.
+        # How far the gyroscope states that the bases turned since the last look, and looks that found otherwise.
         self._turned, self._contradictions = np.zeros(n), np.zeros(n, np.int64)
         self._any_stopped = False
         self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)

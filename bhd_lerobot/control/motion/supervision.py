@@ -22,10 +22,10 @@ GRIPPING_S = 1.5  # [s] after its trajectory's end that a gripper may take to ar
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the goal of one simulation.
+    """The outcome of the goal of one simulation.
 
     Attributes:
-        message: in words, with the offending value and the limit.
+        message: as text, with the offending value and the limit.
     """
 
     sim: int

@@ -39,7 +39,7 @@ class PlanFailure:
 
     Attributes:
         code: the result that the goal ends in.
-        message: what is wrong, in words, with the offending value and the valid ones.
+        message: what is wrong, as text, with the offending value and the valid ones.
     """
 
     code: ResultCode

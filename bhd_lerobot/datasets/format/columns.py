@@ -63,7 +63,7 @@ def in_order(table: pa.Table, rows: Sequence[Row], path: Path) -> pa.Table:
 
 
 def wrong_number(table: pa.Table, wanted: Mapping[str, NDArray[np.int64]]) -> str:
-    """Return the first number that is not what it has to be, in words; empty if all are."""
+    """Return the first number that is not what it has to be, as text; empty if all are."""
     frames = len(wanted["index"])
     if len(table) != frames:
         return f"it has {len(table)} frames; its episodes have {frames}"

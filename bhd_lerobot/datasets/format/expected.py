@@ -1,6 +1,6 @@
 """Checks of the columns of a dataset's Parquet files, on which all readers rely.
 
-Every function returns what is wrong, in words; an empty text if nothing is.
+Every function returns what is wrong, as text; an empty text if nothing is.
 """
 
 import math

@@ -138,7 +138,7 @@ def _vector(dtype: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 def meaning_of(key: str, feature: dict[str, Any]) -> str:
-    """Return what a column holds, in words; the names of a vector where there is nothing better."""
+    """Return what a column holds, as text; the names of a vector where there is nothing better."""
     if key in SCALARS:
         return SCALARS[key][1]
     if key in _LEROBOT_COLUMNS:

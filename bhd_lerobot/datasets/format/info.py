@@ -125,7 +125,7 @@ def shown(value: object, *, quoted: bool = True) -> str:
 
 
 def kind_of(value: object) -> str:
-    """Return what a JSON value is, in words."""
+    """Return what a JSON value is, as text."""
     names = {dict: "an object", list: "a list", str: "text", bool: "a truth value", int: "a number", float: "a number"}
     return names.get(type(value), "nothing")
 

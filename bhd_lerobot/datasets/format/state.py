@@ -123,7 +123,7 @@ def corrupt(path: Path, reason: object) -> DatasetError:
 
 
 def repair_with_info(root: Path) -> str:
-    """Return what to do if `info.json` cannot be used, in words."""
+    """Return what to do if `info.json` cannot be used, as text."""
     return (
         "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and "
         f"cameras, whose counts do not matter: `bhd-data repair {quoted(root)} --info OTHER`. Nothing was changed."

@@ -43,7 +43,7 @@ class Loader:
         return self.order.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state_dict` was taken.
+        """Continue where `state_dict` was taken.
 
         Raises:
             ConfigError: the state is of another dataset.
@@ -60,7 +60,7 @@ class Loader:
     def _place(self, batch: Batch) -> Batch:
         if self.device is None:
             return batch
-        # From page-locked memory a GPU copies while the program goes on.
+        # From page-locked memory a GPU copies while the program continues.
         pin = self.device.type == "cuda"
         return {
             key: (value.pin_memory() if pin else value).to(self.device, non_blocking=pin)

@@ -24,7 +24,7 @@ class LoaderConfig:
         episodes: indices of the episodes to choose from; None means all.
         selection: which of these episodes; None means all.
         intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them.
-        learner_weight: how often frames are drawn in which nobody intervened though somebody could have: those that a
+        learner_weight: how often frames are drawn in which nobody intervened though someone could have: those that a
             learner drove; 0 drops them.
             Held-out samples are not weighted.
         expert_action: serve what the expert would have done, `expert.action`, as `action`.

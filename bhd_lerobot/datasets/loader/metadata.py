@@ -43,7 +43,7 @@ class Metadata(LeRobotDatasetMetadata):
                 with pq.ParquetFile(path) as file:
                     names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
                     table = file.read(columns=names, use_threads=False).replace_schema_metadata(None)
-                # The first says which columns there are, and of which types, as LeRobot has it: merged datasets may
+                # The first states which columns there are, and of which types, as LeRobot has it: merged datasets may
                 # have them in another order in every file.
                 tables.append(table_cast(table, tables[0].schema) if tables else table)
             except UNREADABLE as error:

@@ -22,7 +22,7 @@ class BatchOrder:
     them, and with several ranks the last ones are filled from the beginning of the epoch, so that all ranks have
     equally many of the same size.
 
-    Starting a new iteration while one is under way goes on with the next epoch.
+    Starting a new iteration while one is under way continues with the next epoch.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class BatchOrder:
         return {"epoch": self._epoch, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state that `state_dict` returned; the next iteration starts there."""
+        """Continue from a state that `state_dict` returned; the next iteration starts there."""
         epoch, position = int(state["epoch"]), int(state["position"])
         if epoch < 0 or not 0 <= position <= len(self.samples):
             raise ConfigError(

@@ -184,8 +184,8 @@ def frame_weights(
     Args:
         meta: the dataset.
         episodes: the selected episodes; None means all.
-        intervention: of frames in which somebody intervened; 0 drops them.
-        learner: of the other frames of episodes in which somebody could intervene; 0 drops them. All others have 1.
+        intervention: of frames in which someone intervened; 0 drops them.
+        learner: of the other frames of episodes in which someone could intervene; 0 drops them. All others have 1.
 
     Returns:
         Shape (N,), float32, in the order of the samples; None if all are drawn equally often.

@@ -30,7 +30,7 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
     if not (root / layout.INFO).is_file():
         found = "has no meta/info.json" if root.is_dir() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}. Record one with bhd-record.")
-    load_info(root)  # says what is wrong with it, which LeRobot does not
+    load_info(root)  # states what is wrong with it, which LeRobot does not
     from bhd_lerobot.datasets.loader.metadata import Metadata  # seconds to import
 
     return checked(Metadata(root.name, root=root))
@@ -145,7 +145,7 @@ class FrameTable:
         return {key: column[rows] for key, column in self.columns.items()}
 
     def place(self, row: int) -> str:
-        """Return in words which episode and frame a row is."""
+        """Return as text which episode and frame a row is."""
         return f"episode {int(self.columns['episode_index'][row])}, frame {int(self.columns['frame_index'][row])}"
 
     def _index_episodes(self) -> None:

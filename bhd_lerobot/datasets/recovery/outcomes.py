@@ -117,7 +117,7 @@ def _ended_with(episode: FoundEpisode) -> str | None:
 
 
 def _episodes(numbers: Sequence[int]) -> str:
-    """Return numbers in order in words: a range where there is no hole."""
+    """Return numbers in order as text: a range where there is no hole."""
     if len(numbers) > 2 and list(numbers) == list(range(numbers[0], numbers[-1] + 1)):
         return f"episodes {numbers[0]} to {numbers[-1]}"
     return f"episode{'s' if len(numbers) > 1 else ''} {few([str(number) for number in numbers], 8)}"

@@ -124,7 +124,7 @@ class FoundEpisode:
 class Videos:
     """Videos and loose frames below a root.
 
-    Where a row of ``meta/episodes`` is left, it says where the episode is. Episodes without one come after those with
+    Where a row of ``meta/episodes`` is left, it states where the episode is. Episodes without one come after those with
     one, in videos of their own; these hold whole episodes in the order of their numbers, one after the other, so their
     lengths say where each is. Where that does not come out even, no episode gets a video that may be another's.
     """
@@ -166,7 +166,7 @@ class Videos:
         """Return each episode once, and how many of those without a row have videos at known places.
 
         An episode whose save failed and that was recorded again is stored twice under one number. The last one counts.
-        No file says whether a video shows the first one, too.
+        No file reports whether a video shows the first one, too.
         """
         last = {episode.number: episode for episode in found}
         once = [episode for episode in found if last[episode.number] is episode]

@@ -132,12 +132,12 @@ def total(items: Iterable[Item | RemoteFile]) -> int:
 
 
 def megabytes(size: int) -> str:
-    """Return a number of bytes in words."""
+    """Return a number of bytes as text."""
     return f"{size / 1e6:.1f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
 
 
 def listed(names: Iterable[str], at_most: int = 3) -> str:
-    """Return some names in words, and how many more there are."""
+    """Return some names as text, and how many more there are."""
     names = sorted(names)
     more = f" and {len(names) - at_most} more" if len(names) > at_most else ""
     return f"{', '.join(names[:at_most])}{more}"

@@ -42,7 +42,7 @@ class PullReport:
     """What a pull did: files that were fetched, and those that were there already (`kept`).
 
     `episodes` are those that were chosen, now or before, None if none were; `is_whole` says whether all files are there
-    nevertheless. `problem` says why the dataset is not valid, as it is not where it came from either.
+    nevertheless. `problem` reports why the dataset is not valid, as it is not where it came from either.
     """
 
     root: Path

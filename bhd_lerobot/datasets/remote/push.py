@@ -47,7 +47,7 @@ type MakeCard = Callable[[DatasetState, bool], Card]
 class PushReport:
     """What a push did: files that were sent, there already (`kept`), removed there, and not sent (`left_out`).
 
-    `kept_card` says whether a card there that was not generated is left as it is.
+    `kept_card` reports whether a card there that was not generated is left as it is.
     """
 
     name: str

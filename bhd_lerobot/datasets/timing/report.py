@@ -196,7 +196,7 @@ def quantiles(values: NDArray) -> dict[str, float]:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """Return episodes in words: "episode 3", or "episodes 0-4, 7"."""
+    """Return episodes as text: "episode 3", or "episodes 0-4, 7"."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
         if parts and number == parts[-1][1] + 1:

@@ -51,7 +51,7 @@ class StepCheck:
         step[starts[1:] - 1] = 0.0  # from one episode to the next
         for first in quaternion_columns(names_of(self._features[key])):
             part = slice(first, first + 4)
-            # The nearer of two signs is the other one: the orientation goes on, its numbers do not.
+            # The nearer of two signs is the other one: the orientation continues, its numbers do not.
             flips = (step[:, part] ** 2).sum(axis=1) > 2.0
             if flips.any():
                 name = name_of(self._features[key], first).removesuffix(".pos").removesuffix("_qw")

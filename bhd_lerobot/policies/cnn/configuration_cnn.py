@@ -26,7 +26,7 @@ class CnnConfig(MlpConfig):
 
     It is a ``bhd_mlp``, whose options it has, that looks at images in place of a range finder. To act it needs the
     camera and the wheels' odometry. The beams of a range finder are needed to learn, never to act: of every image the
-    network also says how far away things are in the directions that it shows. Of the last `n_obs_steps` images it
+    network also states how far away things are in the directions that it shows. Of the last `n_obs_steps` images it
     keeps this in mind, so that it knows about things that the camera does not show any more.
 
     Attributes:

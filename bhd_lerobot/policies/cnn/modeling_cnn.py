@@ -1,7 +1,7 @@
 """`bhd_cnn`: from a base's last images and its odometry to a chunk of actions.
 
 A camera shows a part of what is around a robot, and what is beside it has left the image when it matters. So the
-network says of every image how far away things are in the directions that it shows, which a range finder taught it.
+network predicts of every image how far away things are in the directions that it shows, which a range finder taught it.
 Odometry tells from where each image was taken: all of them together give the nearest thing in every direction around
 the robot, as far as it has looked there. That and the present image are what actions depend on.
 """

@@ -13,7 +13,7 @@ from bhd_lerobot.policies.trained_steps import Pipelines, Stats, TrainedStep, ma
 OBS_ODOMETRY = "observation.bhd_odometry"
 """Key of x [m], y [m] and yaw [rad] as they were measured, beside the normalised `observation.state`."""
 OBS_RANGES = "observation.bhd_ranges"
-"""Key of the ranges [m] that are to be learned; no input."""
+"""Key of the ranges [m] to be learned; no input."""
 
 
 @ProcessorStepRegistry.register(name="bhd_odometry_processor")

@@ -115,7 +115,7 @@ class DaggerBrain:
 
     @property
     def uses_privileged_state(self) -> bool:
-        """Whether learner or expert uses what no sensor tells."""
+        """Whether learner or expert uses what no sensor measures."""
         return uses_privileged_state(self.learner) or uses_privileged_state(self.expert)
 
     def bind(self, robot: RobotFeatures) -> None:
@@ -177,7 +177,7 @@ class DaggerBrain:
         return self._goals is None
 
     def advice(self) -> Array | None:
-        """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whoever drives.
+        """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whatever drives.
 
         None for an expert that gives goals.
         """
@@ -192,7 +192,7 @@ class DaggerBrain:
         return tuple(self._causes)
 
     def subtasks(self) -> Sequence[str]:
-        """Return what the expert is doing, in words, where it drives."""
+        """Return what the expert is doing, as text, where it drives."""
         texts = self._goals.subtasks() if self._goals else self.expert.subtasks()
         return [text if taken else LEARNER_DRIVES for text, taken in zip(texts, self._shown, strict=True)]
 

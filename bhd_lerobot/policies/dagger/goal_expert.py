@@ -1,4 +1,4 @@
-"""An expert that gives goals, started in the middle of an episode, from whatever state somebody else left."""
+"""An expert that gives goals, started in the middle of an episode, from whatever state someone else left."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -44,7 +44,7 @@ class _Turn:
     """How far the expert is in one simulation.
 
     Attributes:
-        own: what is to be done before it begins, in order.
+        own: what to do before it begins, in order.
         pending: name of the goal of ours that is under way.
         raw: that of the expert's last goal, as the expert calls it.
         is_first: whether that is the first since it began.
@@ -70,7 +70,7 @@ class _Turn:
 
 
 class GoalExpert:
-    """Lets a brain that gives goals take over, as often as somebody asks.
+    """Lets a brain that gives goals take over, as often as someone asks.
 
     Before it begins, an arm with objects around it comes to rest and gets out of what it is among: it opens the gripper
     and goes straight up; what it holds, if that is what the task is about, it raises. From an odd posture, and where
@@ -118,7 +118,7 @@ class GoalExpert:
         self._turns[sim] = _Turn(turn.number + 1, is_new=True, seed=turn.seed, instruction=turn.instruction)
 
     def subtasks(self) -> Sequence[str]:
-        """Return what is being done, in words."""
+        """Return what is being done, as text."""
         return [turn.doing or text for turn, text in zip(self._turns, self.brain.subtasks(), strict=True)]
 
     def act(self, seen: Observation, driving: NDArray[np.bool_]) -> dict[int, list[BrainCommand]]:
@@ -202,7 +202,7 @@ class GoalExpert:
     # --- getting out of where it is -----------------------------------------------------------------------------------
 
     def _before(self, sim: int, seen: Observation) -> list[str]:
-        """Return what is to be done before the expert begins."""
+        """Return what to do before the expert begins."""
         if self._objects is None or seen.environment_state is None:
             return []  # nothing stands in the way; reaching a target needs no more room than a goal keeps
         q = seen.state[sim, self._joints]

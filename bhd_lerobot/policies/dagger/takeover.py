@@ -29,7 +29,7 @@ class Watch(Protocol):
     """Checks what a learner does in each frame of its turns."""
 
     cause: str
-    """What it finds, in words."""
+    """What it finds, as text."""
 
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
         """Begin the learner's turn in some of n simulations; what remembers nothing does nothing."""

@@ -70,7 +70,7 @@ class LanguageBrain(PickBrain):
     """Finds the object that an instruction means by its name and its place, and carries the instruction out.
 
     It does not use which object the task marks. An instruction that it does not understand, or that fits no object
-    or several, is not carried out: its subtask says why.
+    or several, is not carried out: its subtask reports why.
 
     With `config.perception` it uses nothing that the task tells. It looks once before it moves; that the camera lives
     it sees by the arm, which has moved before the tool goes down; and after a grasp that failed it goes home and looks

@@ -34,7 +34,7 @@ class LearnedBrainConfig(BrainConfig):
         device: where it runs: `cpu`, `cuda`, …
         n_action_steps: how many actions of a chunk are carried out before it looks again; as it was trained if nothing.
         sample: draw actions from a Gaussian policy instead of taking its mean.
-        stream: give whole chunks, which go on while the policy thinks: for `clock = realtime`, where it is slow.
+        stream: give whole chunks, which continue while the policy thinks: for `clock = realtime`, where it is slow.
         exact: infer for every simulation by itself: the bits are those of LeRobot's own evaluation however many run
             side by side; slower.
         threads: threads for torch on the CPU; if nothing, one for small networks and torch's own choice for others.
@@ -274,7 +274,7 @@ class LearnedBrain(ConfiguredBrain):
         self._next[ids] = 0
 
     def _stream(self, running: NDArray[np.intp]) -> Chunk:
-        """Return what is left of every simulation's chunk; the shorter ones go on with their last action."""
+        """Return what is left of every simulation's chunk; the shorter ones continue with their last action."""
         length = self._chunks.shape[1]
         columns = np.minimum(self._next[:, None] + np.arange(length), length - 1)
         left = np.take_along_axis(self._chunks, columns[..., None], axis=1)

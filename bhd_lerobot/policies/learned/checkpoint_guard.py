@@ -78,7 +78,7 @@ def _register_steps(config_class: type) -> None:
     module = config_class.__module__.replace("configuration_", "processor_")
     try:
         importlib.import_module(module)
-    except ImportError:  # it has none, or needs a package that is not installed; loading says which
+    except ImportError:  # it has none, or needs a package that is not installed; loading states which
         return
 
 

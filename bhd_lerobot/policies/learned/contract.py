@@ -64,7 +64,7 @@ class PolicyContract:
 
     @property
     def is_known(self) -> bool:
-        """Whether it says which features the policy takes and gives; if not, only their shapes can be checked."""
+        """Whether it states which features the policy takes and gives; if not, only their shapes can be checked."""
         return self.observation_names is not None or self.action_names is not None
 
     @classmethod

@@ -113,7 +113,7 @@ def _check_device(option: str, device: str) -> None:
 def _load(folder: Path, config: Any, device: str) -> tuple[Any, Any, Any]:
     """Return policy, in evaluation mode, and processors."""
     try:
-        # LeRobot prints where it loads from, and without `strict` it would go on with weights that are not there.
+        # LeRobot prints where it loads from, and without `strict` it would continue with weights that are not there.
         with contextlib.redirect_stdout(io.StringIO()):
             policy = get_policy_class(config.type).from_pretrained(str(folder), config=config, strict=True)
         before, after = make_pre_post_processors(

@@ -53,7 +53,7 @@ class GoalBrain(ConfiguredBrain, ABC):
 
     Attributes:
         config: the parameters.
-        doing: what each simulation's brain is doing, in words; recorded as the column `subtask`.
+        doing: what each simulation's brain is doing, as text; recorded as the column `subtask`.
 
     Args:
         config: the parameters.
@@ -112,7 +112,7 @@ class GoalBrain(ConfiguredBrain, ABC):
         return Goals(commands)
 
     def subtasks(self) -> Sequence[str]:
-        """Return what each simulation's brain is doing, in words."""
+        """Return what each simulation's brain is doing, as text."""
         return self.doing
 
     def new_id(self, sim: int, step: str) -> str:

@@ -1,7 +1,7 @@
 """Position-based servoing: what the tool is to do next, from nothing but where it is and where the objects are.
 
 The brains `reach` and `pick` give goals, each of which is planned once. These give a tool pose in every frame, whatever
-brought the arm where it is: what they would do is known in states that somebody else got the arm into, so that a policy
+brought the arm where it is: what they would do is known in states that someone else got the arm into, so that a policy
 can learn it there (`dataset.expert_action`). They remember nothing, so a network without a memory can learn all of it.
 """
 

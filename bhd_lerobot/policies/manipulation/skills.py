@@ -28,7 +28,7 @@ class Skill(StrEnum):
     HAND_OVER = "hand_over"
 
     def text(self, name: str = "object") -> str:
-        """Return what the skill does, in words, with the object of that name."""
+        """Return what the skill does, as text, with the object of that name."""
         return _TEXTS[self].format(name)
 
 
@@ -103,7 +103,7 @@ class PlanStep:
     Attributes:
         skill: what to do.
         object: index of the object to do it with; None: the one that the plan is about.
-        text: the same in words.
+        text: the same as text.
     """
 
     skill: Skill

@@ -114,7 +114,7 @@ class MlpConfig(TrainedConfig):
             the same name: where a robot is to go next is near where it is. Not for what is opened and closed at once,
             such as a gripper: a small error in each frame would add up.
         residual_columns: of each action the column of `observation.state`, -1 for none; found by their names.
-        sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the
+        sort_objects: sort the objects that a task reports (`object_0_present`, …): what is meant first, then the
             nearest to it. Their order in the observation is then of no account. Where the robot observes its tool pose,
             it also sees where what is meant is from there.
         objects: where they are in `observation.environment_state`: first column, how many, how many numbers each, and

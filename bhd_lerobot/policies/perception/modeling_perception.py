@@ -1,4 +1,4 @@
-"""`bhd_perception`: a small convolutional network that says what stands where on the table, and how sure it is.
+"""`bhd_perception`: a small convolutional network that states what stands where on the table, and how sure it is.
 
 On a grid of cells of the image, each cell says whether an object's centre is near, and where that centre is in the base
 frame: the point of the table that the cell shows where the camera was not moved, plus what the network adds. What it
@@ -267,7 +267,7 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def fit_camera(self, batches: Sequence[dict[str, Tensor]]) -> str:
-        """Find where the camera stands now, look from there, and return what was found, in words."""
+        """Find where the camera stands now, look from there, and return what was found, as text."""
         self.eval()
         config, before = self.config, self.config.view
         for _ in range(_FITS):
@@ -359,7 +359,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         return features, {**answers, "colour": colour.movedim(1, -1)}
 
     def places(self, answers: Mapping[str, Tensor]) -> Tensor:
-        """Return where every cell says that the object near it is, in the base frame [m], shape (batch, h, w, 3)."""
+        """Return where every cell states that the object near it is, in the base frame [m], shape (batch, h, w, 3)."""
         return self._plane + _SHIFT * answers["shift"]
 
     def _found(self, answers: Mapping[str, Tensor], factor: float) -> list[Detections]:

@@ -99,7 +99,7 @@ class PixelsConfig(PerceptionConfig):
         return {self.image_key: [FIRST]}
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are, and find what is to be ignored by its name."""
+        """Check that the dataset states where objects are, and find what is to be ignored by its name."""
         super().set_dataset_feature_metadata(features)
         self.find_columns(features)
         names = names_of(features, OBS_STATE)

@@ -59,7 +59,7 @@ class Hardware(Plant):
     """Passes calls on to a plant, and takes what it raises or what is not a number for a fault of the robot.
 
     Attributes:
-        problem: what it raised in the control loop, in words; empty if nothing.
+        problem: what it raised in the control loop, as text; empty if nothing.
         is_muted: whether commands are dropped, because the loop only warms up.
 
     Args:
@@ -138,7 +138,7 @@ class Hardware(Plant):
             self.problem = ""  # it may have been over in a moment
 
     def not_ready(self, reading: PlantReading) -> str:
-        """Return in words why the robot cannot be driven now; nothing if it can."""
+        """Return as text why the robot cannot be driven now; nothing if it can."""
         self.read(reading)
         age = self._clock() - int(self._stamp_ns[0])
         if self.problem:
@@ -175,7 +175,7 @@ class Hardware(Plant):
         out.safety[:] = SafetyStatus.NORMAL  # if the plant does not say otherwise
         try:
             self._plant.read(out)
-        except Exception as error:  # of another package's code: the loop goes on, and stops the robot
+        except Exception as error:  # of another package's code: the loop continues, and stops the robot
             self._fail(error)
         if out.stamp_ns is not self._stamp_ns:
             self._stamp_ns[:] = 0 if out.stamp_ns is None else out.stamp_ns
@@ -213,7 +213,7 @@ class Hardware(Plant):
     def _try(self, call: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return call(*arguments)
-        except Exception as error:  # of another package's code: the loop goes on, and stops the robot
+        except Exception as error:  # of another package's code: the loop continues, and stops the robot
             self._fail(error)
             return None
 

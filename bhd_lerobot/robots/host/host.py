@@ -41,13 +41,13 @@ class FrameReport:
 
     Attributes:
         applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
-        sent: what became of the setpoints that the frame began with.
+        sent: the outcome of the setpoints that the frame began with.
         limits: `Limit` flags, shape (n,).
         watchdog: `Watchdog` flags, shape (n,).
         command_age_ns: age of the command in force at the end of the frame [ns], shape (n,).
         mode: `Mode` at the end of the frame, shape (n,).
         results: how goals ended, or were refused, during the frame, by simulation.
-        refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
+        refusals: as text why setpoints were refused, by simulation, where a `Reason` does not say it all.
         effort: torques of the joints at the end of the frame [N m], force of a gripper [N], shape (n, joints).
         wrench: what the surroundings put on the tools, likewise, see `Controller.contact_wrench`.
         live: the `LiveFrame` of a robot on the wall clock.
@@ -73,7 +73,7 @@ class Receipt:
     """What was accepted of a command, of n robots.
 
     Attributes:
-        refusals: why setpoints were refused, in words, by simulation, where a `Reason` does not say it all.
+        refusals: why setpoints were refused, as text, by simulation, where a `Reason` does not say it all.
     """
 
     sent: SendResult
@@ -94,7 +94,7 @@ class Host(ABC):
     """n robots of one kind: what they observe, how they act, goals and modes. It needs no world.
 
     Each is in an episode of its own, which nothing outside it can change: not the number of the others, not what they
-    do. A subclass says what is observed; a simulation adds a world, see `bhd_lerobot.robots.host.simulation`.
+    do. A subclass states what is observed; a simulation adds a world, see `bhd_lerobot.robots.host.simulation`.
 
     Args:
         config: the robot's configuration.
@@ -335,7 +335,7 @@ class Host(ABC):
 
     @property
     def problem(self) -> str:
-        """Why robots were last stopped by a fault, in words; empty if that is not known."""
+        """Why robots were last stopped by a fault, as text; empty if that is not known."""
         return self.cerebellum.readings.problem
 
     def statistics(self) -> TimingStatistics:
@@ -389,7 +389,7 @@ class Host(ABC):
         return
 
     def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
-        """Return what a camera of one robot sees now, as an image to come; the robots may go on meanwhile.
+        """Return what a camera of one robot sees now, as an image to come; the robots may continue meanwhile.
 
         Args:
             sim: the robot.

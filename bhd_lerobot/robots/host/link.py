@@ -43,7 +43,7 @@ class LiveLink:
     Attributes:
         bridge_side: this process's ends of the queues for requests and goals.
         grants: what the real-time process was granted or refused, as plain values.
-        problem: what was wrong with a plant in FAULT when the loop last stood still, in words.
+        problem: what was wrong with a plant in FAULT when the loop last stood still, as text.
 
     Args:
         mirror: a host like the one that is to run; this process's image of the robot.

@@ -220,7 +220,7 @@ class LiveProcess:
             self._words[Word.END] = 1
 
     def _may_stand(self) -> bool:
-        """Bring a robot that goes on without the loop to rest; return whether it is."""
+        """Bring a robot that continues without the loop to rest; return whether it is."""
         cerebellum = self._host.cerebellum
         mode = cerebellum.mode[0]
         if mode in (Mode.HOLD, Mode.TRACKING):

@@ -333,7 +333,7 @@ class LiveHost(Host):
 
     @property
     def problem(self) -> str:
-        """What was wrong with the plant in its last fault, or which watchdog noticed something, in words."""
+        """What was wrong with the plant in its last fault, or which watchdog noticed something, as text."""
         noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._watchdog)
         return self.link.problem or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
 

@@ -80,7 +80,7 @@ class RemoteSimulation(Simulation):
         return self._own.touches
 
     def advance(self) -> None:
-        """Take the newest state of the plant, which goes on by itself."""
+        """Take the newest state of the plant, which continues by itself."""
         state = self.remote.refresh()
         if state is None or state is self._taken:
             return

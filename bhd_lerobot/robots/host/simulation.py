@@ -58,7 +58,7 @@ class Simulation(Host):
         """Put robots into scenes, at rest at their start; `reset` does that and starts an episode."""
 
     def privileged_state(self) -> NDArray[np.float64]:
-        """Return what is true and no sensor tells, numbers around 1, shape (n, any); for a critic."""
+        """Return what is true and no sensor measures, numbers around 1, shape (n, any); for a critic."""
         return np.zeros((self.n, 0))
 
     def _started(self, ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
@@ -115,7 +115,7 @@ class Simulation(Host):
             self._render_thread = RenderThread(self.world, self.config.camera_width, self.config.camera_height)
 
     def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
-        """Return what a camera of one robot sees now, as an image to come; the simulation may go on meanwhile.
+        """Return what a camera of one robot sees now, as an image to come; the simulation may continue meanwhile.
 
         Args:
             sim: the robot.

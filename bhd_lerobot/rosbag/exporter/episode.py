@@ -67,7 +67,7 @@ class ExportOptions:
 
 
 class EpisodeTopics:
-    """Makes the topics of a dataset's episodes; the clock goes on from one to the next."""
+    """Makes the topics of a dataset's episodes; the clock continues from one to the next."""
 
     def __init__(self, state: DatasetState, view: views.RobotView, repo_id: str, options: ExportOptions) -> None:
         self._state, self._view, self._repo_id, self._options = state, view, repo_id, options

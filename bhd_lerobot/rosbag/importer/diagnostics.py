@@ -22,7 +22,7 @@ _SAME = (0.5, 2.0)  # ratio of a speed to that of the pose: wheels slip
 
 
 def pace(received: Times, stamps: Times) -> float:
-    """Return by how many seconds the headers of a topic go on in a second of the recorder; 1 if that is not known.
+    """Return by how many seconds the headers of a topic continue in a second of the recorder; 1 if that is not known.
 
     Args:
         received: when the recorder got the messages [ns], shape (n,), in the order in which they were written.

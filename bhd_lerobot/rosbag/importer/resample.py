@@ -104,7 +104,7 @@ def newest(times: Times, at: Times) -> NDArray[np.intp]:
 def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: int, why: str = "start") -> list[Grid]:
     """Return the frames of the episodes that some sensors allow.
 
-    An episode goes on as long as every sensor was received within the last `max_gap_ns`. Frames at its end that only
+    An episode continues as long as every sensor was received within the last `max_gap_ns`. Frames at its end that only
     have readings older than `max_age_ns` are left out.
 
     Args:

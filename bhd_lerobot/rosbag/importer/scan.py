@@ -12,7 +12,7 @@ from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
 GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
-_MOST = 1.5 * 2 * np.pi  # [rad] of a scan; drivers go on a little after a whole turn, and nothing turns twice
+_MOST = 1.5 * 2 * np.pi  # [rad] of a scan; drivers continue a little after a whole turn, and nothing turns twice
 _WIDEST = np.radians(10.0)  # between a beam of ours and the one it is made of; a few beams are no view all around
 
 

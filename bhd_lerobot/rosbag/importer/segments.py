@@ -23,7 +23,7 @@ Wheels slip, times of reception jitter by some messages, and a filter corrects w
 
 
 class Segment(NamedTuple):
-    """A part of a bag through which an episode can go on, if nothing is silent: places in the bag's order.
+    """A part of a bag through which an episode can continue, if nothing is silent: places in the bag's order.
 
     Attributes:
         first, end: the first message's place, and that of the first one after it.
@@ -80,7 +80,7 @@ def _cut(parts: list[Segment], places: Mapping[int, str]) -> list[Segment]:
 
 
 def _restarts(track: Track, stamps: Times, parts: list[Segment], notes: list[str]) -> list[int]:
-    """Return where the clock of a topic's headers begins anew though the recorder's goes on.
+    """Return where the clock of a topic's headers begins anew though the recorder's continues.
 
     So it is when a simulation is restarted. Two clocks in one topic, or stamps that are sometimes unset, go back all
     the time: that is no restart.

@@ -240,5 +240,5 @@ def _scans(topic: Topic, scans: Sequence[Any], reading: _Reading) -> Array:
 
 
 def seconds(nanoseconds: int) -> str:
-    """Return a time in words."""
+    """Return a time as text."""
     return f"{nanoseconds / NANO:.2f} s"

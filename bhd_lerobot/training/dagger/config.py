@@ -57,7 +57,7 @@ class AggregationConfig:
         evaluation: a configuration of `bhd-eval`; of it robot and task are used, for the curve over the rounds.
         data: folders of datasets that were recorded before, of the same robot and task; every round learns from them,
             too.
-        output_dir: where everything goes; the same command goes on there with what is not done yet.
+        output_dir: where everything goes; the same command continues there with what is not done yet.
         rounds: rounds after the first.
         expert_episodes: that the expert drives alone.
         episodes: that the policy of the last round drives in each further round.

@@ -67,7 +67,7 @@ class RlEnvConfig:
 
 @dataclass
 class RlPolicyConfig:
-    """Actor and critic. The actor is a `bhd_mlp`; with `start_from` the checkpoint says which.
+    """Actor and critic. The actor is a `bhd_mlp`; with `start_from` the checkpoint states which.
 
     Attributes:
         n_obs_steps: observations that it looks at; a checkpoint's actor with `see_history` only.
@@ -204,7 +204,7 @@ class RlConfig:
             checkpoint sees the last one; it begins as if it saw that only.
         critic_warmup: environment steps in which only the critic learns.
         output_dir: folder of the run; a new one in `outputs/train` if nothing.
-        resume: go on with the run in `output_dir`.
+        resume: continue with the run in `output_dir`.
         seed: of everything that is random.
         threads: threads of torch; its own choice if nothing.
     """

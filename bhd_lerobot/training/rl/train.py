@@ -34,7 +34,7 @@ from bhd_lerobot.training.rl.validation import Validation, level
 
 @dataclass
 class RlResult:
-    """What became of a run.
+    """The outcome of a run.
 
     Attributes:
         output_dir: the run's folder.
