@@ -1,4 +1,4 @@
-"""Episodes on their way through a cluster: who has them, and the outcome of them."""
+"""Episodes on their way through a cluster: who has them, and their outcome."""
 
 import pickle
 from collections import deque

@@ -1,4 +1,4 @@
-"""A task whose episodes a person judges, because the robot cannot tell the outcome of them."""
+"""A task whose episodes a person judges, because the robot cannot tell their outcome."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""The goals of one arm and the outcome of them: which wait, which is followed, and the results."""
+"""The goals of one arm and their outcome: which wait, which is followed, and the results."""
 
 from collections import deque
 from collections.abc import Callable

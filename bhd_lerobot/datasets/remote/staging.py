@@ -21,7 +21,7 @@ _OURS = {_MARKER, SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout
 
 
 class Staging:
-    """A folder beside a dataset; `is_new` reports whether."""
+    """A folder beside a dataset; `is_new` is whether it was made now."""
 
     def __init__(self, root: Path) -> None:
         """Make the folder, or take up that of an attempt before."""
