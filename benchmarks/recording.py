@@ -5,13 +5,11 @@ shows medians. Both datasets are read back through stock LeRobot and compared va
 episode has a camera as well, and LeRobot encodes while it records, with the same codec and options.
 """
 
-import argparse
 import contextlib
 import gc
 import io
 import logging
 import shutil
-import statistics
 import sys
 import tempfile
 from collections.abc import Callable
@@ -23,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from benchmarks._report import Report, parse_options
 from benchmarks._turns import in_turns, seconds
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.video import VideoSettings
@@ -31,6 +30,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 FPS = 10
 STATE = 362
 CAMERA = "observation.images.front"
+LEROBOT = "LeRobot add_frame + save_episode + finalize"
 PYARROW = "pyarrow alone, write_table as it comes"
 PYARROW_PLAIN = "pyarrow alone, without dictionaries"
 METADATA = {"seed": 1, "outcome": "success", "score": 0.5, "brain": "avoidance"}
@@ -157,12 +157,7 @@ def check(root: Path, data: list, camera_frames: np.ndarray | None) -> None:
 
 def main() -> int:
     """Run all of them in turns and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--length", type=int, default=300)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--video", action="store_true", help="add a 320 x 240 camera")
-    arguments = parser.parse_args()
+    arguments = parse_options(__doc__, episodes=20, length=300, repeats=5, video=(False, "add a 320 x 240 camera"))
     data = episodes(arguments.episodes, arguments.length)
     camera_frames = images(arguments.length, (240, 320)) if arguments.video else None
     settings = VideoSettings()
@@ -170,11 +165,9 @@ def main() -> int:
 
     plain = {"use_dictionary": False}
     contestants: dict[str, Callable[[Path], None]] = {
-        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(
-            root, data, camera_frames, settings
-        ),
         "ours, set_columns": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=False),
         "ours, add_frame": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=True),
+        LEROBOT: lambda root: record_with_lerobot(root, data, camera_frames, settings),
     }
     if camera_frames is None:
         contestants[PYARROW] = lambda root: write_with_pyarrow(root, data, {})
@@ -197,15 +190,11 @@ def main() -> int:
 
     times = in_turns({name: partial(run, name) for name in contestants}, arguments.repeats)
     frames = arguments.episodes * arguments.length
-    rates = {name: frames / statistics.median(took) for name, took in times.items()}
-    shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
-    print(f"{shape}{', camera 320x240' if camera_frames is not None else ''}; median of {arguments.repeats}")
-    references = {"x LeRobot": next(iter(rates)), "x pyarrow": PYARROW, "x pyarrow plain": PYARROW_PLAIN}
-    print(f"{'':44} {'frames/s':>10} {'ms/episode':>11}" + "".join(f"{title:>17}" for title in references))
-    for name, rate in rates.items():
-        shares = [f"{rate / rates[other]:17.2f}" if other in rates else f"{'-':>17}" for other in references.values()]
-        print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f}" + "".join(shares))
-    return 0
+    speeds = {name: [frames / one for one in took] for name, took in times.items()}
+    report = Report(f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats")
+    what = "recording, camera 320x240" if arguments.video else "recording"
+    report.compare(what, "frames/s", speeds, [name for name in speeds if "ours" not in name], form=",.0f")
+    return report.end(arguments.json)
 
 
 if __name__ == "__main__":
