@@ -47,6 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
                     run.make(table.sections[name], name, table, kept)
                 except FailedError as error:
                     failed.append(f"{name}: {error}")
+                except KeyboardInterrupt:
+                    print("Stopped. The same command goes on with what is not done yet.", file=sys.stderr)
+                    return 130
                 _write(table, kept)  # what takes hours may be stopped
     missed = _write(table, kept)
     print("\n".join(failed), file=sys.stderr, end="\n" if failed else "")
