@@ -1,10 +1,8 @@
 """Measurements that take turns, in a few numbers: what the benchmarks share."""
 
-import json
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 
@@ -55,13 +53,6 @@ def shown(found: Mapping[str, float], form: str = ".2f") -> str:
     return f"{found['median']:{form}} ({found['low']:{form}} to {found['high']:{form}})"
 
 
-def write(path: Path | None, results: Any) -> None:
-    """Write results as JSON, if a file was named."""
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-
-
 GOAL_MISSED = 3
 """Exit status of a benchmark that ran and missed a goal. After an exception it is 1; with wrong options, and where
 nothing could be measured, 2."""
@@ -70,9 +61,3 @@ nothing could be measured, 2."""
 def status(*, met: bool) -> int:
     """Return the exit status of a benchmark that ran: 0, or `GOAL_MISSED`."""
     return 0 if met else GOAL_MISSED
-
-
-def verdict(*, met: bool) -> int:
-    """Print whether the goals were met; return the exit status."""
-    print("goals met" if met else "GOAL MISSED")
-    return status(met=met)

@@ -4,16 +4,12 @@ Success of reach, of pick without and with domain randomisation, and of the lang
 causes of failure. Exits with 3 if a goal is missed.
 """
 
-import argparse
 import json
 import sys
 import time
-from collections import Counter
-from dataclasses import dataclass
 
-from benchmarks._episodes import add_options, run, seeds_of
-from benchmarks._turns import verdict
-from bhd_lerobot.evaluation.statistics import wilson
+from benchmarks._episodes import add_success, parse_episodes, run
+from benchmarks._report import Report
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
@@ -29,68 +25,36 @@ SIDE_BY_SIDE = 32
 _FPS = UR5Config().fps
 
 
-@dataclass
-class Case:
-    """One row of the table.
-
-    Attributes:
-        name: its name.
-        task: what is to be achieved.
-        brain: what drives the arms.
-        goal: smallest share of successes.
-    """
-
-    name: str
-    task: Task
-    brain: Brain
-    goal: float
-
-
-def cases(n: int) -> list[Case]:
-    """Return what is measured, with n simulations side by side."""
-    wild = RandomisationConfig(enabled=True)
-    pick, wild_pick = PickTask(PickConfig(), n, _FPS), PickTask(PickConfig(randomisation=wild), n, _FPS)
-    spoken = PickTask(PickConfig(language="any"), n, _FPS)
-    return [
-        Case("reach", ReachTask(ReachConfig(), n, _FPS), ReachBrain(), 0.998),
-        Case("pick", pick, PickBrain(), 0.98),
-        Case("pick, randomised", wild_pick, PickBrain(), 0.95),
-        Case("pick, by language", spoken, LanguageBrain(), 0.98),
-    ]
+def cases(n: int) -> dict[str, tuple[Task, Brain, float]]:
+    """Return the task, the brain and the least share of successes of each case, with n simulations side by side."""
+    wild = PickConfig(randomisation=RandomisationConfig(enabled=True))
+    return {
+        "reach": (ReachTask(ReachConfig(), n, _FPS), ReachBrain(), 0.998),
+        "pick": (PickTask(PickConfig(), n, _FPS), PickBrain(), 0.98),
+        "pick, randomised": (PickTask(wild, n, _FPS), PickBrain(), 0.95),
+        "pick, by language": (PickTask(PickConfig(language="any"), n, _FPS), LanguageBrain(), 0.98),
+    }
 
 
 def main() -> int:
     """Run the cases, print the table, return 0 if every goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_options(parser, 1000)
-    parser.add_argument("--case", help="only the cases whose name holds this")
-    args = parser.parse_args()
-    seeds = seeds_of(args)
-    print(f"{args.episodes} {args.split} episodes, seed {args.seed}\n")
-    print(f"{'':20}{'success':>9}{'95 %':>20}{'goal':>8}{'mean time':>11}{'real time':>11}  failures")
-    missed = False
+    args, seeds = parse_episodes(__doc__, 1000, case=("", "only the cases whose name holds this"))
+    report = Report(f"{args.episodes} {args.split} episodes, seed {args.seed}")
     n = min(SIDE_BY_SIDE, len(seeds))
-    for case in cases(n):
-        if args.case and args.case not in case.name:
+    for name, (task, brain, goal) in cases(n).items():
+        if args.case not in name:
             continue
         started = time.perf_counter()
-        episodes = run(UR5Simulation(UR5Config(), n), case.task, case.brain, seeds)
+        episodes = run(UR5Simulation(UR5Config(), n), task, brain, seeds)
         took = time.perf_counter() - started
-        good = sum(episode.outcome.success for episode in episodes)
-        rate = wilson(good, len(episodes))
-        causes = Counter(episode.outcome.event.cause for episode in episodes if not episode.outcome.success)
+        add_success(report, name, [episode.outcome for episode in episodes], goal)
         seconds = sum(episode.frames for episode in episodes) / _FPS
-        by_cause = ", ".join(f"{cause} {count}" for cause, count in causes.most_common()) or "none"
-        print(
-            f"{case.name:20}{rate.value:>9.2%}{f'{rate.low:.2%} to {rate.high:.2%}':>20}{case.goal:>8.1%}"
-            f"{seconds / len(episodes):>9.2f} s{seconds / took:>9.0f} x  {by_cause}"
-        )
+        report.add(f"{name}: mean time; times real time", f"{seconds / len(episodes):.2f} s; {seconds / took:.0f} x")
         for episode in episodes:
             if not episode.outcome.success:
                 why = episode.plan.get("problem") or [end.message for _, end in episode.results if not end.success]
-                print(f"    episode {episode.spec.index}: {episode.outcome.event.cause}; {json.dumps(why)}")
-        missed |= good / len(episodes) < case.goal
-    return verdict(met=not missed)
+                print(f"{name}, episode {episode.spec.index}: {episode.outcome.event.cause}; {json.dumps(why)}")
+    return report.end(args.json)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ messages, serialised already, into a file, and reads them without decoding them:
 library. They run in turns; the first of each is not counted.
 """
 
-import argparse
 import shutil
 import sys
 import tempfile
@@ -19,7 +18,8 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from benchmarks._turns import in_turns, rates, ratios, shown, spread, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns, rates
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.cli.data.export import robot_view
 from bhd_lerobot.datasets.format import features as keys
@@ -90,12 +90,7 @@ def import_bag(bag: Path, root: Path) -> None:
 
 def main() -> int:
     """Print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--frames", type=int, default=600, help="of an episode")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args()
+    options = parse_options(__doc__, episodes=10, frames=(600, "of an episode"), turns=5)
     view, how = robot_view("turtlebot3"), ExportOptions(one_bag=True)
     with tempfile.TemporaryDirectory() as folder:
         root, bag, back, file = (Path(folder) / name for name in ("data", "bag", "back", "bare.mcap"))
@@ -105,8 +100,8 @@ def main() -> int:
         schemas, messages = bare_read(bag / "bag.mcap")
         works: dict[str, Callable[[], object]] = {
             "export": lambda: export_bags(root, bag, view=view, options=how),
-            "bare_write": lambda: bare_write(file, schemas, messages),
-            "bare_read": lambda: bare_read(file),
+            "bare mcap write": lambda: bare_write(file, schemas, messages),
+            "bare mcap read": lambda: bare_read(file),
             "import": lambda: import_bag(bag, back),
         }
         made = {"export": bag, "import": back}
@@ -118,21 +113,11 @@ def main() -> int:
 
         parts = {name: partial(anew, name, run) for name, run in rates(works, len(messages)).items()}
         speeds = in_turns(parts, options.turns)
-    peers = {"export": "bare_write", "import": "bare_read"}
-    results: dict[str, Any] = {
-        "messages": len(messages),
-        "megabytes": size / 1e6,
-        "messages_per_s": {name: spread(values) for name, values in speeds.items()},
-        "of_the_bare_library": {name: spread(ratios(speeds[name], speeds[peer])) for name, peer in peers.items()},
-    }
-    write(options.json, results)
-    print(f"{len(messages):,} messages, {size / 1e6:.1f} MB")
-    for name, peer in peers.items():
-        print(
-            f"{name:8s} {shown(results['messages_per_s'][name], ',.0f')} messages/s; {peer} of the mcap library "
-            f"{results['messages_per_s'][peer]['median']:,.0f}: ratio {shown(results['of_the_bare_library'][name])}"
-        )
-    return 0
+    report = Report(f"{len(messages):,} messages, {size / 1e6:.1f} MB; messages of the mcap library are not decoded")
+    for name, peer in (("export", "bare mcap write"), ("import", "bare mcap read")):
+        pair = {f"bhd-data {name}": speeds[name], peer: speeds[peer]}
+        report.compare(name, "messages/s", pair, [peer], form=",.0f")
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

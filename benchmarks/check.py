@@ -5,7 +5,6 @@ of action, LeRobot's index columns), beside reading the same files with Arrow an
 turns; the first of each is not counted.
 """
 
-import argparse
 import sys
 import tempfile
 from functools import partial
@@ -14,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from benchmarks._turns import in_turns, rates, ratios, shown, spread, status, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns, rates, spread
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
@@ -68,33 +68,18 @@ def check(root: Path) -> None:
 
 def main() -> int:
     """Print what was measured; return 3 if the goal was missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--frames", type=int, default=500, help="of an episode")
-    parser.add_argument("--turns", type=int, default=7)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args()
+    options = parse_options(__doc__, episodes=1000, frames=(500, "of an episode"), turns=7)
     total = options.episodes * options.frames
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "data"
         record(root, options.episodes, options.frames)
-        works = {"check": partial(check, root), "read": partial(read, root)}
+        works = {"bhd-data check": partial(check, root), "reading alone": partial(read, root)}
         speeds = in_turns(rates(works, total), options.turns)
-    speed, share = spread(speeds["check"]), spread(ratios(speeds["check"], speeds["read"]))
-    results = {
-        "episodes": options.episodes,
-        "frames": total,
-        "frames_per_s": speed,
-        "of_reading_alone": share,
-        "goal": GOAL,
-        "met": speed["median"] >= GOAL,
-    }
-    write(options.json, results)
-    print(
-        f"{options.episodes} episodes, {total:,} frames: {shown(speed, ',.0f')} frames/s, goal {GOAL:,.0f}; "
-        f"{shown(share)} of the speed of reading alone"
-    )
-    return status(met=results["met"])
+    report = Report(f"{options.episodes} episodes, {total:,} frames")
+    report.compare("validation", "frames/s", speeds, ["reading alone"], form=",.0f")
+    speed = spread(speeds["bhd-data check"])["median"]
+    report.add("bhd-data check: frames/s", f"{speed:,.0f}", f"at least {GOAL:,.0f}", met=speed >= GOAL)
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,7 @@ workers are kept: what is measured is recording, from handing out the first epis
 start costs is printed beside it. They run in turns; the first turn is not counted.
 """
 
-import argparse
 import os
-import statistics
 import sys
 import tempfile
 import time
@@ -20,7 +18,8 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 from rich.console import Console
 
-from benchmarks._turns import in_turns, ratios, shown, spread, status, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns, shown, spread
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.cluster.pool import WorkerPool
@@ -82,12 +81,7 @@ def record(config: RecordConfig, pool: WorkerPool | None, episodes: int) -> floa
 
 def main() -> int:
     """Print what was measured; return 3 if the goal was missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=60)
-    parser.add_argument("--episode_s", type=float, default=30.0, help="simulated duration of an episode [s]")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args()
+    options = parse_options(__doc__, episodes=60, episode_s=(30.0, "simulated duration of an episode [s]"), turns=5)
     config = configuration(Path("unused"), options.episode_s)
     quiet = Console(quiet=True)
     started = time.perf_counter()
@@ -107,29 +101,15 @@ def main() -> int:
         two.__exit__()
         pools = {"alone": None, "one": one, "two": two}
         times = in_turns({name: partial(turn, pool) for name, pool in pools.items()}, options.turns)
-    speeds = {name: [options.episodes / took for took in values] for name, values in times.items()}
-    gain = spread(ratios(speeds["two"], speeds["one"]))
+    names = {"two": "two workers", "one": "one worker", "alone": "in one process"}
+    speeds = {names[name]: [options.episodes / took for took in times[name]] for name in names}
+    report = Report(f"{options.episodes} episodes of {options.episode_s:g} s, {os.cpu_count()} processors")
+    report.compare("bhd-record --engine=ray", "episodes/s", speeds, ["one worker"], goal=GOAL)
     pairs = zip(times["one"], times["alone"], strict=True)
     overhead_ms = spread([1000 * (one - alone) / options.episodes for one, alone in pairs])
-    results = {
-        "episodes": options.episodes,
-        "episode_s": options.episode_s,
-        "processors": os.cpu_count(),
-        "start_s": start_s,
-        "episodes_per_s": {name: spread(values) for name, values in speeds.items()},
-        "two_against_one": gain,
-        "overhead_ms_per_episode": overhead_ms,
-        "goal": GOAL,
-        "met": gain["median"] >= GOAL,
-    }
-    write(options.json, results)
-    for name, label in (("alone", "in one process"), ("one", "one worker"), ("two", "two workers")):
-        print(f"{label}: {statistics.median(speeds[name]):.1f} episodes/s of {options.episode_s:g} s")
-    print(
-        f"two workers against one: {shown(gain)}, goal {GOAL}; one worker against one process, ms an episode: "
-        f"{shown(overhead_ms, '+.1f')}; start {start_s:.1f} s"
-    )
-    return status(met=results["met"])
+    report.add("one worker against one process, an episode", f"{shown(overhead_ms, '+.1f')} ms")
+    report.add("start of the cluster", f"{start_s:.1f} s")
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

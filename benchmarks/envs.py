@@ -5,23 +5,21 @@
 the table shows medians, and medians of the ratios within a turn, because a noisy neighbour disturbs all of a turn.
 """
 
-import argparse
 import multiprocessing
 import signal
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing import forkserver
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from benchmarks._turns import in_turns, ratios, spread, status, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 
 # Not imported here: the recorder and the rest that only the measuring process needs. Every process of `AsyncVectorEnv`
@@ -134,45 +132,27 @@ def start(names: list[str], n: int, limit_s: float) -> tuple[dict[str, VectorEnv
     return envs, problems
 
 
-def summary(speeds: dict[str, list[float]], problems: dict[str, str], n: int) -> dict[str, Any]:
-    """Return what was measured, as plain values."""
-    over = {name: spread(ratios(speeds[OURS], values)) for name, values in speeds.items() if name != OURS}
-    return {
-        "task": TASK,
-        "n": n,
-        "steps_per_s": {name: spread(values) for name, values in speeds.items()},
-        "ours_is": over,
-        "not_measured": problems,
-        "goal": GOAL,
-        "met": over[BARE]["median"] >= GOAL,
-    }
-
-
-def show(speeds: dict[str, list[float]], results: dict[str, Any]) -> None:
-    """Print the table."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"{TASK}, {results['n']} environments", title_justify="left")
-    for heading in ("measured", "steps per s", "ours is", "goal"):
-        table.add_column(heading, justify="left" if heading == "measured" else "right")
-    for name, values in speeds.items():
-        ratio = 1.0 if name == OURS else results["ours_is"][name]["median"]
-        goal = f">= {GOAL:.2f} x" if name == BARE else ""
-        table.add_row(name, f"{statistics.median(values):.0f}", f"{ratio:.2f} x", goal)
-    Console(width=100).print(table)
+def summarise(speeds: dict[str, list[float]], problems: dict[str, str], n: int) -> Report:
+    """Return what was measured."""
+    what, report = f"{n} avoid environments", Report(f"{TASK}, {n} environments")
+    peers = [BARE, *(name for name in PEERS if name in speeds)]
+    report.compare(what, "steps/s", speeds, peers, goal=GOAL, form=",.0f")
+    for name, reason in problems.items():
+        report.add(f"{what}: {OURS} / {name}", f"not measured: {reason}")
+    return report
 
 
 def main() -> int:
     """Print the table; return 3 if the goal was missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--n", type=int, default=64, help="environments")
-    parser.add_argument("--repeats", type=int, default=7, help="turns")
-    parser.add_argument("--seconds", type=float, default=3.0, help="length of each part of a turn")
-    parser.add_argument("--peers", nargs="*", choices=("sync", "async"), default=["sync", "async"], help="Gymnasium's")
-    parser.add_argument("--limit", type=float, default=300.0, help="longest time for one of them to come up [s]")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args()
+    kinds = list(PEERS.values())
+    options = parse_options(
+        __doc__,
+        n=(64, "environments"),
+        repeats=(7, "turns"),
+        seconds=(3.0, "length of each part of a turn"),
+        peers={"nargs": "*", "choices": kinds, "default": kinds, "help": "Gymnasium's"},
+        limit=(300.0, "longest time for one of them to come up [s]"),
+    )
     # The processes come first: they part from one that has no threads yet.
     names = [name for name, kind in reversed(PEERS.items()) if kind in options.peers]
     envs, problems = start([*names, OURS], options.n, options.limit)
@@ -183,12 +163,7 @@ def main() -> int:
     finally:
         for env in envs.values():
             env.close()
-    results = summary(speeds, problems, options.n)
-    show(speeds, results)
-    write(options.json, results)
-    if not results["met"]:
-        print(f"Missed: {results['ours_is'][BARE]['median']:.2f} of the bare physics with the same lidar.")
-    return status(met=results["met"])
+    return summarise(speeds, problems, options.n).end(options.json)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,9 @@ is part of the result. Without `--path` a small `bhd_mlp` is trained first, on e
 times the episodes a second. Exits with 3 if it is missed.
 """
 
-import argparse
 import contextlib
 import io
 import logging
-import statistics
 import sys
 import tempfile
 import time
@@ -30,7 +28,8 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 from rich.console import Console
 
-from benchmarks._turns import ratios, shown, spread, verdict, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import spread
 from bhd_lerobot.cli.record import main as record_main
 from bhd_lerobot.cli.train import main as train_main
 from bhd_lerobot.envs.config_env import BhdEnvConfig
@@ -46,17 +45,17 @@ TASKS = {"avoid": ("turtlebot3", "TurtleBot3Avoid-v0", "gap_follower"), "reach":
 
 def main() -> int:
     """Run both in turns, print episodes a second and their ratio, return 0 if the goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", choices=tuple(TASKS), default="avoid")
-    parser.add_argument("--path", help="checkpoint of the policy; a small one is trained if none is given")
-    parser.add_argument("--demonstrations", type=int, default=40, help="episodes that the small policy learns from")
-    parser.add_argument("--steps", type=int, default=500, help="that it learns for")
-    parser.add_argument("--episodes", type=int, default=200, help="episodes of a run, of both")
-    parser.add_argument("--n_envs", type=int, default=50, help="simulations side by side, of both")
-    parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    args = parser.parse_args()
+    args = parse_options(
+        __doc__,
+        task={"choices": tuple(TASKS), "default": "avoid"},
+        path={"help": "checkpoint of the policy; a small one is trained if none is given"},
+        demonstrations=(40, "episodes that the small policy learns from"),
+        steps=(500, "that it learns for"),
+        episodes=(200, "episodes of a run, of both"),
+        n_envs=(50, "simulations side by side, of both"),
+        turns=3,
+        seed=0,
+    )
     logging.disable(logging.INFO)
     turns: list[Turn] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -70,13 +69,9 @@ def main() -> int:
             ours_s, ours = run_ours(args.task, path, episodes, n_envs, seed=args.seed, folder=target)
             if turn >= 0:
                 turns.append(Turn(stock_s, ours_s, stock, ours))
-                print(f"turn {turn + 1}: lerobot-eval {stock_s:.1f} s, bhd-eval {ours_s:.1f} s", flush=True)
         kind = PreTrainedConfig.from_pretrained(find_checkpoint(path)).type
-    results = {"task": args.task, "policy": kind, "seed": args.seed, "n_envs": args.n_envs, "episodes": args.episodes}
-    results |= summary(turns, args.episodes)
-    show(results)
-    write(args.json, results)
-    return verdict(met=results["met"])
+    what = f"{args.episodes} {args.task} episodes of {kind}, {args.n_envs} side by side"
+    return summarise(what, turns, args.episodes).end(args.json)
 
 
 @dataclass(frozen=True)
@@ -96,36 +91,22 @@ class Turn:
     ours: EvalResult
 
 
-def summary(turns: Sequence[Turn], episodes: int) -> dict[str, Any]:
-    """Return what was measured, as plain values."""
-    stock, ours = [episodes / turn.stock_s for turn in turns], [episodes / turn.ours_s for turn in turns]
-    ratio = spread(ratios(ours, stock))
-    pairs = [pair for turn in turns for pair in zip(turn.stock, turn.ours.results.episodes, strict=True)]
-    return {
-        "episodes_per_s": {"lerobot-eval": spread(stock), "bhd-eval": spread(ours)},
-        "ratio": ratio,
-        # Building, intervals and report: what is not the run of the episodes.
-        "around_s": statistics.median(turn.ours_s - turn.ours.timing["brains"]["policy"]["wall_s"] for turn in turns),
-        "compared": len(pairs),
-        "same_success": sum(one["success"] == our.success for one, our in pairs),
-        "largest_return_difference": max(abs(one["sum_reward"] - our.reward) for one, our in pairs),
-        "goal": GOAL,
-        "met": ratio["median"] >= GOAL,
+def summarise(what: str, turns: Sequence[Turn], episodes: int) -> Report:
+    """Return what was measured."""
+    report = Report("bhd-eval beside lerobot-eval on SyncVectorEnv")
+    speeds = {
+        "bhd-eval": [episodes / turn.ours_s for turn in turns],
+        "lerobot-eval": [episodes / turn.stock_s for turn in turns],
     }
-
-
-def show(results: dict[str, Any]) -> None:
-    """Print what was measured."""
-    speeds, ratio, n = results["episodes_per_s"], results["ratio"], results["n_envs"]
-    print(f"{results['task']}, policy {results['policy']}, seed {results['seed']}, {results['episodes']} episodes")
-    for name, what in (("lerobot-eval", f"SyncVectorEnv of {n}"), ("bhd-eval", f"n_envs = {n}")):
-        print(f"{name:<13} {what:<20} {shown(speeds[name])} episodes/s")
-    print(f"ratio {shown(ratio, '.1f')}, goal {results['goal']:.0f}")
-    print(f"bhd-eval spends {results['around_s']:.1f} s before and after the episodes")
-    print(
-        f"of {results['compared']} episodes of both, {results['same_success']} ended the same; "
-        f"returns differ by at most {results['largest_return_difference']:.2g}"
-    )
+    report.compare(what, "episodes/s", speeds, ["lerobot-eval"], goal=GOAL, form=".2f")
+    # Building, intervals and report: what is not the run of the episodes.
+    around = spread([turn.ours_s - turn.ours.timing["brains"]["policy"]["wall_s"] for turn in turns])
+    report.add(f"{what}: before and after the episodes", f"{around['median']:.1f} s")
+    pairs = [pair for turn in turns for pair in zip(turn.stock, turn.ours.results.episodes, strict=True)]
+    same = sum(one["success"] == our.success for one, our in pairs)
+    differ = max(abs(one["sum_reward"] - our.reward) for one, our in pairs)
+    report.add(f"{what}: ended the same with both", f"{same} of {len(pairs)}; returns differ by at most {differ:.2g}")
+    return report
 
 
 def run_ours(task: str, path: str, episodes: int, n_envs: int, *, seed: int, folder: Path) -> tuple[float, EvalResult]:

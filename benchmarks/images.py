@@ -12,36 +12,25 @@ Exits with 3 if a goal is missed.
 """
 
 import argparse
-import json
 import os
 import resource
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-# MuJoCo's renderer takes its backend from here when it is imported; ours looks for one by itself.
-os.environ.setdefault("MUJOCO_GL", "egl")
-
-import mujoco
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks._turns import in_turns, ratios, shown, spread, status, write
+from benchmarks._renderer import speeds
+from benchmarks._report import Report, parse_options
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
 CAMERAS, SIZE = ("scene", "wrist"), 96
 BATCH = 32
-PARTS = {"whole": "a run of {} steps", "steps": "its steps alone"}
 TRAIN_GOAL, RENDER_GOAL = 5.0, 0.8  # times the peer's speed
 # What is recorded to learn each policy from, and with which further options.
 RECORDINGS = {
@@ -90,116 +79,60 @@ def processor_time(program: str, policy: str, root: Path, output: Path, steps: i
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def training(
-    folder: Path, policy: str, episodes: int, steps: int, *, turns: int, parts: Sequence[str]
-) -> dict[str, Any]:
-    """Return samples a second of processor time of both programs, in each part of `PARTS`, and their ratios."""
-    root = record(folder, policy, episodes)
-    runs: dict[tuple[str, int], list[float]] = {}
-    counts = {"whole": (steps,), "steps": (steps // 5, steps)}
-    for _ in range(turns):
+def training(report: Report, folder: Path, policy: str, options: argparse.Namespace) -> None:
+    """Add the rows of samples a second of processor time of both programs."""
+    root, steps, short = record(folder, policy, options.episodes), options.steps, options.steps // 5
+    times: dict[tuple[str, int], list[float]] = {}
+    for _ in range(options.turns):
         for program in PROGRAMS:
-            for count in sorted({count for part in parts for count in counts[part]}):
+            for count in (steps,) if options.whole else (short, steps):
                 seconds = processor_time(program, policy, root, folder / "run", count)
-                runs.setdefault((program, count), []).append(seconds)
-    found: dict[str, Any] = {"episodes": episodes, "steps": steps, "batch_size": BATCH}
-    for what in parts:
-        rates, samples = {}, (steps if what == "whole" else steps - steps // 5) * BATCH
-        for program in PROGRAMS:
-            short = np.array(runs[program, steps // 5]) if what == "steps" else 0.0
-            rates[program] = (samples / (np.array(runs[program, steps]) - short)).tolist()
-            found[f"{what}: {program}"] = spread(rates[program])
-        found[f"{what}: ratio"] = spread(ratios(rates["bhd-train"], rates["lerobot-train"]))
-    return found
+                times.setdefault((program, count), []).append(seconds)
+
+    def compare(part: str, samples: int, times: dict[str, np.ndarray], goal: float | None) -> None:
+        rates = {program: (samples * BATCH / took).tolist() for program, took in times.items()}
+        what = f"learning {policy} from images, {part}"
+        report.compare(what, "samples per CPU second", rates, ["lerobot-train"], goal=goal)
+
+    whole = {program: np.array(times[program, steps]) for program in PROGRAMS}
+    compare(f"a run of {steps} steps", steps, whole, TRAIN_GOAL)
+    if not options.whole:
+        alone = {program: took - np.array(times[program, short]) for program, took in whole.items()}
+        compare("its steps alone", steps - short, alone, None)
 
 
-def rendering(frames: int, turns: int) -> dict[str, Any]:
-    """Return images a second of our camera and of MuJoCo's own renderer, two cameras a frame, taken in turns."""
-    simulation = UR5Simulation(UR5Config())
-    simulation.reset(np.zeros(1, int), [PickTask(PickConfig(), 1, 25).sample(0)], [0])
-    camera = Camera(simulation.world, SIZE, SIZE)
-    model = simulation.world.copy_model(0)
-    data = mujoco.MjData(model)
-    simulation.world.copy_into(0, model, data)
-    renderer = mujoco.Renderer(model, SIZE, SIZE)
-    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
-        renderer.scene.flags[flag] = False
-    option = mujoco.MjvOption()
-    option.geomgroup[:] = [1, 1, 0, 0, 0, 0]
-    joint = simulation.world.qpos[0, 0]
-
-    def ours() -> float:
-        started = time.perf_counter()
-        for frame in range(frames):
-            simulation.world.qpos[0, 0] = joint + 0.001 * frame
-            for name in CAMERAS:
-                camera.render(0, name)
-        return len(CAMERAS) * frames / (time.perf_counter() - started)
-
-    def bare() -> float:
-        started = time.perf_counter()
-        for frame in range(frames):
-            data.qpos[0] = joint + 0.001 * frame
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
-            for name in CAMERAS:
-                renderer.update_scene(data, name, option)
-                renderer.render()
-        return len(CAMERAS) * frames / (time.perf_counter() - started)
-
-    values = in_turns({"ours": ours, "bare": bare}, turns)
-    camera.close()
-    renderer.close()
-    found = {name: spread(one) for name, one in values.items()}
-    return {**found, "ratio": spread(ratios(values["ours"], values["bare"]))}
+def turn(qpos: np.ndarray, frame: int) -> None:
+    """Turn the arm a little."""
+    qpos[0] = 0.001 * frame
 
 
 def main() -> int:
     """Print the table; return 3 if a goal was missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
     policies = list(RECORDINGS)
-    parser.add_argument("--policies", nargs="+", choices=policies, default=policies, help="which of them learn")
-    parser.add_argument("--episodes", type=int, default=40)
-    parser.add_argument("--steps", type=int, default=500, help="of the longer training; the shorter has a fifth")
-    parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--whole", action="store_true", help="whole trainings only, not the speed of their steps alone")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    results: dict[str, Any] = {}
-    table = Table(title="Images", title_justify="left")
-    for heading in ("measured", "ours", "peer", "peer is", "ratio", "goal"):
-        table.add_column(heading, justify="left" if heading in ("measured", "peer is") else "right")
-    missed = []
+    options = parse_options(
+        __doc__,
+        policies={"nargs": "+", "choices": policies, "default": policies, "help": "which of them learn"},
+        episodes=40,
+        steps=(500, "of the longer training; the shorter has a fifth"),
+        turns=3,
+        whole=(False, "whole trainings only, not the speed of their steps alone"),
+    )
+    report = Report("Images")
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
-    results["training"] = {}
     try:
         for policy in options.policies:
-            parts = list(PARTS)[: 1 if options.whole else None]
-            found = training(folder, policy, options.episodes, options.steps, turns=options.turns, parts=parts)
-            results["training"][policy] = found
-            for what in parts:
-                label = f"{policy}, {PARTS[what].format(options.steps)}: samples per CPU s"
-                goal = f">= {TRAIN_GOAL:g}" if what == "whole" else ""
-                both = (shown(found[f"{what}: {program}"], ".1f") for program in PROGRAMS)
-                table.add_row(label, *both, "lerobot-train", shown(found[f"{what}: ratio"]), goal)
-            if found["whole: ratio"]["median"] < TRAIN_GOAL:
-                missed.append(f"training {policy}")
+            training(report, folder, policy, options)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+    simulation = UR5Simulation(UR5Config())
+    simulation.reset(np.zeros(1, int), [PickTask(PickConfig(), 1, 25).sample(0)], [0])
     try:
-        results["rendering"] = found = rendering(100, 2 * options.turns + 1)
-        label, peer = f"two cameras of {SIZE} x {SIZE}: images per s", "MuJoCo's renderer, fastest settings"
-        ratio = shown(found["ratio"])
-        table.add_row(label, shown(found["ours"], ".0f"), shown(found["bare"], ".0f"), peer, ratio, f">= {RENDER_GOAL}")
-        if found["ratio"]["median"] < RENDER_GOAL:
-            missed.append("rendering")
+        rates = speeds(simulation, (SIZE, SIZE), CAMERAS, turn, 100 * options.turns)
+        what = f"two cameras of {SIZE} x {SIZE}"
+        report.compare(what, "images/s", rates, ["MuJoCo's renderer"], goal=RENDER_GOAL)
     except RenderingError as error:
         print(f"Rendering not measured: {error}")
-    Console(width=150).print(table)
-    write(options.json, json.loads(json.dumps(results)))
-    if missed:
-        print(f"Missed: {', '.join(missed)}")
-    return status(met=not missed)
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

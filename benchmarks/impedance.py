@@ -5,7 +5,6 @@ with late motors and with noisy encoders, and the time of a tick. Truth is the s
 settles more than 1 N beside what was commanded.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -13,7 +12,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._turns import seconds, verdict
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import seconds
 from bhd_lerobot.bodies.body import Rates, Shape
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.arm.impedance import ImpedanceController
@@ -113,10 +113,8 @@ class Rig:
         self.keep(2.0)
 
 
-def pushes(speeds: Sequence[float]) -> float:
-    """Print how pushes begin and where they settle, at some speeds of approach; return the largest error [N]."""
-    largest = 0.0
-    print(f"{'approach':>10}{'peak':>10}{'after 20 ms':>13}{'within 1 N after':>18}{'settled':>10}{'felt':>10}")
+def add_pushes(report: Report, speeds: Sequence[float]) -> None:
+    """Add rows of how pushes begin and where they settle, at some speeds of approach."""
     for speed in speeds:
         rig = Rig(wall=True)
         rig.push(speed)
@@ -124,58 +122,55 @@ def pushes(speeds: Sequence[float]) -> float:
         onset = int(np.flatnonzero(force)[0])
         late = float(np.flatnonzero(np.abs(force[onset:] - FORCE) > 1.0)[-1]) / _RATES.control_hz
         error = float(np.abs(force[-250:] - FORCE).max())
-        largest = max(largest, error)
-        print(
-            f"{speed:>6.2f} m/s{force.max():>8.1f} N{force[onset + 10 :].max():>11.1f} N{late:>16.2f} s"
-            f"{force[-1]:>8.2f} N{felt[-1]:>8.2f} N"
-        )
-    return largest
+        what = f"push of {FORCE:g} N, approach at {speed} m/s"
+        peaks = f"{force.max():.1f} N, after 20 ms {force[onset + 10 :].max():.1f} N"
+        report.add(f"{what}: peak", f"{peaks}; within 1 N after {late:.2f} s")
+        value = f"{force[-1]:.2f} N, felt {felt[-1]:.2f} N"
+        report.add(f"{what}: settled", value, f"within {GOAL_N:g} N", met=error <= GOAL_N)
 
 
-def stop_in_motion() -> None:
-    """Print how far the tool goes after an emergency stop at 0.25 m/s."""
+def add_stop(report: Report) -> None:
+    """Add a row of how far the tool goes after an emergency stop at 0.25 m/s."""
     rig = Rig()
     rig.move((0, -0.2, 0), 0.25)
     pressed = rig.tool[-1]
     rig.bridge.estop()
     rig.bridge.advance_ticks(1000)
-    away = np.linalg.norm(np.array(rig.tool[-1000:]) - pressed, axis=1)
-    print(f"\nemergency stop at 0.25 m/s: {away.max() * 1e3:.1f} mm on at the most, {away[-1] * 1e3:.1f} mm after 2 s")
+    away = np.linalg.norm(np.array(rig.tool[-1000:]) - pressed, axis=1) * 1e3
+    report.add("emergency stop at 0.25 m/s", f"{away.max():.1f} mm on at the most, {away[-1]:.1f} mm after 2 s")
 
 
-def false_contacts(faults: Sequence[tuple[int, float]]) -> None:
-    """Print the largest force that is felt in free motion at 0.25 m/s, with late motors and noisy encoders."""
-    print("\nfelt in free motion at 0.25 m/s")
+def add_false_contacts(report: Report, faults: Sequence[tuple[int, float]]) -> None:
+    """Add rows of the largest force that is felt in free motion, with late motors and noisy encoders."""
     for late, noise in faults:
         rig = Rig(late=late, noise=noise)
         rig.move((0, -0.4, 0), 0.25)
         rig.keep(0.3)
         felt = np.linalg.norm(np.array(rig.felt)[:, :3], axis=1).max()
-        print(f"  motors late by {late:2d} ticks, noise of {noise:g} rad/s: {felt:.2f} N")
+        what = f"felt in free motion at 0.25 m/s, motors late by {late} ticks, noise of {noise:g} rad/s"
+        report.add(what, f"{felt:.2f} N")
 
 
-def cost(counts: Sequence[int]) -> None:
-    """Print the time of a tick of some numbers of arms."""
+def add_cost(report: Report, counts: Sequence[int]) -> None:
+    """Add rows of the time of a tick of some numbers of arms."""
     for n in counts:
         rig = Rig(n=n)
         rig.keep(0.2)
         times = []
         for _ in range(5):
             times.append((seconds(partial(rig.keep, 1.0)) - seconds(partial(rig.world.step, 500))) / 500)
-        print(f"\na tick of {n} arm(s): {np.median(times) * 1e3:.2f} ms, physics not counted", end="")
-    print()
+        report.add(f"a tick of {n} arms, physics not counted", f"{np.median(times) * 1e3:.2f} ms")
 
 
 def main() -> int:
     """Measure everything, print it, return 0 if the goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one of each only; not to be quoted")
-    quick = parser.parse_args().quick
-    error = pushes(SPEEDS[-1:] if quick else SPEEDS)
-    stop_in_motion()
-    false_contacts(FAULTS[-1:] if quick else FAULTS)
-    cost((1,) if quick else (1, 8))
-    return verdict(met=error <= GOAL_N)
+    options = parse_options(__doc__, quick=(False, "one of each only; not to be quoted"))
+    report = Report("Impedance control of the UR5")
+    add_pushes(report, SPEEDS[-1:] if options.quick else SPEEDS)
+    add_stop(report)
+    add_false_contacts(report, FAULTS[-1:] if options.quick else FAULTS)
+    add_cost(report, (1,) if options.quick else (1, 8))
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

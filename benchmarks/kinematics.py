@@ -5,7 +5,6 @@ at 1e-6 m and rad. The goal: ours solves at least 99.9 % of the poses, and is fa
 Exits with 3 if it is missed.
 """
 
-import argparse
 import math
 import sys
 import time
@@ -19,7 +18,8 @@ import pink
 import pinocchio
 from eaik.IK_DH import DhRobot
 
-from benchmarks._turns import seconds, verdict
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import seconds
 from bhd_lerobot.bodies.body import ArmChain
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
@@ -41,10 +41,7 @@ Solver = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def main() -> int:
     """Measure, print the table, return 0 if the goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--poses", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
+    args = parse_options(__doc__, poses=1000, seed=0)
     arm = ur5()
     kinematics = ArmKinematics(arm.chain, arm.limits)
     rng = np.random.default_rng(args.seed)
@@ -68,20 +65,20 @@ def main() -> int:
     batch = np.resize(poses, (BATCH, 4, 4))
     batched = float(np.median([seconds(lambda: kinematics.solutions(batch)) for _ in range(20)])) / BATCH
 
-    print(f"{len(poses)} poses of random admissible postures, seed {args.seed}; solved: {TOLERANCE} m and rad")
-    print(f"iterative peers start within {SEED_DISTANCE} rad of a solution and take {MOST_STEPS} steps at most\n")
+    report = Report(
+        f"{len(poses)} poses of random admissible postures, seed {args.seed}; solved: {TOLERANCE} m and rad. Iterative "
+        f"peers start within {SEED_DISTANCE} rad of a solution and take {MOST_STEPS} steps at most"
+    )
     base = float(np.median(times["ours, all checks"]))
-    print(f"{'':20}{'median':>11}{'90 %':>11}{'/ all checks':>14}{'solved':>9}")
     for name in solvers:
         median, slow = (float(np.percentile(times[name], share)) for share in (50, 90))
-        row = f"{name:20}{median * 1e6:>8.1f} us{slow * 1e6:>8.1f} us{median / base:>14.2f}"
-        print(f"{row}{solved[name].mean():>9.2%}")
-    print(f"{'ours, ' + str(BATCH) + ' at once':20}{batched * 1e6:>8.2f} us{'':11}{batched / base:>14.4f}")
-    ours = ("ours, all checks", "ours, closed form")
-    met = all(solved[name].mean() >= GOAL for name in ours)
-    met = met and all(base < float(np.median(times[name])) for name in iterative)
-    print()
-    return verdict(met=met)
+        value = f"median {median * 1e6:.1f} us, 90 % below {slow * 1e6:.1f} us, {median / base:.2f} of all checks"
+        goal, met = ("slower than ours", median > base) if name in iterative else ("", None)
+        report.add(name, value, goal, met=met)
+        goal, met = (f"at least {GOAL:.1%}", solved[name].mean() >= GOAL) if name.startswith("ours") else ("", None)
+        report.add(f"{name}: solved", f"{solved[name].mean():.2%}", goal, met=met)
+    report.add(f"ours, {BATCH} at once", f"{batched * 1e6:.2f} us, {batched / base:.4f} of all checks")
+    return report.end(args.json)
 
 
 def admissible(kinematics: ArmKinematics, rng: np.random.Generator, count: int) -> np.ndarray:

@@ -5,7 +5,6 @@ acceleration, of the joints and of the tool, but none of the jerk: no law with o
 goal is missed.
 """
 
-import argparse
 import sys
 import time
 
@@ -15,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
-from benchmarks._turns import verdict
+from benchmarks._report import Report, parse_options
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED
 from bhd_lerobot.control.motion.line import ToolLimits, along_line
 from bhd_lerobot.control.motion.planner import GoalPlanner
@@ -28,25 +27,17 @@ _BOX = np.array([[0.30, -0.35, 0.10], [0.65, 0.35, 0.50]])  # where lines begin 
 
 def main() -> int:
     """Measure both, print the table, return 0 if the goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--lines", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
+    args = parse_options(__doc__, lines=200, seed=0)
     toppra.setup_logging("ERROR")
-    print(f"{args.lines} lines each, seed {args.seed}\n")
-    heads = ("ours", 9), ("TOPP-RA", 9), ("ratio: median", 15), ("90 %", 7), ("worst", 7), ("planned in", 12)
-    print(f"{'speed of the tool':<20}" + "".join(f"{head:>{width}}" for head, width in heads))
-    medians = []
+    report = Report(f"{args.lines} lines each, seed {args.seed}")
     for speed in (0.25, MAX_TOOL_SPEED):
         ours, peers, planning = measure(speed, args.lines, args.seed)
-        ratios = ours / peers
-        medians.append(float(np.median(ratios)))
-        print(
-            f"{speed:>4.2f} m/s{'':<12}{np.median(ours):>7.3f} s{np.median(peers):>7.3f} s{medians[-1]:>15.3f}"
-            f"{np.percentile(ratios, 90):>7.2f}{ratios.max():>7.2f}{np.median(planning) * 1e3:>9.1f} ms"
-        )
-    print(f"\ngoal: a median of at most {GOAL}")
-    return verdict(met=max(medians) <= GOAL)
+        ratios, middle = ours / peers, np.median(ours / peers)
+        times = f"{np.median(ours):.3f} s, TOPP-RA {np.median(peers):.3f} s"
+        report.add(f"{speed} m/s: median time", f"{times}; planned in {np.median(planning) * 1e3:.1f} ms")
+        spread = f"median {middle:.3f}, 90 % below {np.percentile(ratios, 90):.2f}, worst {ratios.max():.2f}"
+        report.add(f"{speed} m/s: ours / TOPP-RA", spread, f"median at most {GOAL}", met=middle <= GOAL)
+    return report.end(args.json)
 
 
 def measure(speed: float, lines: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

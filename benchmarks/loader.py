@@ -13,36 +13,36 @@ import json
 import multiprocessing
 import os
 import shutil
-import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 
-from rich.console import Console
-from rich.table import Table
-
-from benchmarks._turns import spread, status, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns
 from bhd_lerobot.cli.record import main as record_main
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)
 NAMES = ("ours", *(f"LeRobot, {n} workers" for n in WORKERS))
-# What is recorded, with which further options, and how many times the better of LeRobot's speeds is the goal.
+# What is recorded, with which further options, how it is shown, and the goal, over the better of LeRobot's speeds.
 CASES = {
-    "state": ("configs/record/ur5_reach.yaml", (), 200.0),
+    "state": ("configs/record/ur5_reach.yaml", (), "loader, state data, chunks of 50 steps", 200.0),
     "cameras": (
         "configs/record/ur5_pick_camera.yaml",
         ("--robot.camera_width=96", "--robot.camera_height=96", "--task.randomisation.enabled=false"),
+        "loader, two cameras of 96 x 96 pixels",
         10.0,
     ),
 }
 EPISODES = (50, 12)  # of each
+BETTER = "LeRobot's better"
 
 
 def record_dataset(root: Path, name: str, episodes: int) -> str:
@@ -51,7 +51,7 @@ def record_dataset(root: Path, name: str, episodes: int) -> str:
     In a process of its own: PyTorch's workers are copies of this one, and do not survive a renderer's threads in it. It
     is a copy, too, which need not import anything: call this before anything else starts threads.
     """
-    config, options, _ = CASES[name]
+    config, options, *_ = CASES[name]
     arguments = [
         f"--config_path={config}",
         f"--dataset.root={root}",
@@ -130,87 +130,53 @@ def timed(start: Callable[[], Any], batches: int | None) -> float:
     return time.perf_counter() - started
 
 
-def measure(root: Path, seconds: float, repeats: int) -> tuple[list[list[float]], int, float]:
-    """Return samples a second of ours and LeRobot's, by repeat; the number of samples; mebibytes that ours takes."""
+def compare(report: Report, what: str, unit: str, found: dict[str, list[float]], goal: float | None = None) -> None:
+    """Add rows of speeds, with the ratio to LeRobot's better number of workers in each turn."""
+    better = [max(theirs) for theirs in zip(*(found[name] for name in NAMES[1:]), strict=True)]
+    report.compare(what, unit, {**found, BETTER: better}, [BETTER], goal=goal)
+
+
+def measure(report: Report, root: Path, name: str, options: argparse.Namespace) -> None:
+    """Add the rows of a dataset."""
+    *_, what, goal = CASES[name]
     fps = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["fps"]
-    ours = Ours(root, fps)
-    mine = ours.batches()
-    theirs = [LeRobots(root, fps, workers).batches() for workers in WORKERS]
-    values = [[samples_per_second(stream, seconds) for stream in (mine, *theirs)] for _ in range(repeats)]
-    return values, len(ours.dataset), ours.dataset.nbytes / 2**20
+    starts: dict[str, Callable[[], Any]] = {
+        one: partial(LeRobots, root, fps, workers) for one, workers in zip(NAMES[1:], WORKERS, strict=True)
+    }
+    starts = {NAMES[0]: partial(Ours, root, fps), **starts}
+    streams = {one: start().batches() for one, start in starts.items()}
+    parts = {one: partial(samples_per_second, stream, options.seconds) for one, stream in streams.items()}
+    compare(report, what, "samples/s", in_turns(parts, options.repeats, uncounted=0), goal)
+    for end, batches, turns in () if options.no_start else (("first batch", 1, 3), ("first epoch", None, 1)):
+        times = in_turns({one: partial(timed, start, batches) for one, start in starts.items()}, turns, uncounted=0)
+        speeds = {one: [1 / took for took in values] for one, values in times.items()}
+        compare(report, f"{what}, from closed files to the end of the {end}", "1/s", speeds)
 
 
 def main() -> int:
     """Print the table; return 3 if a goal was missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument(
-        "--episodes", type=int, nargs=2, default=EPISODES, help="of each dataset; 0 leaves it out", metavar=tuple(CASES)
+    options = parse_options(
+        __doc__,
+        repeats=3,
+        episodes={"type": int, "nargs": 2, "default": EPISODES, "metavar": tuple(CASES), "help": "0 leaves it out"},
+        seconds=(3.0, "length of one measurement [s]"),
+        no_start=(False, "do not time starts"),
     )
-    parser.add_argument("--seconds", type=float, default=3.0, help="length of one measurement [s]")
-    parser.add_argument("--start", action=argparse.BooleanOptionalAction, default=True, help="time starts, too")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args()
+    report = Report("Loader: batches of 64, action chunks of 50 steps")
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
-    table = Table(title="Loader: batches of 64, action chunks of 50 steps", title_justify="left")
-    for heading in ("measured", *NAMES, "ratio", "goal"):
-        table.add_column(heading, justify="left" if heading == "measured" else "right")
-    results: dict[str, Any] = {}
-    missed = []
     try:
         counts = {name: episodes for name, episodes in zip(CASES, options.episodes, strict=True) if episodes}
         problems = {name: record_dataset(folder / name, name, episodes) for name, episodes in counts.items()}
         for name, error in problems.items():
-            root, goal = folder / name, CASES[name][2]
             if error:
                 print(f"{name}: nothing was recorded. {error}")
-                missed.append(name)
-                continue
-            values, samples, mebibytes = measure(root, options.seconds, options.repeats)
-            ratio = statistics.median(mine / max(theirs) for mine, *theirs in values)
-            missed += [name] * (ratio < goal)
-            medians = [statistics.median(column) for column in zip(*values, strict=True)]
-            table.add_row(
-                f"{name}, {samples} samples, {mebibytes:.3g} MiB: samples per s",
-                *(f"{value:,.0f}" for value in medians),
-                f"{ratio:,.0f}",
-                f">= {goal:.0f}",
-            )
-            results[name] = {
-                "samples_per_s": dict(zip(NAMES, map(spread, zip(*values, strict=True)), strict=True)),
-                "ratio": spread([mine / max(theirs) for mine, *theirs in values]),
-                "goal": goal,
-                "met": ratio >= goal,
-                "samples": samples,
-                "mib": mebibytes,
-            }
-            fps = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["fps"]
-            starts: list[Callable[[], Any]] = [
-                lambda root=root, fps=fps: Ours(root, fps),
-                *(lambda root=root, fps=fps, workers=workers: LeRobots(root, fps, workers) for workers in WORKERS),
-            ]
-            for what, batches in (("first batch", 1), ("first epoch", None)) if options.start else ():
-                rows = [[timed(start, batches) for start in starts] for _ in range(1 if batches is None else 3)]
-                medians = [statistics.median(column) for column in zip(*rows, strict=True)]
-                ratio = statistics.median(min(theirs) / mine for mine, *theirs in rows)
-                table.add_row(
-                    f"{name}: from closed files to the end of the {what}, s",
-                    *(f"{value:.2f}" for value in medians),
-                    f"{ratio:.3g}",
-                    "",
-                )
-                results[name][what.replace(" ", "_")] = {
-                    "seconds": dict(zip(NAMES, map(spread, zip(*rows, strict=True)), strict=True)),
-                    "ratio": spread([min(theirs) / mine for mine, *theirs in rows]),
-                }
+                report.add(CASES[name][2], "not measured: its dataset could not be recorded", met=False)
+            else:
+                measure(report, folder / name, name, options)
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(folder)
-    Console(width=150).print(table)
-    write(options.json, results)
-    if missed:
-        print(f"Missed: {', '.join(missed)}")
-    return status(met=not missed)
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ every frame's numbers anew. LeRobot's result loses the columns that are ours and
 is done here, not less. Opening the datasets is part of both.
 """
 
-import argparse
 import logging
 import shutil
 import sys
@@ -18,7 +17,8 @@ from pathlib import Path
 import av
 import numpy as np
 
-from benchmarks._turns import in_turns, ratios, seconds, shown, spread, write
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import in_turns, seconds
 from benchmarks.check import record
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -60,17 +60,11 @@ def timed(merge_into: Callable[[list[Path], Path], object], roots: list[Path], t
 
 def main() -> int:
     """Print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--datasets", type=int, default=10)
-    parser.add_argument("--episodes", type=int, default=100, help="of a dataset without video; a tenth of that with")
-    parser.add_argument("--frames", type=int, default=300, help="of an episode")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write what was measured to this file")
-    options = parser.parse_args()
+    help_text = "of a dataset without video; a tenth of that with"
+    options = parse_options(__doc__, datasets=10, episodes=(100, help_text), frames=(300, "of an episode"), turns=5)
     logging.disable(logging.WARNING)
     av.logging.set_level(av.logging.ERROR)
-
-    results: dict[str, object] = {}
+    report = Report(f"Merging {options.datasets} datasets")
     with tempfile.TemporaryDirectory() as folder:
         for kind, make, episodes in (
             ("state", record, options.episodes),
@@ -79,19 +73,13 @@ def main() -> int:
             roots = [Path(folder) / f"{kind}{number}" for number in range(options.datasets)]
             for root in roots:
                 make(root, episodes, options.frames)
-            target = Path(folder) / "target"
-            merges = {"ours": merge, "theirs": merge_with_lerobot}
-            took = in_turns({name: partial(timed, one, roots, target) for name, one in merges.items()}, options.turns)
-            faster = spread(ratios(took["theirs"], took["ours"]))
             frames = options.datasets * episodes * options.frames
-            times = {name: spread(values)["median"] for name, values in took.items()}
-            print(
-                f"{kind}: {options.datasets} datasets, {frames:,} frames: {shown(faster, '.1f')} times as fast as "
-                f"LeRobot's, {times['ours']:.2f} s and {times['theirs']:.2f} s"
-            )
-            results[kind] = {"faster": faster, **took, "frames": frames}
-    write(options.json, results)
-    return 0
+            merges = {"bhd-data merge": merge, "LeRobot's": merge_with_lerobot}
+            parts = {name: partial(timed, one, roots, Path(folder) / "target") for name, one in merges.items()}
+            times = in_turns(parts, options.turns)
+            speeds = {name: [frames / took for took in values] for name, values in times.items()}
+            report.compare(f"{kind}, {frames:,} frames", "frames/s", speeds, ["LeRobot's"], form=",.0f")
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

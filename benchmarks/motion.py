@@ -5,13 +5,12 @@ with an empty gripper. Joint goals at full speed: the time from the end of the t
 the goal tolerance, 0.002 rad, and slower than 0.01 rad/s. Exits with 3 if a goal is missed.
 """
 
-import argparse
 import sys
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._turns import verdict
+from benchmarks._report import Report, parse_options
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -26,27 +25,18 @@ _TOLERANCE, _STILL = 0.002, 0.01  # [rad], the goals' own; [rad/s], below which 
 
 def main() -> int:
     """Measure both, print the table, return 0 if the goals are met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--motions", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
+    args = parse_options(__doc__, motions=100, seed=0)
     rng = np.random.default_rng(args.seed)
     simulation = UR5Simulation(UR5Config())
-    first = np.zeros(1, np.intp)
-    simulation.reset(first, [TableScene("empty", (), simulation.body.home)], [0])
-    deviations = lines(simulation, rng, args.motions)
-    settling = settle(simulation, rng, args.motions)
-    print(f"{args.motions} motions each, seed {args.seed}\n")
-    print(f"{'':44}{'median':>10}{'worst':>10}{'goal':>10}")
-    print(
-        f"{'distance from a straight line at 0.25 m/s':44}{np.median(deviations) * 1e3:>7.3f} mm"
-        f"{deviations.max() * 1e3:>7.3f} mm{PATH_GOAL_M * 1e3:>7.1f} mm"
-    )
-    print(
-        f"{'settling after a joint goal at full speed':44}{np.median(settling):>8.3f} s{settling.max():>8.3f} s"
-        f"{SETTLE_GOAL_S:>8.1f} s"
-    )
-    return verdict(met=deviations.max() <= PATH_GOAL_M and settling.max() <= SETTLE_GOAL_S)
+    simulation.reset(np.zeros(1, np.intp), [TableScene("empty", (), simulation.body.home)], [0])
+    report = Report(f"{args.motions} motions each, seed {args.seed}")
+    for what, found, unit, goal in (
+        (f"distance from a straight line at {SPEED} m/s", lines(simulation, rng, args.motions), "m", PATH_GOAL_M),
+        ("settling after a joint goal at full speed", settle(simulation, rng, args.motions), "s", SETTLE_GOAL_S),
+    ):
+        value = f"median {np.median(found):.6f} {unit}, worst {found.max():.6f} {unit}"
+        report.add(what, value, f"worst at most {goal} {unit}", met=found.max() <= goal)
+    return report.end(args.json)
 
 
 def follow(simulation: UR5Simulation, goal: BrainCommand) -> tuple[ResultCode, NDArray, NDArray]:

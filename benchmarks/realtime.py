@@ -1,15 +1,13 @@
 """How punctual the robots' control loop is on the wall clock: `make bench-realtime`.
 
-The TurtleBot3 ticks at 200 Hz and the UR5, with the objects of the pick task on its table, at 1 kHz. Four loops take
-turns in blocks of some seconds, quiet and under CPU load on every core: a C++ loop and a plain Python loop in this
-process, each on an absolute grid with the same physics and nothing else; the robot as it is, driven by a brain; and the
-UR5 with two cameras, a torch brain that looks at them, and video that is encoded meanwhile. One table shows the
-lateness of the ticks, how long they take, and behind every time its ratio to that of a peer in the neighbouring block.
-Ticks that were missed are counted, and what the system refused is printed. Exits with 3 if a goal is missed, with 2 if
-nothing could be measured.
+The TurtleBot3 ticks at 200 Hz and the UR5, with the objects of the pick task on its table, at 1 kHz. Three loops take
+turns in blocks of some seconds, quiet and under CPU load on every core: a C++ loop on an absolute grid with the same
+physics and nothing else; the robot as it is, driven by a brain; and the UR5 with two cameras, a torch brain that looks
+at them, and video that is encoded meanwhile. The table shows the lateness of the ticks, how long they take, and behind
+every time its ratio to that of a peer in the neighbouring block. Ticks that were missed are counted, and what the
+system refused is printed. Exits with 3 if a goal is missed, with 2 if nothing could be measured.
 """
 
-import argparse
 import os
 import shutil
 import statistics
@@ -18,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,18 +25,15 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from benchmarks._turns import ratios, status, write
+from benchmarks._report import Report, parse_options
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings, SystemCalls
+from bhd_lerobot.realtime.privileges import RealtimeSettings, SystemCalls
 from bhd_lerobot.registry import make_robot, make_simulation, robot_configs
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
@@ -47,7 +42,8 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
 RATES = {"turtlebot3": 200, "ur5": 1000}  # control ticks and physics steps a second [Hz]
 CONDITIONS = ("quiet", "load")
-TWIN, PYTHON, OURS, VIDEO = "C++ twin", "plain Python", "bhd-lerobot", "bhd-lerobot, torch and video"
+TWIN, OURS, VIDEO = "C++ twin", "bhd-lerobot", "bhd-lerobot, torch and video"
+PEERS = {OURS: TWIN, VIDEO: OURS}
 TIMES = ("wake_p50", "wake_p99", "wake_max", "tick_p99")
 # The largest good values: of a ratio to the peer, and of the share of a period that a tick takes.
 GOALS = ((OURS, "wake_p50", 1.2), (OURS, "wake_p99", 1.5), (OURS, "share", 0.25), (VIDEO, "tick_p99", 1.5))
@@ -112,57 +108,6 @@ def summarise(ticks: Ticks, warm_up_s: float = WARM_UP_S) -> dict[str, float]:
     }
 
 
-def walk(
-    tick: Callable[[], object],
-    period_ns: int,
-    points: int,
-    now: Callable[[], int] = time.monotonic_ns,
-    sleep: Callable[[float], object] = time.sleep,
-) -> NDArray[np.int64]:
-    """Tick on an absolute grid; on overrun the phase stays, and the points that have passed are skipped.
-
-    Args:
-        tick: what to do.
-        period_ns: the grid's period [ns].
-        points: points of the grid.
-        now: the clock [ns].
-        sleep: waits for a number of seconds.
-
-    Returns:
-        When each tick was due, started and ended [ns], shape (ticks, 3).
-    """
-    times = np.zeros((points, 3), np.int64)
-    start, point, executed = now() + period_ns, 0, 0
-    while point < points:
-        due = start + point * period_ns
-        wait = due - now()
-        if wait > 0:
-            sleep(wait * 1e-9)
-        started = now()
-        tick()
-        ended = now()
-        times[executed] = due, started, ended
-        executed += 1
-        point = max(point + 1, (ended - start) // period_ns + 1)
-    return times[:executed]
-
-
-def find(blocks: Sequence[dict[str, Any]], robot: str, loop: str, condition: str) -> dict[int, dict[str, Any]]:
-    """Return the blocks of a loop of a robot under a condition, by their round."""
-    wanted = (robot, loop, condition)
-    return {block["round"]: block for block in blocks if (block["robot"], block["loop"], block["condition"]) == wanted}
-
-
-def ratio(ours: dict[int, dict[str, Any]], theirs: dict[int, dict[str, Any]], key: str) -> float | None:
-    """Return the median of the ratios of blocks of the same round; None if no round has both.
-
-    The median of the ratios, not the ratio of the medians: a noisy neighbour disturbs both of a pair.
-    """
-    rounds = sorted(ours.keys() & theirs.keys())
-    found = ratios([ours[number][key] for number in rounds], [theirs[number][key] for number in rounds])
-    return statistics.median(found) if found else None
-
-
 # --- loops ------------------------------------------------------------------------------------------------------------
 
 
@@ -185,19 +130,6 @@ def settled(robot: str) -> Any:
     simulation.reset(np.zeros(1, np.intp), [make_task(robot, config.fps).sample(SEED)], [SEED])
     simulation.world.step(RATES[robot] // 5)
     return simulation.world
-
-
-def run_python(robot: str, seconds: float, load: Load) -> Ticks:
-    """Measure a plain Python loop in this process, with the privileges of the robots' loop.
-
-    But for locked memory: this process holds PyTorch, all of which would be read from the disk.
-    """
-    world, period_ns = settled(robot), 10**9 // RATES[robot]
-    with load(), Privileges() as privileges:
-        grants = privileges.acquire(RealtimeSettings(lock_memory=False))
-        times = walk(world.step, period_ns, round(seconds * RATES[robot]))
-    world.check()
-    return Ticks(times, period_ns, tuple(f"{grant.name}: {grant.detail}" for grant in grants if not grant.granted))
 
 
 def build_twin(folder: Path) -> Path:
@@ -450,77 +382,66 @@ def measure(
     return blocks, notes
 
 
-def peer_of(blocks: Sequence[dict[str, Any]], robot: str, loop: str) -> str:
-    """Return what a loop is compared with."""
-    if loop == VIDEO:
-        return OURS
-    measured = {block["loop"] for block in blocks if block["robot"] == robot}
-    return next((one for one in (TWIN, PYTHON) if one in measured and one != loop), "")
-
-
-def rows(blocks: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each loop and condition: medians over the blocks, the overall maximum, sums, and ratios."""
-    table = []
-    for robot, loop, condition in dict.fromkeys(
-        (block["robot"], block["loop"], block["condition"]) for block in blocks
-    ):
-        own = find(blocks, robot, loop, condition)
-        peer = "" if loop == TWIN else peer_of(blocks, robot, loop)
-        row: dict[str, Any] = {"robot": robot, "loop": loop, "condition": condition, "peer": peer}
-        row |= {key: statistics.median(one[key] for one in own.values()) for key in (*TIMES, "share")}
-        row["wake_max"] = max(one["wake_max"] for one in own.values())
-        row |= {key: sum(one[key] for one in own.values()) for key in ("ticks", "late", "missed")}
-        theirs = find(blocks, robot, peer, condition)
-        row["ratios"] = {key: ratio(own, theirs, key) for key in TIMES}
-        table.append(row)
-    return table
-
-
-def missed_goals(table: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the goals that were missed, in words."""
-    found = []
-    for loop, key, most in GOALS:
-        for row in (one for one in table if one["loop"] == loop):
-            value = row["share"] if key == "share" else row["ratios"][key]
-            if value is not None and value > most:
-                what = "tick_p99 ÷ period" if key == "share" else f"{key} ÷ {row['peer']}"
-                found.append(f"{row['robot']}, {loop}, {row['condition']}: {what} is {value:.2f}, at most {most}")
-    return found
-
-
-def show(table: Sequence[dict[str, Any]], conditions: Sequence[str]) -> None:
-    """Print the table."""
-    view = Table(title="Punctuality: µs (ratio to the peer)", title_justify="left")
-    for heading in ("robot", "loop", "while", "peer"):
-        view.add_column(heading)
-    for heading in ("wake p50", "wake p99", "wake max", "tick p99", "÷ period", "ticks", "late", "missed"):
-        view.add_column(heading, justify="right", no_wrap=True)
-    order = [*RATES, *conditions, TWIN, PYTHON, OURS, VIDEO]
-    for row in sorted(table, key=lambda one: [order.index(one[key]) for key in ("robot", "condition", "loop")]):
+def summarise_blocks(report: Report, blocks: Sequence[dict[str, Any]]) -> None:
+    """Add the rows of each loop and condition: medians over the blocks, the overall maximum, sums, and ratios."""
+    found: dict[tuple[str, str, str], dict[int, dict[str, Any]]] = {}
+    for block in blocks:
+        found.setdefault((block["robot"], block["loop"], block["condition"]), {})[block["round"]] = block
+    for (robot, loop, condition), own in found.items():
+        peer = PEERS.get(loop, "")
+        theirs = found.get((robot, peer, condition), {})
+        both = sorted(own.keys() & theirs.keys())
+        # The median of the ratios, not the ratio of the medians: a noisy neighbour disturbs both of a pair.
+        over = {
+            key: statistics.median(own[number][key] / theirs[number][key] for number in both) if both else None
+            for key in TIMES
+        }
+        middle = {key: statistics.median(one[key] for one in own.values()) for key in (*TIMES, "share")}
+        middle["wake_max"] = max(one["wake_max"] for one in own.values())
+        ticks, late, missed = (sum(one[key] for one in own.values()) for key in ("ticks", "late", "missed"))
+        what = f"{robot} at {RATES[robot]} Hz, {loop}, {condition}"
         cells = [
-            f"{row[key]:.1f}" + ("" if (times := row["ratios"][key]) is None else f" ({times:.2f})") for key in TIMES
+            f"{key} {middle[key]:.1f} us" + ("" if (times := over[key]) is None else f" ({times:.2f} x)")
+            for key in TIMES
         ]
-        counts = [str(row[key]) for key in ("ticks", "late", "missed")]
-        names = [escape(row[key]) for key in ("robot", "loop", "condition", "peer")]
-        view.add_row(*names, *cells, f"{row['share']:.2f}", *counts)
-    console = Console()
-    (console if console.is_terminal else Console(width=160)).print(view)
+        report.add(what + (f", over {peer}" if both else ""), "; ".join(cells))
+        report.add(f"{what}: ticks", f"{ticks}, {late} late by over 0.1 ms, {missed} missed")
+        for name, key, most in GOALS:
+            value = middle["share"] if key == "share" else over[key]
+            if loop == name and value is not None:
+                words = "tick_p99 / period" if key == "share" else f"{key} / {peer}"
+                report.add(f"{what}: {words}", f"{value:.2f}", f"at most {most}", met=value <= most)
+
+
+def check_lengths(what: str, number: int, seconds: float) -> None:
+    """End the program with status 2 if there is nothing to measure, or too much."""
+    if number < 1 or not 0 < seconds <= 3600:
+        print(f"--{what} must be at least 1, and --seconds more than 0 and at most 3600.", file=sys.stderr)
+        sys.exit(2)
+
+
+def add_conditions(report: Report, busy: float, notes: Iterable[str]) -> None:
+    """Add rows of what was refused, and of other programs."""
+    for note in notes:
+        report.add(note, "")
+    used = f"{busy:.0%} of the processors" + (": THE MACHINE IS NOT IDLE" if busy > BUSY else "")
+    report.add("used by other programs before the run", used)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 3 if a goal was missed, 2 if nothing was measured."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.realtime", description=__doc__)
-    parser.add_argument("--blocks", type=int, help="blocks for each loop and condition (default 6)")
-    parser.add_argument("--seconds", type=float, help="length of a block [s] (default 10)")
-    parser.add_argument("--robots", nargs="+", choices=tuple(RATES), default=list(RATES))
-    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
-    parser.add_argument("--quick", action="store_true", help="1 block of 1 s; its numbers are not to be quoted")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args(arguments)
+    options = parse_options(
+        __doc__,
+        arguments,
+        blocks={"type": int, "help": "blocks for each loop and condition (default 6)"},
+        seconds={"type": float, "help": "length of a block [s] (default 10)"},
+        robots={"nargs": "+", "choices": tuple(RATES), "default": list(RATES)},
+        conditions={"nargs": "+", "choices": CONDITIONS, "default": list(CONDITIONS)},
+        quick=(False, "1 block of 1 s; its numbers are not to be quoted"),
+    )
     blocks = (1 if options.quick else 6) if options.blocks is None else options.blocks
     seconds = (1.0 if options.quick else 10.0) if options.seconds is None else options.seconds
-    if blocks < 1 or not 0 < seconds <= 3600:
-        parser.error("--blocks must be at least 1, and --seconds more than 0 and at most 3600.")
+    check_lengths("blocks", blocks, seconds)
     busy = busy_share()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bhd-bench-")))
@@ -529,25 +450,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stack.callback(calls.close, calls.hold_cpu_latency(0))
         loops: list[tuple[str, str, Run]] = []
         for robot in options.robots:
-            loops += [(robot, TWIN, lambda *one: run_twin(*one, folder)), (robot, PYTHON, run_python)]
-            loops.append((robot, OURS, run_robot))
+            loops += [(robot, TWIN, lambda *one: run_twin(*one, folder)), (robot, OURS, run_robot)]
             if robot == "ur5":
                 loops.append((robot, VIDEO, lambda *one: run_robot(*one, folder)))
         found, notes = measure(loops, options.conditions, blocks, seconds)
     if not found:
         print("Nothing was measured.", *notes, sep="\n", file=sys.stderr)
         return 2
-    table = rows(found)
-    missed = missed_goals(table)
-    show(table, options.conditions)
-    print(*(notes or ["Everything that the loops asked the system for was granted."]), sep="\n")
-    if busy > BUSY:
-        print(f"THE MACHINE IS NOT IDLE: before the run other programs used {busy:.0%} of the processors.")
-    if blocks < 6 or seconds < 10:
-        print("A SHORT RUN: these numbers are not to be quoted; that takes 6 blocks of 10 s.")
-    print(*(f"GOAL MISSED: {one}" for one in missed), sep="\n" if missed else "", end="\n" if missed else "goals met\n")
-    write(options.json, {"seconds": seconds, "busy": busy, "notes": list(notes), "rows": table, "blocks": found})
-    return status(met=not missed)
+    is_short = blocks < 6 or seconds < 10
+    short = ". A short run: not to be quoted; that takes 6 blocks of 10 s" if is_short else ""
+    report = Report(f"Punctuality: lateness of ticks, and how long they take{short}")
+    summarise_blocks(report, found)
+    add_conditions(report, busy, notes)
+    report.numbers |= {"seconds": seconds, "busy": busy, "notes": list(notes), "blocks": found}
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

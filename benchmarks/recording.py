@@ -1,17 +1,14 @@
 """Frames per second of recording: LeRobot's own writer, this package, and pyarrow alone, on the same frames.
 
 Run with ``python -m benchmarks.recording``. All of them record the same episodes in one process, in turns; the table
-shows medians. Both datasets are read back through stock LeRobot and compared value by value. With ``--video`` an
-episode has a camera as well, and LeRobot encodes while it records, with the same codec and options.
+shows medians. Both datasets are read back through stock LeRobot and compared value by value.
 """
 
-import argparse
 import contextlib
 import gc
 import io
 import logging
 import shutil
-import statistics
 import sys
 import tempfile
 from collections.abc import Callable
@@ -23,20 +20,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from benchmarks._report import Report, parse_options
 from benchmarks._turns import in_turns, seconds
 from bhd_lerobot.datasets.format.schema import Schema
-from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 FPS = 10
 STATE = 362
-CAMERA = "observation.images.front"
-PYARROW = "pyarrow alone, write_table as it comes"
-PYARROW_PLAIN = "pyarrow alone, without dictionaries"
 METADATA = {"seed": 1, "outcome": "success", "score": 0.5, "brain": "avoidance"}
 
 
-def features(camera: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
+def features() -> dict[str, dict[str, Any]]:
     """Return the features of a recording of a TurtleBot3 with all its beams."""
 
     def feature(dtype: str, size: int = 1) -> dict[str, Any]:
@@ -46,9 +40,6 @@ def features(camera: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
     result |= {f"control.{name}": feature("float32") for name in ("time", "age", "lateness", "overruns", "limited")}
     result |= {"control.watchdog": feature("bool"), "control.mode": feature("int64"), "event": feature("int64")}
     result |= {"next.reward": feature("float32"), "next.success": feature("bool"), "next.done": feature("bool")}
-    if camera:
-        names = ["height", "width", "channels"]
-        result[CAMERA] = {"dtype": "video", "shape": (*camera, 3), "names": names}
     return result
 
 
@@ -60,7 +51,7 @@ def episodes(count: int, length: int) -> list[dict[str, np.ndarray]]:
         scan = 1.5 + np.cumsum(rng.normal(0, 0.02, (length, STATE)), axis=0) + rng.normal(0, 0.01, (length, STATE))
         columns = {"observation.state": np.clip(scan, 0.12, 3.5).astype(np.float32)}
         columns["action"] = rng.uniform(-0.2, 0.2, (length, 2)).astype(np.float32)
-        for key, feature in features(None).items():
+        for key, feature in features().items():
             if key not in columns:
                 values = rng.normal(size=length) if feature["dtype"] == "float32" else rng.random(length) < 0.1
                 columns[key] = values.astype(feature["dtype"])
@@ -68,62 +59,34 @@ def episodes(count: int, length: int) -> list[dict[str, np.ndarray]]:
     return result
 
 
-def images(length: int, camera: tuple[int, int]) -> np.ndarray:
-    """Return moving colour gradients, shape (T, H, W, 3)."""
-    y, x = np.mgrid[: camera[0], : camera[1]]
-    frames = [np.stack([x + 3 * t, y + 2 * t, x + y + t], axis=-1) % 256 for t in range(length)]
-    return np.array(frames, dtype=np.uint8)
-
-
-def record_with_lerobot(root: Path, data: list, camera_frames: np.ndarray | None, settings: VideoSettings) -> None:
+def record_with_lerobot(root: Path, data: list) -> None:
     """Record with LeRobot's own writer."""
-    from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    options: dict[str, Any] = {}
-    camera = None
-    if camera_frames is not None:
-        camera = camera_frames.shape[1:3]
-        recorded = settings.recorded()
-        encoder = RGBEncoderConfig(**{**recorded, "extra_options": {**recorded["extra_options"], "bf": 0}})
-        options = {"rgb_encoder": encoder, "streaming_encoding": True, "encoder_queue_maxsize": 10_000}
-        options["encoder_threads"] = settings.encoder_threads
-    dataset = LeRobotDataset.create(
-        "bench/lerobot", FPS, features(camera), root=root, robot_type="bench", use_videos=True, **options
-    )
+    dataset = LeRobotDataset.create("bench/lerobot", FPS, features(), root=root, robot_type="bench")
     for columns in data:
         for i in range(len(columns["action"])):
             frame = {key: values[i] if values.ndim == 2 else values[i : i + 1] for key, values in columns.items()}
-            if camera_frames is not None:
-                frame[CAMERA] = camera_frames[i]
             dataset.add_frame({**frame, "task": "avoid"})
         dataset.save_episode()
     dataset.finalize()
 
 
-def record_with_ours(
-    root: Path, data: list, camera_frames: np.ndarray | None, settings: VideoSettings, by_frame: bool
-) -> None:
+def record_with_ours(root: Path, data: list, *, by_frame: bool) -> None:
     """Record with this package, by frames or by columns."""
-    camera = camera_frames.shape[1:3] if camera_frames is not None else None
-    with DatasetRecorder.create(
-        "bench/ours", FPS, features(camera), robot_type="bench", root=root, recording={}, video=settings
-    ) as recorder:
+    with DatasetRecorder.create("bench/ours", FPS, features(), robot_type="bench", root=root, recording={}) as recorder:
         for columns in data:
             episode = recorder.begin_episode()
             if not by_frame:
                 episode.set_columns(columns)
-            for i in range(len(columns["action"])):
-                if by_frame:
-                    episode.add_frame({key: values[i] for key, values in columns.items()})
-                if camera_frames is not None:
-                    episode.add_image(CAMERA, camera_frames[i])
+            for i in range(len(columns["action"])) if by_frame else ():
+                episode.add_frame({key: values[i] for key, values in columns.items()})
             recorder.save(episode, task="avoid", metadata=METADATA)
 
 
 def write_with_pyarrow(root: Path, data: list, options: dict[str, Any]) -> None:
     """Write the same columns with one ``pq.write_table`` per episode, and nothing else."""
-    schema = Schema(features(None))
+    schema = Schema(features())
     root.mkdir()
     start = 0
     for index, columns in enumerate(data):
@@ -134,7 +97,7 @@ def write_with_pyarrow(root: Path, data: list, options: dict[str, Any]) -> None:
         start += len(frames)
 
 
-def check(root: Path, data: list, camera_frames: np.ndarray | None) -> None:
+def check(root: Path, data: list) -> None:
     """Read a dataset with stock LeRobot and compare every value with what was recorded."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -148,37 +111,22 @@ def check(root: Path, data: list, camera_frames: np.ndarray | None) -> None:
         assert np.array_equal(values.to_numpy(zero_copy_only=False).reshape(wanted.shape), wanted), key
     assert dataset[0]["observation.state"].numpy().tobytes() == data[0]["observation.state"][0].tobytes()
     assert set(dataset.meta.stats["observation.state"]) >= {"min", "max", "mean", "std", "count", "q01", "q99"}
-    if camera_frames is not None:
-        for i in (0, len(dataset) - 1):
-            decoded = dataset[i][CAMERA].permute(1, 2, 0).numpy() * 255
-            difference = np.abs(decoded - camera_frames[i % len(camera_frames)]).mean()
-            assert difference < 12, f"frame {i} differs by {difference:.1f} grey levels"
 
 
 def main() -> int:
     """Run all of them in turns and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--length", type=int, default=300)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--video", action="store_true", help="add a 320 x 240 camera")
-    arguments = parser.parse_args()
+    arguments = parse_options(__doc__, episodes=20, length=300, repeats=5)
     data = episodes(arguments.episodes, arguments.length)
-    camera_frames = images(arguments.length, (240, 320)) if arguments.video else None
-    settings = VideoSettings()
     logging.disable(logging.WARNING)
-
-    plain = {"use_dictionary": False}
     contestants: dict[str, Callable[[Path], None]] = {
-        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(
-            root, data, camera_frames, settings
+        "ours, set_columns": partial(record_with_ours, data=data, by_frame=False),
+        "ours, add_frame": partial(record_with_ours, data=data, by_frame=True),
+        "LeRobot add_frame + save_episode + finalize": partial(record_with_lerobot, data=data),
+        "pyarrow alone, write_table as it comes": partial(write_with_pyarrow, data=data, options={}),
+        "pyarrow alone, without dictionaries": partial(
+            write_with_pyarrow, data=data, options={"use_dictionary": False}
         ),
-        "ours, set_columns": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=False),
-        "ours, add_frame": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=True),
     }
-    if camera_frames is None:
-        contestants[PYARROW] = lambda root: write_with_pyarrow(root, data, {})
-        contestants[PYARROW_PLAIN] = lambda root: write_with_pyarrow(root, data, plain)
     done = set()
 
     def run(name: str) -> float:
@@ -189,7 +137,7 @@ def main() -> int:
             with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
                 took = seconds(lambda: contestants[name](folder / "dataset"))
                 if name not in done and "pyarrow" not in name:
-                    check(folder / "dataset", data, camera_frames)
+                    check(folder / "dataset", data)
             done.add(name)
             return took
         finally:
@@ -197,15 +145,10 @@ def main() -> int:
 
     times = in_turns({name: partial(run, name) for name in contestants}, arguments.repeats)
     frames = arguments.episodes * arguments.length
-    rates = {name: frames / statistics.median(took) for name, took in times.items()}
-    shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
-    print(f"{shape}{', camera 320x240' if camera_frames is not None else ''}; median of {arguments.repeats}")
-    references = {"x LeRobot": next(iter(rates)), "x pyarrow": PYARROW, "x pyarrow plain": PYARROW_PLAIN}
-    print(f"{'':44} {'frames/s':>10} {'ms/episode':>11}" + "".join(f"{title:>17}" for title in references))
-    for name, rate in rates.items():
-        shares = [f"{rate / rates[other]:17.2f}" if other in rates else f"{'-':>17}" for other in references.values()]
-        print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f}" + "".join(shares))
-    return 0
+    speeds = {name: [frames / one for one in took] for name, took in times.items()}
+    report = Report(f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats")
+    report.compare("recording", "frames/s", speeds, [name for name in speeds if "ours" not in name], form=",.0f")
+    return report.end(arguments.json)
 
 
 if __name__ == "__main__":

@@ -7,15 +7,13 @@ question is about a table of its own, so the intervals are Wilson's. Evaluations
 not show a brain that takes anything.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks._turns import write
+from benchmarks._report import parse_options, write
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, TableScene
 from bhd_lerobot.control.commands import Goals
 from bhd_lerobot.envs.stage import Stage
@@ -80,17 +78,16 @@ def ask(perception: PerceptionOptions, world: str, seeds: Sequence[int]) -> dict
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Ask in each world, and print how often the brain went for something; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--path", required=True, help="checkpoint of a bhd_perception")
-    parser.add_argument("--worlds", nargs="+", choices=("nominal", "randomised", "unseen"), default=["nominal"])
-    parser.add_argument("--episodes", type=int, default=500, help="tables")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--split", choices=("held_out", "validation"), default="held_out")
-    parser.add_argument(
-        "--min_certainty", type=float, help="as brain.perception.min_certainty; its default if left out"
+    options = parse_options(
+        __doc__,
+        arguments,
+        path={"required": True, "help": "checkpoint of a bhd_perception"},
+        worlds={"nargs": "+", "choices": ("nominal", "randomised", "unseen"), "default": ["nominal"]},
+        episodes=(500, "tables"),
+        seed=0,
+        split={"choices": ("held_out", "validation"), "default": "held_out"},
+        min_certainty={"type": float, "help": "as brain.perception.min_certainty; its default if left out"},
     )
-    parser.add_argument("--json", type=Path, help="file for the numbers")
-    options = parser.parse_args(arguments)
     certainty = {} if options.min_certainty is None else {"min_certainty": options.min_certainty}
     seeds = [episode_seed(options.seed, episode, options.split) for episode in range(options.episodes)]
     found = {}

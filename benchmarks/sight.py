@@ -16,7 +16,6 @@ brain that may not happen more often than beside `noop`. Exits with 3 if a goal 
 measured.
 """
 
-import argparse
 import logging
 import math
 import os
@@ -36,12 +35,21 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 from torch.nn import functional
 
-from benchmarks._turns import ratios, status, write
-from benchmarks.realtime import BUSY, SEED, WARM_UP_S, NotMeasuredError, busy_share, drive, make_task, summarise
+from benchmarks._report import Report, parse_options
+from benchmarks._turns import ratios
+from benchmarks.realtime import (
+    SEED,
+    WARM_UP_S,
+    NotMeasuredError,
+    add_conditions,
+    busy_share,
+    check_lengths,
+    drive,
+    make_task,
+    summarise,
+)
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.policies.baselines import NoopBrain
@@ -62,6 +70,7 @@ WIDTH, HEIGHT = 320, 240
 NOOP, PERCEPTION, PIXELS = BRAINS = ("noop", "bhd_perception", "bhd_pixels")
 BESIDE, SAME = CORES = ("its own core", "the brain's core")
 TIMES = ("wake_p50", "wake_p99", "tick_p99")
+KEYS = (*TIMES, "late_share", "frames_per_s", "cpu_ms", "inference_p50", "inference_p99")
 GOALS = {
     "wake_p99": 1.5,  # largest ratio of lateness to that beside `noop`
     "late_share": 0.001,  # by which the share of late ticks may exceed that beside `noop`
@@ -259,74 +268,49 @@ def attempt(run: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], int]:
 # --- results ----------------------------------------------------------------------------------------------------------
 
 
-def rows(blocks: Sequence[dict[str, Any]], fps: int = 25) -> list[dict[str, Any]]:
-    """Return a row for each brain and core: medians over the blocks, and the ratios to `noop` in the same round."""
-    table = []
+def summarise_blocks(report: Report, blocks: Sequence[dict[str, Any]], fps: int = 25) -> None:
+    """Add the rows of each brain on each core: medians over the blocks, and ratios to `noop` in the same round."""
     for where, name in dict.fromkeys((one["core"], one["brain"]) for one in blocks):
         own, quiet = (
             [one for one in blocks if (one["core"], one["brain"]) == (where, brain)] for brain in (name, NOOP)
         )
-        row: dict[str, Any] = {"core": where, "brain": name, "rounds": len(own)}
-        for key in (*TIMES, "wake_max", "late_share", "frames_per_s", "cpu_ms", "inference_p50", "inference_p99"):
-            row[key] = statistics.median(one[key] for one in own)
-        row |= {key: sum(one[key] for one in own) for key in ("ticks", "late", "missed", "stops")}
-        row["objects"] = None if own[0]["objects"] is None else statistics.mean(one["objects"] for one in own)
-        if name != NOOP:
-            row["ratios"] = {
-                key: statistics.median(ratios([one[key] for one in own], [one[key] for one in quiet])) for key in TIMES
-            }
-            more = statistics.median(
-                one["late_share"] - other["late_share"] for one, other in zip(own, quiet, strict=True)
-            )
-            row["late_share_excess"] = more
-            is_punctual = row["ratios"]["wake_p99"] <= GOALS["wake_p99"] and more <= GOALS["late_share"]
-            is_kept_up = row["frames_per_s"] >= GOALS["frames_per_s"] * fps
-            row["met"] = is_punctual and is_kept_up and row["stops"] <= sum(one["stops"] for one in quiet)
-        table.append(row)
-    return table
-
-
-def show(table: Sequence[dict[str, Any]]) -> None:
-    """Print the table."""
-    title = "A UR5 at 500 Hz, brains at 25 Hz: lateness of ticks in µs (ratio to noop), of the brain in ms"
-    view = Table(title=title, title_justify="left")
-    for heading in ("cerebellum on", "brain"):
-        view.add_column(heading)
-    for heading in (
-        "wake p50",
-        "wake p99",
-        "tick p99",
-        "late",
-        "missed",
-        "of ticks",
-        "frames/s",
-        "CPU/frame",
-        "inference p50, p99",
-    ):
-        view.add_column(heading, justify="right", no_wrap=True)
-    for row in sorted(table, key=lambda one: (CORES.index(one["core"]), BRAINS.index(one["brain"]))):
-        times = [f"{row[key]:.1f}" + (f" ({row['ratios'][key]:.2f})" if "ratios" in row else "") for key in TIMES]
-        counts = [f"{100 * row['late_share']:.2f} %", str(row["missed"]), str(row["ticks"])]
-        brain = [
-            f"{row['frames_per_s']:.2f}",
-            f"{row['cpu_ms']:.1f}",
-            f"{row['inference_p50']:.2f}, {row['inference_p99']:.2f}",
-        ]
-        view.add_row(row["core"], row["brain"], *times, *counts, *brain)
-    Console(width=150).print(view)
+        middle, beside = ({key: statistics.median(one[key] for one in some) for key in KEYS} for some in (own, quiet))
+        missed, missed_beside, stops, stops_beside = (
+            sum(one[key] for one in some) for key in ("missed", "stops") for some in (own, quiet)
+        )
+        what = f"UR5 at 500 Hz beside {name} at {fps} Hz, cerebellum on {where}"
+        times = ", ".join(f"{key} {middle[key]:.1f} us" for key in TIMES)
+        inference = f"inference p50 {middle['inference_p50']:.2f} ms, p99 {middle['inference_p99']:.2f} ms"
+        report.add(what, f"{times}; {inference}; {sum(one['ticks'] for one in own)} ticks")
+        if name == NOOP:
+            continue
+        pairs = [[one["wake_p99"] for one in some] for some in (own, quiet)]
+        over, goal = statistics.median(ratios(*pairs)), GOALS["wake_p99"]
+        value = f"{over:.2f} x ({middle['wake_p99']:.0f} us)"
+        heading = f"{what}: lateness of ticks p99, over that beside noop"
+        report.add(heading, value, f"at most {goal:g} x", met=over <= goal)
+        more = statistics.median(a["late_share"] - b["late_share"] for a, b in zip(own, quiet, strict=True))
+        stopped = f"; stopped and run again {stops}, beside noop {stops_beside}" if stops else ""
+        shares = f"{middle['late_share']:.2%}, beside noop {beside['late_share']:.2%}"
+        value = f"{shares}; missed {missed}, beside noop {missed_beside}{stopped}"
+        is_met, goal = more <= GOALS["late_share"] and stops <= stops_beside, GOALS["late_share"]
+        report.add(f"{what}: ticks later than 0.1 ms", value, f"at most {goal:.1%} more", met=is_met)
+        frames, goal = middle["frames_per_s"], GOALS["frames_per_s"]
+        value = f"{frames:.2f}, beside noop {beside['frames_per_s']:.2f}; {middle['cpu_ms']:.1f} CPU ms each"
+        report.add(f"{what}: frames/s", value, f"at least {goal:.0%} of {fps}", met=frames >= goal * fps)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return 3 if a goal was missed, 2 if nothing was measured."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.sight", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=6, help="blocks for each brain and core")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a block [s]")
-    parser.add_argument("--perception", type=Path, help="checkpoint of a bhd_perception, for 320 x 240 px")
-    parser.add_argument("--pixels", type=Path, help="checkpoint of a bhd_pixels, for this robot")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
-    options = parser.parse_args(arguments)
-    if options.rounds < 1 or not 0 < options.seconds <= 3600:
-        parser.error("--rounds must be at least 1, and --seconds more than 0 and at most 3600.")
+    options = parse_options(
+        __doc__,
+        arguments,
+        rounds=(6, "blocks for each brain and core"),
+        seconds=(10.0, "length of a block [s]"),
+        perception={"type": Path, "help": "checkpoint of a bhd_perception, for 320 x 240 px"},
+        pixels={"type": Path, "help": "checkpoint of a bhd_pixels, for this robot"},
+    )
+    check_lengths("rounds", options.rounds, options.seconds)
     torch.set_num_threads(1)
     # The untrained policy has no dataset to name, and is warned of in every block.
     logging.getLogger("bhd_lerobot.policies.learned").setLevel(logging.ERROR)
@@ -342,21 +326,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (BhdError, NotMeasuredError) as error:
         print(f"Nothing was measured: {error}", file=sys.stderr)
         return 2
-    table = rows(blocks)
-    show(table)
-    refused = dict.fromkeys(one for found in blocks for one in found["refused"])
-    print(*(f"refused was {one}" for one in refused), sep="\n", end="\n" if refused else "")
-    looked = next(row["objects"] for row in table if row["brain"] == PERCEPTION)
-    print(f"Objects found per image: {looked:.1f}.")
-    if busy > BUSY:
-        print(f"THE MACHINE IS NOT IDLE: before the run other programs used {busy:.0%} of the processors.")
-    for row in table:
-        if row["stops"]:
-            print(f"STOPPED AND RUN AGAIN: {row['stops']} blocks of {row['brain']}, cerebellum on {row['core']}")
-    missed = [f"{row['brain']}, cerebellum on {row['core']}" for row in table if row.get("met") is False]
-    print(*(f"GOAL MISSED: {one}" for one in missed), sep="\n" if missed else "", end="\n" if missed else "goals met\n")
-    write(options.json, {"seconds": options.seconds, "busy": busy, "goals": GOALS, "rows": table, "blocks": blocks})
-    return status(met=not missed)
+    report = Report("A UR5 at 500 Hz, brains at 25 Hz")
+    summarise_blocks(report, blocks)
+    objects = statistics.mean(one["objects"] for one in blocks if one["brain"] == PERCEPTION)
+    report.add("objects found per image", f"{objects:.1f}")
+    add_conditions(report, busy, {f"refused was {one}": None for found in blocks for one in found["refused"]})
+    report.numbers |= {"seconds": options.seconds, "busy": busy, "goals": GOALS, "blocks": blocks}
+    return report.end(options.json)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""What is claimed about learning, recorded, trained and evaluated again: `make results`."""
+"""What is claimed about learning and speed: run by `make results`, written to `docs/reference/results.md`."""

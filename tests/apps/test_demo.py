@@ -1,6 +1,7 @@
 """The demo runs without further input, names files that exist, and takes nothing away from a folder that it finds."""
 
 import json
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from bhd_lerobot.apps import demo
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.cli.demo import main
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import RenderingError
+from bhd_lerobot.errors import RenderingError, counted
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
@@ -22,32 +23,43 @@ from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.world import World
 from bhd_lerobot.training.arguments import parse_train
-from tests.cases import each_case
 
 pytestmark = pytest.mark.figures
 
-SMALL = {"episodes": 2, "steps": 4, "trials": 2, "video": False}  # videos are the slowest part, and tested elsewhere
-AVOID = replace(
-    demo.AVOID,
-    **SMALL,
-    world=("--robot.type=turtlebot3", "--robot.beams=36", "--task.type=avoid", "--task.duration_s=2", "--threads=1"),
-)
-REACH = replace(
-    demo.REACH,
-    **SMALL,
-    early_steps=2,
-    world=(*demo.REACH.world, "--threads=1"),
-)
-PICK = replace(demo.PICK, episodes=1, video=False, options=("--threads=1",))
-SEE = replace(
-    demo.SEE,
-    episodes=12,
-    batch=4,
-    steps=2,
-    trials=1,
-    world=("--robot.type=ur5", "--robot.camera=true", "--robot.camera_width=96", "--robot.camera_height=72"),
-    policy=("--policy.channels=4", "--policy.hidden=4", "--policy.context=4"),
-)
+NUMBERS = {"steps": 4, "log_freq": 1, "eval_steps": 1, "n_envs": 2, "n_episodes": 2, "dataset.num_episodes": 2}
+NUMBERS |= {"task.duration_s": 2}
+OWN = {
+    "ur5_pick": {"dataset.num_episodes": 1, "n_envs": 1},
+    "ur5_reach": {"task.duration_s": 6, "save_freq": 2},
+    "ur5_see": {"dataset.num_episodes": 12, "n_envs": 1, "n_episodes": 1, "steps": 2, "batch_size": 4}
+    | {"task.duration_s": 0.04, "robot.camera_width": 96, "robot.camera_height": 72},
+}
+
+
+def read_small() -> tuple[dict[str, list[demo.Command]], dict[str, str]]:
+    """The commands of the demo, with fewer and shorter episodes and trainings, and without videos, which are slow."""
+    steps, words = WHOLE
+    numbers = re.compile(r"--([\w.]+)=(\d[\d.]*)(?= |$)")
+
+    def shrink(command: demo.Command) -> demo.Command:
+        small = {**NUMBERS, **OWN.get(command.name, {})}
+        line = command.line
+        for word in ("roaming", "reaching", "seeing"):
+            line = line.replace(f"{{{word}}}", words[word])
+        line = numbers.sub(lambda one: f"--{one[1]}={small.get(one[1], one[2])}", line).replace("000300", "000002")
+        if line.startswith("bhd-record"):
+            line = line.replace("--preview_video=false ", "") + " --preview_video=false"
+        if line.startswith(("bhd-record", "bhd-eval")):
+            line += " --threads=1" + (" --robot.beams=36" if command.name == "turtlebot3_avoid" else "")
+        if "bhd_perception" in line:
+            line += " --policy.channels=4 --policy.hidden=4 --policy.context=4"
+        return replace(command, line=line)
+
+    without = {**words, "beside": words["beside"].replace("{videos}", "--videos=0")}
+    return {heading: [shrink(one) for one in step] for heading, step in steps.items()}, without
+
+
+WHOLE = demo.read_steps()
 
 
 def _can_render() -> bool:
@@ -63,7 +75,7 @@ CAN_RENDER = _can_render()
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(demo, "LESSONS", (AVOID, REACH, PICK))
+    monkeypatch.setattr(demo, "read_steps", read_small)
     monkeypatch.setenv("COLUMNS", "160")
 
 
@@ -72,9 +84,8 @@ def done(tmp_path_factory):
     """Return the folder of a small demo, and what it printed."""
     folder = tmp_path_factory.mktemp("demo") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "LESSONS", (AVOID, REACH, PICK))
-        patch.setattr(demo, "SEE", SEE)
-        patch.setattr(demo.Demo, "_can_render", CAN_RENDER)  # whether there is a video says it otherwise
+        patch.setattr(demo, "read_steps", read_small)
+        patch.setattr(demo, "can_render", lambda _: CAN_RENDER)  # whether there is a video says it otherwise
         patch.setenv("COLUMNS", "160")
         printed: list[str] = []
         patch.setattr("sys.stdout", _Kept(printed))
@@ -120,14 +131,14 @@ def test_every_path_that_is_named_exists(done):
 
 def test_datasets_load_with_lerobot_and_checkpoints_name_what_they_were_trained_on(done):
     folder, printed = done
-    for one in (AVOID, REACH, PICK):
-        root = folder / one.name / "dataset"
-        dataset = LeRobotDataset(f"bhd/demo_{one.name}", root=root, video_backend="pyav")
-        assert dataset.num_episodes == one.episodes == len(dataset_info(root).episodes)
-        assert f"{one.episodes} episodes, {dataset.num_frames:,} frames" in printed
-    for one in (AVOID, REACH):
-        contract = PolicyContract.load(folder / one.name / "train/checkpoints/last/pretrained_model")
-        assert contract.robot_type == one.name.partition("_")[0]
+    for name, episodes in (("turtlebot3_avoid", 2), ("ur5_reach", 2), ("ur5_pick", 1)):
+        root = folder / name / "dataset"
+        dataset = LeRobotDataset(f"bhd/demo_{name}", root=root, video_backend="pyav")
+        assert dataset.num_episodes == episodes == len(dataset_info(root).episodes)
+        assert f"{counted(episodes, 'episode')}, {dataset.num_frames:,} frames" in printed
+    for name in ("turtlebot3_avoid", "ur5_reach"):
+        contract = PolicyContract.load(folder / name / "train/checkpoints/last/pretrained_model")
+        assert contract.robot_type == name.partition("_")[0]
     assert (folder / "ur5_reach/train/checkpoints/000002/pretrained_model").is_dir()
 
 
@@ -189,20 +200,27 @@ def test_a_signal_in_a_step_ends_the_demo_with_its_status(small, tmp_path, monke
 
 
 def test_a_failure_in_a_step_gives_its_message_and_status_2(small, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(demo, "LESSONS", (replace(PICK, options=("--task.max_objects=0",)),))
+    broken = demo.Command(
+        "ur5_pick", "bhd-record --robot.type=ur5 --task.type=pick --brain.type=pick --task.max_objects=0 {data}"
+    )
+    monkeypatch.setattr(demo, "read_steps", lambda: ({"1. Record": [broken]}, WHOLE[1]))
     assert main([str(tmp_path / "run")]) == 2
     assert "max_objects" in capsys.readouterr().err
 
 
-@each_case("one", [demo.AVOID, demo.REACH])
-def test_whole_size_command_lines_are_valid(one, tmp_path):
-    recorded = parse(RecordConfig, one.record_options(tmp_path))
-    assert recorded.dataset.num_episodes == one.episodes
-    trained = parse_train(one.train_options(tmp_path)).config
-    assert trained.steps == one.steps
-    assert trained.dataset.root == recorded.dataset.root
-    assert not one.early_steps or one.steps % one.early_steps == 0
-    assert (Path(demo.__file__).parents[2] / one.recipe).is_file()
-    rule = replace(one, early_steps=0)
-    options = [text for text in rule.eval_options(tmp_path, tmp_path / "none", None) if "learned" not in text]
-    assert parse(EvalConfig, options).split != recorded.split
+def test_whole_size_command_lines_are_valid(tmp_path):
+    steps, words = WHOLE
+    splits = []
+    for command in (one for step in steps.values() for one in step):
+        options = demo.options_of(command, words, tmp_path, "--videos=1")
+        if command.line.startswith("bhd-record"):
+            splits.append(parse(RecordConfig, options).split)
+        elif command.line.startswith("bhd-train"):
+            config = parse_train(options).config
+            assert not config.save_freq or config.steps % config.save_freq == 0
+            assert config.dataset.root == str(tmp_path / "dataset")
+        elif command.line.startswith("bhd-eval"):
+            rules = [text for text in options if not re.search(r"learned|early|\.path=", text)]
+            assert parse(EvalConfig, rules).split not in splits
+        for note in command.notes:
+            assert (Path(demo.__file__).parents[2] / re.search(r"configs/\S+yaml", note)[0]).is_file()

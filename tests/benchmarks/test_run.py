@@ -23,12 +23,11 @@ SHORT = {
     "contact": "--speeds=3 --frames=5",
     "envs": "--n=1 --repeats=1 --seconds=0.1 --peers sync",
     "evaluate": "--demonstrations=2 --steps=2 --episodes=1 --n_envs=1 --turns=1",
-    "hub": "--megabytes=1 --files=1 --turns=1",
     "images": "--policies=bhd_cnn --episodes=2 --steps=2 --turns=1 --whole",
     "impedance": "--quick",
     "kinematics": "--poses=2",
     "lines": "--lines=1",
-    "loader": "--episodes 1 0 --repeats=1 --seconds=0.1 --no-start",
+    "loader": "--episodes 1 0 --repeats=1 --seconds=0.1 --no_start",
     "merge": "--datasets=2 --episodes=10 --frames=10 --turns=1",
     "motion": "--motions=1",
     "navigate": "--episodes=1",
@@ -75,7 +74,7 @@ def test_a_benchmark_runs_in_its_shortest_form(name: str, tmp_path: Path) -> Non
 def test_a_crash_and_a_missed_goal_have_statuses_of_their_own(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    statuses = {"arms": 0, "bags": GOAL_MISSED, "check": 1, "hub": -9, "wire": 2}
+    statuses = {"arms": 0, "bags": GOAL_MISSED, "check": 1, "motion": -9, "wire": 2}
     assert GOAL_MISSED not in (0, 1, 2)  # of success, of an exception, and of wrong options
 
     def fake(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
@@ -85,7 +84,7 @@ def test_a_crash_and_a_missed_goal_have_statuses_of_their_own(
     assert run.main(["arms"]) == 0
     assert run.main(["arms", "bags"]) == GOAL_MISSED
     assert "Goals missed: bags." in capsys.readouterr().err
-    for name in ("check", "hub", "wire"):
+    for name in ("check", "motion", "wire"):
         assert run.main(["arms", "bags", name]) == 1
         assert f"Failed: {name}." in capsys.readouterr().err
     assert run.main(["no_such"]) == 2

@@ -7,46 +7,63 @@ import pytest
 import torch
 
 from benchmarks import sight
+from benchmarks._report import Report, Row
 from benchmarks.realtime import NotMeasuredError
-from benchmarks.results.speed import sight_rows
-from benchmarks.sight import ATTEMPTS, BESIDE, GOALS, HEIGHT, NOOP, PERCEPTION, SAME, WIDTH, rows, untrained_perception
+from benchmarks.sight import (
+    ATTEMPTS,
+    BESIDE,
+    HEIGHT,
+    NOOP,
+    PERCEPTION,
+    SAME,
+    WIDTH,
+    summarise_blocks,
+    untrained_perception,
+)
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
+from tests.cases import each_case
 
 
-def block(brain: str, number: int, wake: float, *, core: str = SAME, rate: float = 25.0) -> dict[str, Any]:
+def block(brain: str, number: int, wake: float, *, core: str = SAME) -> dict[str, Any]:
     times = {"wake_p50": wake / 2, "wake_p99": wake, "wake_max": 3 * wake, "tick_p99": 100.0}
-    brains = {"frames_per_s": rate, "cpu_ms": 9.0, "inference_p50": 8.0, "inference_p99": 9.0, "objects": None}
+    brains = {"frames_per_s": 25.0, "cpu_ms": 9.0, "inference_p50": 8.0, "inference_p99": 9.0, "objects": None}
     counts = {"ticks": 5000, "late": 5, "missed": 1, "late_share": 1e-3, "stops": 0}
     return {"round": number, "core": core, "brain": brain, **times, **brains, **counts}
+
+
+def report(blocks: list[dict[str, Any]]) -> dict[str, Row]:
+    """Return the rows by core, brain and what is measured."""
+    found, first, second = Report(""), "UR5 at 500 Hz beside ", " at 25 Hz, cerebellum"
+    summarise_blocks(found, blocks)
+    return {row.what.replace(first, "").replace(second, ""): row for row in found.rows}
 
 
 def test_a_ratio_is_taken_within_a_round_and_on_the_same_core() -> None:
     blocks = [block(NOOP, 0, 10.0), block(PERCEPTION, 0, 12.0), block(NOOP, 1, 100.0), block(PERCEPTION, 1, 140.0)]
     blocks += [block(NOOP, 0, 1.0, core=BESIDE), block(PERCEPTION, 0, 3.0, core=BESIDE)]
-    table = {(row["core"], row["brain"]): row for row in rows(blocks)}
-    assert table[SAME, PERCEPTION]["ratios"]["wake_p99"] == pytest.approx(1.3)
-    assert table[SAME, PERCEPTION]["met"]
-    assert (table[SAME, PERCEPTION]["ticks"], table[SAME, PERCEPTION]["missed"]) == (10_000, 2)
-    assert table[BESIDE, PERCEPTION]["ratios"]["wake_p99"] == pytest.approx(3.0)
-    assert not table[BESIDE, PERCEPTION]["met"]
-    assert "ratios" not in table[SAME, NOOP]
+    rows = report(blocks)
+    late = "lateness of ticks p99, over that beside noop"
+    same, beside = (rows[f"{PERCEPTION} on {core}: {late}"] for core in (SAME, BESIDE))
+    assert (same.value, same.met) == ("1.30 x (76 us)", True)
+    assert (beside.value, beside.met) == ("3.00 x (3 us)", False)
+    assert rows[f"{PERCEPTION} on {SAME}"].value.endswith("10000 ticks")
+    assert not [what for what in rows if what.startswith(NOOP) and ": " in what]
 
 
-def test_what_is_too_slow_misses_its_goal_and_the_page_says_so() -> None:
-    table = rows([block(NOOP, 0, 10.0), block(PERCEPTION, 0, 10.0, rate=20.0)])
-    assert not table[1]["met"]
-    shown = sight_rows({"rows": table, "goals": GOALS})
-    assert [row.met for row in shown] == [True, True, False]
-    assert "20.00, beside noop 25.00" in shown[2].value
-
-
-def test_more_late_ticks_than_beside_noop_in_the_same_round_miss_the_goal() -> None:
-    for late, met in ((2e-3, True), (3e-3, False)):
-        blocks = [block(NOOP, 0, 10.0), {**block(PERCEPTION, 0, 10.0), "late_share": late}]
-        table = rows(blocks)
-        assert table[1]["met"] == met
-        assert [row.met for row in sight_rows({"rows": table, "goals": GOALS})] == [True, met, True]
+@each_case(
+    ("more", "missed"),
+    [
+        ({}, []),
+        ({"frames_per_s": 20.0}, ["frames/s"]),
+        ({"late_share": 2e-3}, []),
+        ({"late_share": 3e-3}, ["ticks later than 0.1 ms"]),
+    ],
+)
+def test_what_is_too_slow_or_too_often_late_misses_its_goal(more: dict[str, float], missed: list[str]) -> None:
+    rows = report([block(NOOP, 0, 10.0), {**block(PERCEPTION, 0, 10.0), **more}])
+    assert [what.split(": ")[1] for what, row in rows.items() if row.met is False] == missed
+    assert f"{more.get('frames_per_s', 25.0):.2f}, beside noop 25.00" in rows[f"{PERCEPTION} on {SAME}: frames/s"].value
 
 
 def test_a_block_whose_robot_was_stopped_is_run_again_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,14 +79,11 @@ def test_a_block_whose_robot_was_stopped_is_run_again_and_counted(monkeypatch: p
     monkeypatch.setattr(sight, "block", run)
     for stopped in range(ATTEMPTS):
         asked.clear()
-        table = rows(sight.measure(1, 1.0, {}))
-        assert asked.count(PERCEPTION) == stopped + len(table) // 3
-        assert {row["brain"]: row["stops"] for row in table if row["core"] == SAME}[PERCEPTION] == stopped
-        told = sight_rows({"rows": table, "goals": GOALS})[1]
-        assert (f"stopped and run again {stopped}, beside noop 0" in told.value) == bool(stopped)
-        assert told.met == (not stopped)
-        missed = [(row["core"], row["brain"]) for row in table if row.get("met") is False]
-        assert missed == ([(SAME, PERCEPTION)] if stopped else [])
+        blocks = sight.measure(1, 1.0, {})
+        assert asked.count(PERCEPTION) == stopped + len(blocks) // 3
+        row = report(blocks)[f"{PERCEPTION} on {SAME}: ticks later than 0.1 ms"]
+        assert (f"stopped and run again {stopped}, beside noop 0" in row.value) == bool(stopped)
+        assert row.met == (not stopped)
     stopped = ATTEMPTS
     asked.clear()
     with pytest.raises(NotMeasuredError, match="ended with fault"):

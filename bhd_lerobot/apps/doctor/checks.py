@@ -15,6 +15,7 @@ from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 
+import yaml
 from packaging.specifiers import SpecifierSet
 
 from bhd_lerobot.apps.doctor.trials import Outcome
@@ -55,16 +56,7 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found. In the table ``{name}`` stands for a value.
-
-    Attributes:
-        check: the check.
-        status: how bad it is.
-        symptom: what a user notices; this and the next two are empty where all is well.
-        cause: why.
-        remedy: what to do.
-        found: what was measured or read.
-    """
+    """What a check found, and what a user notices, why, and what to do; empty where all is well."""
 
     check: str
     status: Status
@@ -74,229 +66,22 @@ class Finding:
     found: str = ""
 
 
-_W, _P = Status.WARNING, Status.PROBLEM
-_RIGHTS = GRANT_RIGHTS.replace("{rtprio}", "95")
-_REINSTALL = "`make venv` in the checkout, or `pip install -e .` there in the environment that you use"
-_SOFTWARE_GL = "`apt-get install libosmesa6` and `MUJOCO_GL=osmesa`; or another driver"
-_LATE = "{share} of the period passed before the latest wake-up: other load, a busy host, or rights that were refused"
-
-ROWS: dict[str, Finding] = {
-    "python": Finding(
-        "Python",
-        _P,
-        "packages cannot be installed or imported",
-        "Python {version} is not supported; required: {required}",
-        "make the environment with Python 3.12 or 3.13: `PYTHON=/path/to/python3.12 make test`",
-    ),
-    "package.missing": Finding(
-        "versions",
-        _P,
-        "imports fail, or LeRobot does not know our robots",
-        "`{name}` is not installed in this environment",
-        _REINSTALL,
-    ),
-    "package.version": Finding(
-        "versions",
-        _P,
-        "errors about arguments, attributes or types that there are not",
-        "`{name}` is {version}; required: {required}",
-        _REINSTALL,
-    ),
-    "plugins.error": Finding(
-        "plug-ins",
-        _P,
-        "every `lerobot-*` command fails",
-        "LeRobot cannot be imported: {error}",
-        "repair what the message names, or " + _REINSTALL,
-    ),
-    "plugins.missing": Finding(
-        "plug-ins",
-        _P,
-        "`--robot.type=turtlebot3` or `--teleop.type=bhd_brain` is an invalid choice for `lerobot-record`",
-        "LeRobot did not find {missing}: `lerobot_robot_bhd` is not installed, or its import failed. {error}",
-        _REINSTALL,
-    ),
-    "plugins.failed": Finding(
-        "plug-ins",
-        _W,
-        "what the plug-in has is an invalid choice for every command",
-        "{error}",
-        "repair the plug-in, or uninstall it: `uv pip uninstall NAME`",
-    ),
-    "opengl.missing": Finding(
-        "OpenGL",
-        _W,
-        "no camera images, and no video of an episode",
-        "no OpenGL that renders without a display. {error}",
-        "`apt-get install libegl1 libgl1`, with and without a GPU; unset `MUJOCO_GL`; or leave the cameras off",
-    ),
-    "opengl.crash": Finding(
-        "OpenGL",
-        _P,
-        "a recording ends without a message, or hangs, as soon as an image is rendered",
-        "the OpenGL driver does not work: {error}",
-        _SOFTWARE_GL,
-    ),
-    "opengl.blank": Finding(
-        "OpenGL",
-        _P,
-        "all images are of one colour",
-        "the OpenGL driver {driver} renders nothing",
-        _SOFTWARE_GL,
-    ),
-    "ffmpeg": Finding(
-        "FFmpeg",
-        _P,
-        "no video of an episode; datasets with cameras can be neither written nor read",
-        "PyAV, which brings FFmpeg, cannot encode H.264: {error}",
-        "`pip install --force-reinstall av`",
-    ),
-    "scheduler.rights": Finding(
-        "scheduler",
-        _W,
-        "with `robot.clock = realtime` ticks are late as soon as anything else runs",
-        "this process may not use SCHED_FIFO",
-        _RIGHTS,
-    ),
-    "scheduler.bandwidth": Finding(
-        "scheduler",
-        _W,
-        "with `robot.clock = realtime` ticks are late as soon as anything else runs",
-        "this process has the right to SCHED_FIFO, and its control group or its container refuses",
-        GRANT_BANDWIDTH,
-    ),
-    "scheduler.error": Finding(
-        "scheduler",
-        _P,
-        "the real-time process does not start",
-        "a process that asks for real-time rights ends: {error}",
-        "check for a sandbox (seccomp) that kills, or a memory limit of the container that locked memory exceeds",
-    ),
-    "memory": Finding(
-        "memory lock",
-        _W,
-        "single ticks are late by milliseconds when memory is short",
-        "this process may not lock its memory",
-        _RIGHTS,
-    ),
-    "cpu latency": Finding(
-        "cpu latency",
-        _W,
-        "an idle machine wakes up later than a busy one",
-        "`/dev/cpu_dma_latency` cannot be held at 0, so processors sleep deeply",
-        GRANT_LATENCY_FILE,
-    ),
-    "kernel": Finding(
-        "kernel",
-        _W,
-        "rarely, under load, a tick is late by milliseconds",
-        "the kernel was not built with PREEMPT_RT",
-        "for a simulation, and where `--realtime` is content: nothing. For hardware: a kernel with PREEMPT_RT "
-        "(`apt-get install linux-image-rt-amd64`, `pro enable realtime-kernel`)",
-    ),
-    "throttling.off": Finding(
-        "RT throttling",
-        _W,
-        "a real-time process that hangs takes a processor until the machine is switched off",
-        "`kernel.sched_rt_runtime_us` is -1",
-        "`sysctl -w kernel.sched_rt_runtime_us=950000`",
-    ),
-    "throttling.low": Finding(
-        "RT throttling",
-        _W,
-        "the real-time process stands still for a part of every second, or is refused",
-        "real-time processes may use only {share} of a processor's time",
-        "`sysctl -w kernel.sched_rt_runtime_us=950000`",
-    ),
-    "clock": Finding(
-        "clock source",
-        _W,
-        "every reading of the clock takes microseconds, and ticks are late",
-        "the kernel measures time with {source}",
-        "the kernel parameter `clocksource=tsc`, if `dmesg` does not call the TSC unstable; in a virtual machine the "
-        "host's clock (`kvm-clock`)",
-    ),
-    "shm.missing": Finding(
-        "shared memory",
-        _P,
-        "`robot.clock = realtime` and LeRobot's data loader do not start",
-        "`/dev/shm` is missing, full or not writable: {error}",
-        "`mount -t tmpfs tmpfs /dev/shm`; remove what fills it; in a container: `--shm-size=1g`",
-    ),
-    "shm.small": Finding(
-        "shared memory",
-        _W,
-        "training ends with a bus error in a worker of the data loader",
-        "`/dev/shm` has {free} left",
-        "in a container: `--shm-size=1g`; or `--num_workers=0`",
-    ),
-    "disk.denied": Finding(
-        "disk",
-        _P,
-        "a recording cannot be saved",
-        "{folder} cannot be written: {error}",
-        "another `dataset.root`, or its permissions",
-    ),
-    "disk.full": Finding(
-        "disk",
-        _P,
-        "a recording ends with an error when an episode is saved",
-        "{folder} has {free} left",
-        "free some space, or another `dataset.root`",
-    ),
-    "disk.low": Finding(
-        "disk",
-        _W,
-        "a long recording with cameras may not fit",
-        "{folder} has {free} left",
-        "free some space, or another `dataset.root`",
-    ),
-    "disk.slow": Finding(
-        "disk",
-        _W,
-        "saving an episode takes long",
-        "{folder} takes {speed}, which a network file system may be",
-        "a `dataset.root` on a local disk; copy the dataset afterwards",
-    ),
-    "latency.late": Finding(
-        "latency test",
-        _W,
-        "at {rate} Hz a part of the period is lost to waiting",
-        _LATE,
-        "follow the remedies above; leave a processor free of other work; a lower `control_hz`",
-    ),
-    "latency.missed": Finding(
-        "latency test",
-        _W,
-        "at {rate} Hz ticks are missed: what the robot does is late by as much",
-        _LATE,
-        "follow the remedies above; leave a processor free of other work; a lower `control_hz`",
-    ),
-    "latency.stopped": Finding(
-        "latency test",
-        _P,
-        "at {rate} Hz the robot stops with a fault: its plant waits {timeout} for a command, and then stops by itself",
-        _LATE,
-        "follow the remedies above; leave a processor free of other work; a lower `control_hz`, or "
-        "`robot.clock = lockstep`",
-    ),
-    "latency.error": Finding(
-        "latency test",
-        _P,
-        "the latency cannot be measured",
-        "the measuring process ends: {error}",
-        "see the row of the scheduler",
-    ),
+_REMEDIES = {
+    "{RIGHTS}": GRANT_RIGHTS.replace("{rtprio}", "95"),
+    "{BANDWIDTH}": GRANT_BANDWIDTH,
+    "{LATENCY_FILE}": GRANT_LATENCY_FILE,
 }
 
 
-def markdown_table() -> str:
-    """Return the table of the documentation, with "…" for values."""
-    rows = ["| check | | symptom | cause | remedy |", "|---|---|---|---|---|"]
-    for finding in ROWS.values():
-        texts = [re.sub(r"\{\w+\}", "…", text) for text in (finding.symptom, finding.cause, finding.remedy)]
-        rows.append(f"| {finding.check} | {finding.status} | {' | '.join(texts)} |")
-    return "\n".join(rows) + "\n"
+def _read_rows() -> dict[str, Finding]:
+    rows = yaml.safe_load(Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8"))
+    return {
+        key: Finding(**row | {"status": Status(row["status"]), "remedy": _REMEDIES.get(row["remedy"], row["remedy"])})
+        for key, row in rows.items()
+    }
+
+
+ROWS = _read_rows()
 
 
 def fine(check: str, found: str) -> Finding:
@@ -305,13 +90,7 @@ def fine(check: str, found: str) -> Finding:
 
 
 def wrong(key: str, found: str, **values: object) -> Finding:
-    """Return a finding of the table.
-
-    Args:
-        key: of `ROWS`.
-        found: what was measured or read.
-        values: for what stands in braces in its texts.
-    """
+    """Return a finding of `ROWS`, with what was found, and values for what stands in braces in its texts."""
     row = ROWS[key]
     texts = {name: getattr(row, name).format(**values) for name in ("symptom", "cause", "remedy")}
     return replace(row, found=found, **texts)
@@ -331,12 +110,7 @@ def check_python(version: str = platform.python_version()) -> list[Finding]:
 def check_versions(
     shown: Sequence[str] = ("lerobot", "mujoco"), version_of: Callable[[str], str] = metadata.version
 ) -> list[Finding]:
-    """Check that the packages that ours requires are there, in the required versions.
-
-    Args:
-        shown: the packages that get a finding also if all is well.
-        version_of: returns the version of an installed package.
-    """
+    """Check that the packages that ours requires are there; those of `shown` get a finding also if all is well."""
     try:
         required = required_versions(DISTRIBUTION)
     except metadata.PackageNotFoundError:
@@ -473,13 +247,7 @@ def check_disk(
     free_of: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
     clock: Callable[[], float] = time.perf_counter,
 ) -> list[Finding]:
-    """Check that datasets can be written under a folder, or where it would be made: space, permission, speed.
-
-    Args:
-        root: the folder.
-        free_of: free space of a folder's disk [B].
-        clock: the time [s].
-    """
+    """Check that datasets can be written under a folder, or where it would be made: space [B], permission, speed."""
     folder = root.absolute()
     while not folder.exists():
         folder = folder.parent
@@ -507,12 +275,9 @@ def check_disk(
 
 
 def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) -> list[Finding]:
-    """Compare a measurement with what robots need: its latest wake-up, because one is enough to stop a robot.
+    """Compare a measurement with what robots need [Hz]: its latest wake-up, because one is enough to stop a robot.
 
-    Args:
-        outcome: the outcome of `latency_test.measure`.
-        robots: control rate of each [Hz].
-        timeout_s: how long a plant waits for a command [s].
+    Its plant waits for a command until the time-out [s].
     """
     if outcome.kind != "value":
         return [wrong("latency.error", _error(outcome), error=_error(outcome))]

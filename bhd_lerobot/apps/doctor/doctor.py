@@ -23,12 +23,7 @@ RunTrials = Callable[[Sequence[Sequence[Any]], float], list[Outcome]]
 
 
 def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
-    """Return what every check finds.
-
-    Args:
-        root: folder for datasets.
-        run: how to try something out in a process of its own.
-    """
+    """Return what every check finds; datasets go to the folder."""
     rights, ffmpeg, opengl, plugins = run([["rights"], ["ffmpeg"], ["opengl"], ["plug-ins"]], TIMEOUT_S)
     versions = checks.check_versions()
     renders = not any(one.status is Status.PROBLEM and "mujoco" in one.found for one in versions)

@@ -19,14 +19,7 @@ _WARM_UP = 50  # points of the grid, not counted: the first passes touch memory 
 
 
 def walk_grid(points: int, period_ns: int, clock: Callable[[], int], sleep: Callable[[float], None]) -> list[int]:
-    """Wake up at the points of a grid; return how late each wake-up was [ns]. A point that has passed is skipped.
-
-    Args:
-        points: points of the grid.
-        period_ns: distance of the points [ns].
-        clock: the time [ns].
-        sleep: waits for a number of seconds.
-    """
+    """Wake up at points of a grid [ns]; return how late each wake-up was [ns]. A point that has passed is skipped."""
     grid, lateness = TickGrid(clock() + period_ns, period_ns), []
     while grid.executed + grid.skipped < points:
         due, now = grid.next_due_ns, clock()
@@ -39,16 +32,10 @@ def walk_grid(points: int, period_ns: int, clock: Callable[[], int], sleep: Call
 
 
 def summarise(lateness: Sequence[int], rate: int, points: int) -> dict[str, Any]:
-    """Return what a walk along a grid has shown, as plain values.
+    """Return what a walk along a grid of so many points has shown, as plain values.
 
-    Args:
-        lateness: of every wake-up [ns], at least one.
-        rate: points a second [Hz].
-        points: points of the grid.
-
-    Returns:
-        `rate` and `points`; `missed`, the points that had passed when the loop got to them; `p50`, `p99` and `max` of
-        the lateness [s]; `bins_us` and `histogram`, the wake-ups in each bin.
+    These are ``missed``, the points that had passed when the loop got to them, ``p50``, ``p99`` and ``max`` of the
+    lateness [s], which is given in nanoseconds, and ``histogram``, the wake-ups in each bin.
     """
     p50, p99 = np.quantile(lateness, (0.50, 0.99), method="inverted_cdf") / 1e9
     bins = np.searchsorted(np.array(BINS_US) * 1_000, lateness, side="left")
@@ -65,15 +52,7 @@ def summarise(lateness: Sequence[int], rate: int, points: int) -> dict[str, Any]
 
 
 def measure(rate: int, seconds: float) -> dict[str, Any]:
-    """Measure in this process, with what it is granted of what the real-time cerebellum asks for.
-
-    Args:
-        rate: points of the grid a second [Hz].
-        seconds: length of the measurement [s].
-
-    Returns:
-        The values of `summarise`, and `grants`, the outcome of each request for privileges.
-    """
+    """Measure for some seconds, with what this process is granted of what the real-time cerebellum asks for."""
     points, period_ns = max(1, round(rate * seconds)), round(1e9 / rate)
     with Privileges() as privileges:
         grants = privileges.acquire(RealtimeSettings())

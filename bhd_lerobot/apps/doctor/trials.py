@@ -19,18 +19,14 @@ from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 
 TIMEOUT_S = 180.0
-_RESULT = "\0result "  # begins the line that a trial's result stands in, among what libraries print
+_RESULT = "\0result "  # stands before the result, after what libraries print
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a trial ended.
+    """How a trial ended: a value was returned, an exception raised, the process died, or did not answer.
 
-    Attributes:
-        kind: a value was returned, an exception raised, the process died, or did not answer.
-        value: what was returned.
-        error: what went wrong, in one line; empty for a value.
-        output: the last line that was printed meanwhile.
+    ``error`` says what went wrong in one line; ``output`` is the last line that was printed meanwhile.
     """
 
     kind: Literal["value", "error", "crash", "timeout"]
@@ -40,21 +36,12 @@ class Outcome:
 
 
 def run_trials(trials: Sequence[Sequence[Any]], timeout_s: float = TIMEOUT_S) -> list[Outcome]:
-    """Try things out in one process, and those after a crash in another; nothing is printed on our terminal.
-
-    Args:
-        trials: name, one of `TRIALS`, and arguments of each.
-        timeout_s: after this time a process is killed [s].
-    """
-    outcomes: list[Outcome] = []
-    while len(outcomes) < len(trials):
-        outcomes += _run_process(trials[len(outcomes) :], timeout_s)
-    return outcomes
+    """Try things out, names of `TRIALS` with their arguments; a process that does not end in time [s] is killed."""
+    return [_run_process(trial, timeout_s) for trial in trials]
 
 
-def _run_process(trials: Sequence[Sequence[Any]], timeout_s: float) -> list[Outcome]:
-    """Return the outcomes of all trials, or of those up to the first that ended the process."""
-    command = [sys.executable, "-P", "-m", __name__, *map(json.dumps, trials)]
+def _run_process(trial: Sequence[Any], timeout_s: float) -> Outcome:
+    command = [sys.executable, "-P", "-m", __name__, json.dumps(trial)]
     kind: Literal["crash", "timeout"] = "crash"
     try:
         done = subprocess.run(
@@ -68,14 +55,9 @@ def _run_process(trials: Sequence[Sequence[Any]], timeout_s: float) -> list[Outc
         printed, end = done.stdout, _describe_end(done.returncode)
     except subprocess.TimeoutExpired as error:
         kind, printed, end = "timeout", error.stdout or b"", f"no answer in {timeout_s:g} s"
-    outcomes, last = [], ""
-    for line in printed.decode(errors="replace").split("\n"):
-        if line.startswith(_RESULT):
-            outcomes.append(Outcome(**json.loads(line.removeprefix(_RESULT)), output=last))
-            last = ""
-        else:
-            last = line.strip() or last
-    return outcomes if len(outcomes) == len(trials) else [*outcomes, Outcome(kind, error=end, output=last)]
+    before, _, result = printed.decode(errors="replace").partition(_RESULT)
+    last = next((line.strip() for line in reversed(before.split("\n")) if line.strip()), "")
+    return Outcome(**json.loads(result), output=last) if result else Outcome(kind, error=end, output=last)
 
 
 def _describe_end(status: int) -> str:
@@ -85,19 +67,19 @@ def _describe_end(status: int) -> str:
     return f"ended by {names.get(-status, f'signal {-status}')}"
 
 
-def main(trials: Sequence[str]) -> None:
-    """Run trials in this process; print a line with the result of each."""
-    for trial in trials:
-        name, *arguments = json.loads(trial)
-        try:
-            result = {"kind": "value", "value": TRIALS[name](*arguments)}
-        except BhdError as error:
-            result = {"kind": "error", "error": str(error)}
-        except Exception as error:
-            result = {"kind": "error", "error": f"{type(error).__name__}: {error}"}
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
-        os.write(1, f"\n{_RESULT}{json.dumps(result)}\n".encode())
+def main(trial: str) -> None:
+    """Run a trial in this process; print its result, after whatever libraries print."""
+    name, *arguments = json.loads(trial)
+    try:
+        result = {"kind": "value", "value": TRIALS[name](*arguments)}
+    except BhdError as error:
+        result = {"kind": "error", "error": str(error)}
+    except Exception as error:
+        result = {"kind": "error", "error": f"{type(error).__name__}: {error}"}
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os.write(1, f"\n{_RESULT}{json.dumps(result)}".encode())
+    os._exit(0)  # nothing is printed at the exit, and no driver can crash there
 
 
 def ask_rights() -> list[dict[str, Any]]:
@@ -210,7 +192,7 @@ def _with_version(name: str) -> str:
 
 
 TRIALS: dict[str, Callable[..., Any]] = {
-    "rights": ask_rights,  # first: it locks the memory of its process, which is small then
+    "rights": ask_rights,
     "ffmpeg": encode,
     "opengl": render,
     "plug-ins": list_plugins,
@@ -218,4 +200,4 @@ TRIALS: dict[str, Callable[..., Any]] = {
 }
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(sys.argv[1])
