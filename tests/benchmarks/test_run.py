@@ -52,6 +52,7 @@ def _benchmark(name: str, *options: str) -> None:
     runpy.run_module(f"benchmarks.{name}", run_name="__main__")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", run.NAMES)
 def test_a_benchmark_runs_in_its_shortest_form(name: str, tmp_path: Path) -> None:
     if name in SLOW and os.environ.get("BHD_SWEEP") != "full":

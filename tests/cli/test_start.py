@@ -140,6 +140,7 @@ def test_the_handler_before_comes_back() -> None:
         signal.signal(signal.SIGINT, former)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("command", ["bhd-record", "bhd-data"])
 def test_help_that_nobody_reads_to_its_end_ends_without_output(command: str) -> None:
     """As of ``--help | head``; bhd-data has tests of its other output."""

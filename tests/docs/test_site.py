@@ -13,6 +13,7 @@ from tests.docs.support import ROOT
 REFERENCE = ROOT / "docs" / "reference" / "api.md"
 
 
+@pytest.mark.thorough
 def test_it_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
     monkeypatch.chdir(ROOT)

@@ -92,6 +92,7 @@ class Wander(nn.Module):
         return torch.stack([torch.full((len(state),), 0.2), (state[:, 5] - state[:, -5]) * 0.5 + 0.3], dim=1)
 
 
+@pytest.mark.thorough
 def test_lerobots_rollout_sees_the_same_with_ours_and_with_gymnasiums() -> None:
     lerobot_eval = pytest.importorskip("lerobot.scripts.lerobot_eval")
     results = []

@@ -120,6 +120,7 @@ SINGLE: dict[str, Callable[[gymnasium.Env], gymnasium.Env]] = {
 }
 
 
+@pytest.mark.thorough(but=3)
 @pytest.mark.parametrize("name", SINGLE)
 def test_wrappers_of_single_environments(name: str) -> None:
     renders = name in ("AddRenderObservation", "RenderCollection")
@@ -165,6 +166,7 @@ N = 3
 NEXT_STEP_ONLY = ("NormalizeObservation", "FlattenObservation", "FilterObservation", "DtypeObservation")
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize("kind", ["vector_entry_point", "sync"])
 def test_wrappers_of_vector_environments(kind: str, mode: AutoresetMode) -> None:
@@ -204,6 +206,7 @@ for name in [name for name in gymnasium.registry if name.startswith("bhd_lerobot
 """
 
 
+@pytest.mark.thorough
 def test_every_documented_way_registers_and_makes_an_environment_where_nothing_was_imported() -> None:
     """In one interpreter that forgets the registration after each, because starting one takes seconds."""
     name = f"bhd_lerobot/{next(iter(ENVIRONMENTS))}"

@@ -38,6 +38,7 @@ def play(env: VectorEnv, actions: np.ndarray, **reset: Any) -> Iterator[Any]:
         yield env.step(action)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize(
     ("name", "mode"),
     [*((name, AutoresetMode.SAME_STEP) for name in NAMES), *((name, AutoresetMode.NEXT_STEP) for name in NAMES[::3])],

@@ -41,6 +41,7 @@ def test_a_checkpoint_for_something_else_is_refused_by_name(checkpoint, tmp_path
         run_eval(tmp_path, brains__net__type="learned", brains__net__path=tmp_path / "nowhere")
 
 
+@pytest.mark.thorough
 def test_an_evaluation_runs_on_the_wall_clock(tmp_path):
     result, printed = run_eval(tmp_path, only="[old]", n_episodes=2, task__duration_s=1, task__min_path_m=0.01, **LIVE)
     assert result.exit_status == 0

@@ -208,6 +208,7 @@ def test_a_killed_evaluation_runs_the_missing_episodes_and_ends_as_if_nothing_ha
         assert episode_rows(roots[0]) == episode_rows(roots[1])
 
 
+@pytest.mark.thorough
 def test_partial_results_of_the_same_evaluation_are_completed_and_no_others(whole, tmp_path, monkeypatch):
     recorded = {**RECORDED, "record__root": tmp_path / "data"}
     with pytest.MonkeyPatch.context() as patch:

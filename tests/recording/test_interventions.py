@@ -203,6 +203,7 @@ REACH = {
 }
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("robot", [{**AVOID, **TURNS}, REACH], ids=["avoid", "reach"])
 def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_exactly(
     tmp_path: Path, robot: dict[str, Any]
@@ -362,6 +363,7 @@ EXPERTS = {
 }
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("expert", EXPERTS)
 def test_every_rule_that_gives_setpoints_says_what_it_would_do_where_it_did_not_choose_to_be(
     expert: str, tmp_path: Path

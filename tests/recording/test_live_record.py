@@ -56,6 +56,7 @@ def episodes(root: Path) -> list[dict[str, Any]]:
     return pq.read_table(root / "meta" / "episodes").to_pylist()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("robot", [{}, ARM], ids=["turtlebot3", "ur5"])
 def test_a_recording_is_complete_and_no_frame_is_lost_uncounted(tmp_path, robot):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -90,6 +91,7 @@ def test_a_recording_is_complete_and_no_frame_is_lost_uncounted(tmp_path, robot)
         assert {grant["name"] for grant in grants} >= {"scheduler", "memory lock"}
 
 
+@pytest.mark.thorough
 def test_an_episode_that_no_machine_could_keep_is_rejected_and_the_dataset_stays_as_it_was(tmp_path):
     root, name = tmp_path / "d", unique("reject")
     result, _ = run_live(root, robot__id=name, dataset__num_episodes=1, dataset__episode_time_s=1)
@@ -151,6 +153,7 @@ def programs():
         one.close()
 
 
+@pytest.mark.thorough
 def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time(tmp_path, programs):
     root, name = tmp_path / "d", unique("program")
     many = {"dataset__num_episodes": 100, "dataset__episode_time_s": 2}

@@ -162,6 +162,7 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
     assert Replay(root, 0).open_loop().identical
 
 
+@pytest.mark.thorough
 def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
     root = tmp_path / "killed"
     start(root, 1, **PICK, **SPOKEN, resume="true").kill()

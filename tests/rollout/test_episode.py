@@ -91,6 +91,7 @@ def script(kind: str) -> np.ndarray:
     return np.stack([0.1 + 0.05 * np.sin(time / 3), 0.8 * np.cos(time / 5)], axis=1)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
 @pytest.mark.parametrize(("length", "every"), [(8, 3), (30, 10), (1, 1)])
 def test_a_chunk_does_what_its_actions_sent_one_by_one_do(kind: str, length: int, every: int) -> None:

@@ -10,6 +10,7 @@ from bhd_lerobot.rollout import plots
 pytestmark = pytest.mark.figures
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("count", [1, 2, 7, plots.SHOWN])
 def test_every_trajectory_has_a_panel(tmp_path, monkeypatch, count):
     drawn = []

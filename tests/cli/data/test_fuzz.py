@@ -72,6 +72,7 @@ def run(arguments: list[str]) -> int | str:
         return ended.code or 0
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(3600)  # the complete form takes minutes
 def test_a_damaged_dataset_ends_no_command_in_a_traceback(sources: list[Path], tmp_path: Path, capsys) -> None:
     root, out = tmp_path / "data" / "d", tmp_path / "out"

@@ -584,6 +584,7 @@ def test_an_existing_dataset_stays_and_a_refused_import_leaves_none(tmp_path, pl
     assert not (tmp_path / "e").exists()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("source", ["mcap", "sqlite3", "ours"])
 def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source):
     if source == "ours":

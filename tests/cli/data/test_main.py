@@ -176,6 +176,7 @@ def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, c
     assert main.main(["check", str(root)]) == 0
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("arguments", [["info"], ["check", "--json"]])
 def test_a_closed_output_ends_the_command_without_a_message(recorded, arguments):
     command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded)]

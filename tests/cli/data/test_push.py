@@ -285,6 +285,7 @@ def test_a_policy_that_cannot_be_uploaded_is_kept(hub: HubServer, lesson: Path, 
     assert not (tmp_path / "none/checkpoints").exists()
 
 
+@pytest.mark.thorough
 def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkeypatch) -> None:
     import datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

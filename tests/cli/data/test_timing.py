@@ -275,6 +275,7 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
 # --- the image, and words ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_episodes_of_any_length_are_drawn(measured, tmp_path):
     report = timing_report.load_timing(measured, 0)
     (one,) = report.episodes

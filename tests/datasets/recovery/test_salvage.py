@@ -70,6 +70,7 @@ def loaded(root: Path, frames: int) -> None:
     assert dataset[frames - 1]["task"]
 
 
+@pytest.mark.thorough(but=3)
 @pytest.mark.parametrize(
     "case",
     [

@@ -419,6 +419,7 @@ def record_with_lerobot(root: Path) -> Path:
     return root
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("source", ["ours", "stock"])
 def test_datasets_edited_by_lerobot_have_warnings_of_unused_statistics(
     valid, tmp_path, source, capsys, monkeypatch

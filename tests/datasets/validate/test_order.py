@@ -174,6 +174,7 @@ def test_another_order_is_found_and_corrected(tmp_path: Path, case: str) -> None
             RootLock(root).release()
 
 
+@pytest.mark.thorough
 @each_case("case", [case for case in CASES if CASES[case][3]])
 def test_edits_put_the_episodes_in_order(tmp_path: Path, case: str) -> None:
     CASES[case][0](tmp_path / "d")
@@ -219,6 +220,7 @@ def test_readers_of_ours_go_by_the_numbers(tmp_path: Path, case: str) -> None:
     assert [read_episode(tmp_path / "d", e)["action"].tolist() for e in range(3)] == actions
 
 
+@pytest.mark.thorough
 @each_case("case", [case for case in CASES if "numbers" not in case])
 def test_a_training_gets_the_right_frames_or_an_error(tmp_path: Path, case: str) -> None:
     CASES[case][0](tmp_path / "d")

@@ -49,6 +49,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, step: int, error: BaseException) ->
         yield seen
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("video", [False, True])
 def test_a_disk_that_fails_at_any_step_of_a_save(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, video: bool) -> None:
     """The failing episode is refused with a clear error; those before and after it are complete."""
@@ -76,6 +77,7 @@ def test_a_disk_that_fails_at_any_step_of_a_save(tmp_path: Path, monkeypatch: py
     assert support.verify(tmp_path / "d", recorder.num_episodes, video=video, stats=True) == recorder.num_episodes
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize(
     ("error", "first"), [(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x"), 0), (KeyboardInterrupt(), 1)]
 )
