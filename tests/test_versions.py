@@ -87,6 +87,7 @@ def run_beside(folder: Path, name: str, version: str, program: str, *arguments: 
     )
 
 
+@pytest.mark.thorough
 def test_every_command_that_simulates_ends_in_one_sentence_beside_another_mujoco(tmp_path: Path) -> None:
     done = run_beside(tmp_path, "mujoco", "3.8.1", COMMANDS, "record", "train", "evaluate", "replay", "data", "monitor")
     assert "Traceback" not in done.stderr
@@ -120,6 +121,7 @@ def test_lerobots_commands_keep_their_robots_and_ours_say_what_is_wrong(tmp_path
     assert all("mujoco is 3.8.1; lerobot_robot_bhd supports mujoco>=" in one for one in sentences)
 
 
+@pytest.mark.thorough
 def test_lerobots_commands_go_on_beside_our_refusal_of_their_version(tmp_path: Path) -> None:
     program = STOCK.partition("robot =")[0]
     done = run_beside(tmp_path, "lerobot", "0.9.0", program)

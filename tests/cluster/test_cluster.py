@@ -145,6 +145,7 @@ def workers_of(raylets: set[int]) -> list[int]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_path):
     pytest.importorskip("ray")
     many = {"dataset__num_episodes": 400, "dataset__episode_time_s": 2}
@@ -252,6 +253,7 @@ class TestOnePool:
         run_alone(tmp_path / "local", **many)
         assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
 
+    @pytest.mark.thorough
     def test_a_cluster_goes_on_with_what_one_machine_began_images_too(self, cluster, shared, tmp_path):
         several = {**ARM, "dataset__num_episodes": 4, "dataset__episode_time_s": 1, "n_envs": 2}
         run_alone(tmp_path / "local", **{**several, "dataset__num_episodes": 2})
@@ -445,6 +447,7 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
     assert "No worker could be started within 1 s" in str(error)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("driver")
 def test_the_run_stops_when_it_is_told_to(cluster):
     stopped = threading.Event()

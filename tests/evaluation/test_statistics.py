@@ -113,6 +113,7 @@ def test_intervals_of_scores_cover_the_truth_as_often_as_they_say_however_few_th
         assert all(0.0 <= one.low < one.high <= 1.0 for one in estimates)  # never without a width
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("failures", [0.0, 0.02, 0.05])
 def test_intervals_of_differences_and_ratios_cover_a_clone_that_rarely_fails(failures):
     """It does in all other episodes what its rule does, to the bit: the episodes seen may hold none of its failures."""

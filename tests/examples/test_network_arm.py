@@ -200,6 +200,7 @@ def _block(name: str) -> Any:
         return None
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("installed")
 def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm) -> None:
     process = subprocess.Popen(

@@ -86,6 +86,7 @@ def test_it_is_at_most_120_lines() -> None:
     assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in files) <= 120
 
 
+@pytest.mark.thorough
 def test_it_is_recorded_replayed_bit_for_bit_and_evaluated(used: Path) -> None:
     results = json.loads((used / "eval" / "results.json").read_text())
     assert set(results["brains"]) == {"mine", "gaps"}

@@ -49,6 +49,7 @@ def test_it_sees_the_last_observation_and_asks_for_none_of_its_own(robot, teleop
     teleop.get_action()
 
 
+@pytest.mark.thorough
 def test_without_a_robot_a_command_that_catches_nothing_ends_with_the_message_alone() -> None:
     program = (
         "from bhd_lerobot.teleoperators.bhd_brain import BhdBrain\n"

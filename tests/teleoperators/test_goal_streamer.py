@@ -31,6 +31,7 @@ def drive(tmp_path, brain, frames=125, **options):
         return robot.simulation.truth(), robot._scene, teleop._brain
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize(
     ("brain", "seed", "space"), [(PickBrainConfig(), 0, "joint"), (LanguageBrainConfig(), 1, "tool")]
 )

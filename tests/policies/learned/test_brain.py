@@ -35,6 +35,7 @@ def drive(brain: LearnedBrain, seen: list[Observation], seeds: list[int]) -> NDA
     return np.array(actions)
 
 
+@pytest.mark.thorough(but=4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_alone_its_actions_are_those_of_lerobot_to_the_bit(checkpoints: dict[str, Path], kind: str) -> None:
     brain, stock = make_brain(checkpoints[kind]), Stock(checkpoints[kind])
@@ -92,6 +93,7 @@ def test_a_policy_whose_chunks_need_more_than_an_observation_is_refused(checkpoi
         assert part in str(raised.value)
 
 
+@pytest.mark.thorough(but=4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_episode_does_not_feel_the_others(checkpoints: dict[str, Path], kind: str) -> None:
     n, sim = 8, 5

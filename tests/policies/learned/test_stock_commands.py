@@ -144,6 +144,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Tr
     return make
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize(
     ("kind", "program"),
     [
@@ -172,6 +173,7 @@ def test_a_checkpoint_does_the_same_in_all_three_programs(
     assert not connected_robots()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("kind", ["bhd_mlp", "bhd_cnn", "bhd_pixels", "bhd_perception"])
 def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_path: Path) -> None:
     once = {"save_freq": 1, "threads": 1, "num_workers": 0}
@@ -185,6 +187,7 @@ def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_pat
     assert (last[0] / "model.safetensors").read_bytes() == whole
 
 
+@pytest.mark.thorough
 def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(
     trained: Callable[[str, str], Trained],
 ) -> None:

@@ -136,6 +136,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_a_run_that_was_moved_or_is_named_by_another_path_ends_as_if_nothing_had_happened(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,6 +266,7 @@ def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(
     assert "The folder is full." in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_every_round_learns_from_data_that_was_recorded_before_as_well(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
