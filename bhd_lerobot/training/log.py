@@ -59,7 +59,7 @@ def _line(row: Row) -> str:
     return json.dumps(plain) + "\n"
 
 
-def draw_loss(rows: Sequence[Row], path: Path, heading: str, loss: str = "loss") -> None:
+def draw_loss(rows: Sequence[Row], path: Path, heading: str, loss: str) -> None:
     """Draw training and held-out loss over the steps, and below them the learning rate; `loss` names the y-axis."""
     figure = Figure(figsize=(8.5, 5.2))
     figure.subplots_adjust(
