@@ -186,10 +186,18 @@ def _paired(given: ReportInput) -> str:
             str(one.episodes),
         ]
         rows.append((label, cells))
-    head = ["success, difference", "episodes that differ", "McNemar p", "score, difference", "score, ratio", "episodes"]
+    head = [
+        "success, difference",
+        "episodes that differ",
+        "McNemar p",
+        "score, difference ¹",
+        "score, ratio ¹",
+        "episodes",
+    ]
     note = (
         f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
-        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios. p is that of McNemar's "
+        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also hold "
+        "what rare episodes would do, see ¹ above. p is that of McNemar's "
         "exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval that "
         "leaves out the dashed line says that the difference is more than chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
