@@ -46,21 +46,23 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    # What is too wide for the terminal is folded, never cut off.
-    for heading in ("brain", "success, 95 %", "score, 95 %", f"success minus\n{baseline}'s, 95 %", "failures"):
-        is_text = heading in ("brain", "failures")
-        table.add_column(escape(heading), no_wrap=not is_text, overflow="fold")
+    table.add_column("brain", overflow="fold")  # a name that is too wide for the terminal is never cut off
+    for heading in ("success, 95 %", "score, 95 %", *(["success minus\nbaseline's, 95 %"] if results.paired else [])):
+        table.add_column(heading, no_wrap=True)
+    failures = {}
     for label, one in results.brains.items():
-        failures = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
+        failures[label] = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
         pair = results.paired.get(label)
         table.add_row(
             escape(label) + "".join(f"\n({mark})" for mark in _marks(one, baseline, len(results.brains))),
             _lines(f"{one.successes}/{one.episodes} = {percent(one.success)}"),
             _lines(number(one.means["score"], 3)),
-            _lines(percent(pair.success, sign=True)) if pair else "",
-            "\n".join(failures) or "none",
+            *([_lines(percent(pair.success, sign=True)) if pair else ""] if results.paired else []),
         )
     console.print(table)
+    for label, causes in failures.items():
+        if causes:
+            console.print(f"{escape(label)} failed: {', '.join(causes)}", highlight=False)
     for label, one in results.brains.items():
         if one.perception is not None:
             console.print(escape(f"{label}: {perception_sentence(one.perception)}"), soft_wrap=True)

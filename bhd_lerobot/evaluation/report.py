@@ -19,7 +19,7 @@ from bhd_lerobot.evaluation import plots
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults
-from bhd_lerobot.evaluation.statistics import Estimate
+from bhd_lerobot.evaluation.statistics import Estimate, unseen_share
 from bhd_lerobot.evaluation.text import number, percent, sentences
 from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
@@ -136,11 +136,12 @@ def _summary(given: ReportInput) -> str:
         ]
         rows.append((label, cells))
     unit, what = results.config["jerk_unit"], results.config["jerk"]
-    head = ["success", "score", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return"]
+    head = ["success", "score ¹", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return ²"]
     note = (
-        "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means; those "
-        f"of scores also hold what may have stayed unseen. Jerk is that of the commanded motion ({what}), from frame "
-        "to frame; “largest” is the mean over episodes of each one's largest."
+        "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means. "
+        f"Jerk is that of the commanded motion ({what}), from frame to frame; “largest” is the mean over episodes of "
+        f"each one's largest.<br>{_score_note(results.brains)}<br>² Return: the sum of an episode's rewards, which the "
+        "task defines. Unlike a score it has no bounds, so that it, or its interval, can go below 0 or beyond 1."
     )
     privileged = {label for label, one in results.brains.items() if one.privileged}
     if privileged:
@@ -150,6 +151,23 @@ def _summary(given: ReportInput) -> str:
         )
     drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
     return drawn + table(head, rows, results.config["baseline"], privileged) + f'<p class="note">{note}</p>'
+
+
+def _score_note(brains: Mapping[str, BrainSummary]) -> str:
+    """Return why the interval of a score is wider than the scores differ, with the numbers of a brain."""
+    note = (
+        "¹ Score: from 0 to 1. Its interval reaches further than the scores of the episodes vary, because it also "
+        "holds what rare episodes would do that so few easily leave unseen"
+    )
+    label, one = max(brains.items(), key=lambda item: item[1].episodes)
+    if one.episodes < 2:
+        return f"{note}."
+    unseen, score = unseen_share(one.episodes), one.means["score"]
+    return (
+        f"{note}: {one.episodes} episodes prove little about what happens in up to {100 * unseen:.0f} % of all. If "
+        f"those scored 0, the mean score of {escape(label)} would be {(1 - unseen) * score.value:.3f}; if they "
+        f"scored 1, {score.value + unseen * (1 - score.value):.3f}. More episodes make it narrower."
+    )
 
 
 def _paired(given: ReportInput) -> str:
@@ -168,10 +186,18 @@ def _paired(given: ReportInput) -> str:
             str(one.episodes),
         ]
         rows.append((label, cells))
-    head = ["success, difference", "episodes that differ", "McNemar p", "score, difference", "score, ratio", "episodes"]
+    head = [
+        "success, difference",
+        "episodes that differ",
+        "McNemar p",
+        "score, difference ¹",
+        "score, ratio ¹",
+        "episodes",
+    ]
     note = (
         f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
-        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios. p is that of McNemar's "
+        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also hold "
+        "what rare episodes would do, see ¹ above. p is that of McNemar's "
         "exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval that "
         "leaves out the dashed line says that the difference is more than chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
@@ -398,4 +424,4 @@ def table(
 
 def chart(source: str, text: str) -> str:
     """Return an image with words for those who do not see it."""
-    return f'<div class="scroll"><img class="chart" src="{source}" alt="{escape(text)}"></div>'
+    return f'<div class="scroll wide"><img class="chart" src="{source}" alt="{escape(text)}"></div>'

@@ -78,7 +78,7 @@ def mean(
         skewness = float(((sample - value) ** 3).mean()) / spread**3
         low, high = (value - spread * _corrected(one, skewness, count) for one in (quantile, -quantile))
     lower, upper = within
-    unseen = 1 - (1 - confidence) ** (1 / count)
+    unseen = unseen_share(count, confidence)
     if math.isfinite(lower):
         low = max(lower, np.fmin(low, value - unseen * (value - lower)))
     if math.isfinite(upper):
@@ -91,6 +91,11 @@ def _corrected(quantile: float, skewness: float, count: int) -> float:
     if abs(skewness) < 1e-9:
         return quantile / math.sqrt(count)
     return float(np.cbrt(1 + skewness * (quantile / math.sqrt(count) - skewness / (6 * count))) - 1) * 3 / skewness
+
+
+def unseen_share(count: int, confidence: float = CONFIDENCE) -> float:
+    """Return the share of episodes that easily stays unseen in a number of them: about 3 / n for 95 %."""
+    return 1 - (1 - confidence) ** (1 / count)
 
 
 def mean_difference(
@@ -140,7 +145,7 @@ def ratio_of_means(
     lower, upper = within
     if count == 1 or not math.isfinite(upper):
         return found
-    unseen = 1 - (1 - confidence) ** (1 / count)
+    unseen = unseen_share(count, confidence)
     top, bottom = float(one.mean()), float(two.mean())
     least, most = top - unseen * (top - lower), top + unseen * (upper - top)
     low = min(least / bottom, top / (bottom + unseen * (upper - bottom)))

@@ -107,7 +107,7 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
     """Print what the run did; `video` reports whether it left a video."""
     robot: Any = config.robot
     table = Table(title="Recorded", show_header=False, title_justify="left")
-    table.add_row("dataset", f"{result.root} ({counted(result.episodes, 'episode')})")
+    table.add_row("dataset", counted(result.episodes, "episode"))
     table.add_row(
         "this run",
         f"{counted(result.recorded, 'episode')}, {counted(result.frames, 'frame')}, {result.simulated_s:.0f} s"
@@ -128,8 +128,10 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         *(["trajectories.png"] if result.recorded else []),
         *(["episode.mp4", "episode.png"] if video else []),
     ]
-    table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
+    table.add_row("files", ", ".join(files))
     console.print(table)
+    # A path stands in one line, however narrow the terminal.
+    console.print(escape(f"Dataset: {result.root}\nRun folder: {result.output_dir}"), soft_wrap=True)
     if result.estop is not None:
         console.print(
             f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "

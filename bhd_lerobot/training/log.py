@@ -59,8 +59,8 @@ def _line(row: Row) -> str:
     return json.dumps(plain) + "\n"
 
 
-def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
-    """Draw loss and held-out loss over steps, and below them the learning rate."""
+def draw_loss(rows: Sequence[Row], path: Path, heading: str, loss: str) -> None:
+    """Draw training and held-out loss over the steps, and below them the learning rate; `loss` names the y-axis."""
     figure = Figure(figsize=(8.5, 5.2))
     figure.subplots_adjust(
         left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13
@@ -70,8 +70,8 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
     smallest = []
     for key, label, colour, marker in (
         *((key, f"training, {key}", colour, None) for key, colour in zip(_parts(rows), _PART_COLOURS, strict=False)),
-        ("loss", "training", "#2c3e50", None),
-        ("held_out_loss", "held-out episodes", "#c0392b", "o"),
+        ("loss", "training, mean since the previous point", "#2c3e50", None),
+        ("held_out_loss", "held-out episodes, not trained on", "#c0392b", "o"),
     ):
         points = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
         if not points:
@@ -84,15 +84,16 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
             marker="o" if len(points) == 1 else marker,
             markersize=3.5,
             linewidth=1.3,
-            label=f"{label}: {values[-1]:.3g}",
+            label=f"{label}: {values[-1]:.3g} at step {steps[-1]:,}",
         )
         smallest.append(min(values))
     if smallest and min(smallest) > 0:  # a negative log-likelihood may be below 0
         above.set_yscale("log")
-        above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
         above.yaxis.set_minor_locator(NullLocator())
         above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    above.set_ylabel("loss")
+        loss += ", log scale"
+    above.set_ylabel(loss)
     above.grid(alpha=0.3, which="both")
     if smallest:
         above.legend(frameon=False, fontsize=9)
@@ -100,10 +101,10 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
     if rates:
         below.plot(*zip(*rates, strict=True), color="#8a8478", linewidth=1.2)
     below.set_ylim(bottom=0)
-    below.set_ylabel("learning rate")
+    below.set_ylabel("learning\nrate")
     below.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3))
-    below.set_xlabel("step")
-    below.xaxis.set_major_locator(MaxNLocator(integer=True))
+    below.set_xlabel("training step")
+    below.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     below.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 

@@ -79,8 +79,10 @@ class RunOutput:
             return
         config = self._config
         heading = f"{config.job_name} on {config.dataset.repo_id}, step {step} of {config.steps}"
+        kind = getattr(config.policy, "loss_name", None)
+        loss = f"loss of {config.policy.type}{f' ({kind})' if kind else ''}" if config.policy else "loss"
         try:
-            draw_loss(self._metrics.rows, self.folder / PLOT_NAME, heading)
+            draw_loss(self._metrics.rows, self.folder / PLOT_NAME, heading, loss)
             self._drawn = (step, len(self._metrics.rows))
         except OSError:
             (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of an image

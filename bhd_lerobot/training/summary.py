@@ -32,7 +32,7 @@ def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: Tra
     total = sum(parameter.numel() for parameter in policy.parameters())
     frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
     held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table = _table()
     table.add_row(
         "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")
     )
@@ -51,7 +51,7 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
     """Print how the run ended, where its files are, and the next command."""
     losses = [row["loss"] for row in result.rows if row.get("loss") is not None]
     held_out = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table = _table()
     table.add_row("steps", f"{result.step:,} of {config.steps:,} in {result.wall_s:.1f} s")
     if losses:
         table.add_row("loss", _course(losses))
@@ -74,6 +74,14 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
         lines += how_to_evaluate(result.contract, str(result.checkpoint), kind)
     for line in lines:
         console.print(escape(line), soft_wrap=True, highlight=False)
+
+
+def _table() -> Table:
+    """Return an empty table of names and values, which folds a path that is too long."""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column()
+    table.add_column(overflow="fold")
+    return table
 
 
 def _course(losses: Sequence[float]) -> str:

@@ -92,6 +92,31 @@ def test_the_page_says_what_the_results_say(page):
     assert digest[1] == hashlib.sha256((result.output_dir / "results.json").read_bytes()).hexdigest()
 
 
+def test_the_page_says_why_the_interval_of_a_score_is_wide_and_what_a_return_is(page):
+    result, text = page
+    assert "<th>score ¹</th>" in text
+    assert "<th>return ²</th>" in text
+    note = re.search(
+        r"4 episodes prove .* up to 53 % of all\..* of old would be ([\d.]+); .* scored 1, ([\d.]+)\.", text
+    )
+    assert note is not None
+    score = result.results.brains["old"].means["score"]
+    low, high = map(float, note.groups())
+    assert score.low - 5e-4 <= low < score.value < high <= score.high + 5e-4  # it is in the interval above it
+    assert "² Return: the sum of an episode's rewards" in text
+
+
+def test_a_chart_that_is_wider_than_a_phone_says_that_it_scrolls(page):
+    _, text = page
+    charts = [
+        attributes["class"] for tag, attributes in Page(text).tags if tag == "div" and "scroll" in str(attributes)
+    ]
+    assert charts.count("scroll wide") == text.count('class="chart"') == 5
+    width = int(re.search(r"img.chart \{ min-width: (\d+)px", text)[1])
+    hint = re.search(r'@media \(max-width: (\d+)px\) \{\s+\.wide::before \{ content: "Scroll sideways', text)
+    assert int(hint[1]) == width + 2 * 14 - 1  # as soon as the chart and the page's margins need more
+
+
 def test_charts_are_well_formed_and_name_every_brain(page):
     result, text = page
     charts = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', text)

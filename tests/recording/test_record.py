@@ -1,16 +1,19 @@
 """bhd-record: same seed same bytes, resume after any kill, signals, bad input, what is in the run folder."""
 
+import io
 import json
 import os
 import random
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from rich.console import Console
 
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -19,6 +22,7 @@ from bhd_lerobot.hub.card import CardOptions, make_card
 from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.report import print_summary
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
@@ -200,6 +204,16 @@ def test_the_run_folder_has_the_resolved_configuration_and_an_image(recorded):
     assert (folder / "trajectories.png").is_file()
     for part in (f"{result.successes} of 3", "mean score", "real time", "trajectories.png"):
         assert part in text
+
+
+def test_a_path_stands_in_one_line_at_80_columns(recorded):
+    root, result, _ = recorded
+    console = Console(file=io.StringIO(), width=80)
+    far = Path("/", *(f"folder_{number}_of_a_long_path" for number in range(6)))
+    print_summary(console, parse(RecordConfig, options(root)), replace(result, root=far / "d", output_dir=far), False)
+    lines = console.file.getvalue().splitlines()
+    assert lines[-2:] == [f"Dataset: {far / 'd'}", f"Run folder: {far}"]
+    assert all(len(line) <= 80 for line in lines[:-2])
 
 
 def test_the_video_is_made_where_images_can_be_rendered(tmp_path):

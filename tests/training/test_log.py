@@ -36,7 +36,7 @@ def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:
             figures.append(self)
 
     monkeypatch.setattr(log, "Figure", Spy)
-    draw_loss(rows, path, "toy")
+    draw_loss(rows, path, "toy", "loss of toy (l1)")
     assert path.stat().st_size > 1000
     return figures[0]
 
@@ -44,14 +44,20 @@ def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:
 def test_the_curve_shows_both_losses_on_a_log_scale(tmp_path: Path, monkeypatch) -> None:
     above, below = drawn(ROWS, tmp_path / "loss.png", monkeypatch).axes
     assert above.get_yscale() == "log"
-    assert [line.get_label() for line in above.lines] == ["training: 0.0333", "held-out episodes: 0.0667"]
+    assert [line.get_label() for line in above.lines] == [
+        "training, mean since the previous point: 0.0333 at step 30",
+        "held-out episodes, not trained on: 0.0667 at step 30",
+    ]
+    assert [axes.get_ylabel() for axes in (above, below)] == ["loss of toy (l1), log scale", "learning\nrate"]
+    assert below.get_xlabel() == "training step"
     assert above.lines[1].get_ydata().tolist() == [0.2, 0.1, 2 / 30]
     assert below.lines[0].get_xdata().tolist() == [10, 20, 30]
 
 
 def test_a_negative_log_likelihood_has_a_linear_scale(tmp_path: Path, monkeypatch) -> None:
     rows = [{"step": 1, "loss": 1.0}, {"step": 2, "loss": -1.0}]
-    assert drawn(rows, tmp_path / "loss.png", monkeypatch).axes[0].get_yscale() == "linear"
+    above = drawn(rows, tmp_path / "loss.png", monkeypatch).axes[0]
+    assert (above.get_yscale(), above.get_ylabel()) == ("linear", "loss of toy (l1)")
 
 
 def test_no_row_at_all_can_be_drawn(tmp_path: Path, monkeypatch) -> None:

@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import re
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -72,12 +74,23 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
 
 
 def _print_remedies(findings: Sequence[Finding], console: Console) -> None:
-    """Print what is wrong as lines that are not broken, so that a command can be copied from them."""
+    """Print what is wrong in lines of whole words; a command is never broken, so that it can be copied."""
     for finding in findings:
         if finding.status is not Status.OK:
             console.print(f"\n[{_COLOURS[finding.status]}]{finding.status}: {finding.check}[/]")
             for heading, text in (("symptom", finding.symptom), ("cause", finding.cause), ("remedy", finding.remedy)):
-                console.print(f"  {heading:<8} {escape(text)}", highlight=False, soft_wrap=True)
+                shown = _wrapped(f"  {heading:<8} ", text, console.width)
+                console.print(shown, highlight=False, markup=False, soft_wrap=True)
+
+
+def _wrapped(heading: str, text: str, width: int) -> str:
+    """Return a text in lines of some width, below each other beside its heading; what is in backticks is one word."""
+    joined = re.sub("`[^`]*`", lambda command: command[0].replace(" ", "\0"), text)
+    lines = textwrap.wrap(
+        joined, width, initial_indent=heading, subsequent_indent=" " * len(heading), break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+    return "\n".join(lines).replace("\0", " ")
 
 
 def _print_latency(measured: dict[str, Any], console: Console) -> None:

@@ -218,8 +218,9 @@ def _summary(state: DatasetState, stamp: str) -> dict[str, Any]:
         "late": [_late_frames(row) for row in state.rows],
         "interventions": [_listed(row.get(f"{PREFIX}interventions")) for row in state.rows],
     }
+    root = state.root.resolve()
     return {
-        "name": state.root.resolve().name,
+        "name": root.parent.name if root.name == "dataset" else root.name,
         "root": str(state.root),
         "stamp": stamp,
         "robot": state.info.get("robot_type"),

@@ -540,7 +540,8 @@ def test_the_printed_report_has_findings_histogram_and_remedies(
     assert any(line.split()[:3] == ["≤", "10", "µs"] and "█" * 40 in line for line in lines)
     assert "problem: OpenGL" in text
     assert "[E] ended by SIGSEGV" in text  # square brackets are not markup
-    # A command stands in one line, however narrow the terminal.
+    # All is printed in lines of whole words; a command stands in one line, however narrow the terminal.
+    assert all(len(line) <= 80 or "`" in line for line in lines)
     remedy = next(line for line in lines if "setcap" in line)
     assert "setcap cap_sys_nice,cap_ipc_lock+ep " + os.path.realpath(sys.executable) in remedy
 

@@ -44,11 +44,14 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
         assert "being recorded, repaired or edited" in content.decode()
 
 
-def test_an_empty_dataset(tmp_path) -> None:
+@pytest.mark.parametrize(("folder", "name"), [("pick/d", "d"), ("pick/dataset", "pick")])
+def test_an_empty_dataset_and_the_name_of_a_dataset(tmp_path, folder, name) -> None:
+    root = tmp_path / folder
     features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
-    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=tmp_path / "d", recording={}).finalize()
-    with served(tmp_path / "d") as server:
-        assert server.json("/api/dataset")["episodes"]["frames"] == []
+    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=root, recording={}).finalize()
+    with served(root) as server:
+        assert (found := server.json("/api/dataset"))["name"] == name
+        assert found["episodes"]["frames"] == []
         assert server.ask("/api/episodes/0")[0] == 409
 
 

@@ -1,11 +1,12 @@
-"""The page's JavaScript modules fit together, also where no browser is installed to open the page."""
+"""The page's JavaScript modules and styles fit together, also where no browser is installed to open the page."""
 
 import re
 from pathlib import Path
 
 from bhd_lerobot.apps import view
 
-SCRIPTS = sorted((Path(view.__file__).parent / "static" / "js").glob("*.js"))
+STATIC = Path(view.__file__).parent / "static"
+SCRIPTS = sorted((STATIC / "js").glob("*.js"))
 DECLARED = re.compile(r"^(export )?(?:async )?(?:function\*?|const|let|class) (?:(\w+)|\{([^}]*)\})", re.MULTILINE)
 IMPORTED = re.compile(r"^import \{([^}]*)\} from \"\./([\w.]+)\"", re.MULTILINE)
 
@@ -24,3 +25,10 @@ def test_every_import_is_exported_and_no_name_is_declared_twice() -> None:
             assert set(names(listed)) <= exported[source], (name, source)
             declared += names(listed)
         assert sorted(declared) == sorted(set(declared)), name
+
+
+def test_a_phone_keeps_the_transport_controls_in_the_window() -> None:
+    phone = (STATIC / "style.css").read_text(encoding="utf-8").partition("@media (max-width: 760px)")[2]
+    timeline = re.findall(r"#timeline \{([^}]*)\}", phone)
+    assert len(timeline) == 1
+    assert {"position: sticky", "bottom: 0"} <= {rule.strip() for rule in timeline[0].split(";")}
