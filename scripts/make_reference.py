@@ -89,9 +89,9 @@ def pages() -> dict[Path, str]:
     ]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():
-        text = "\n".join(parts)
+        page = "\n".join(parts)
         # A page of one command has no headings of the second level of its own.
-        written[FOLDER / "options" / f"{name}.md"] = text if "\n## " in text else text.replace("\n### ", "\n## ")
+        written[FOLDER / "options" / f"{name}.md"] = page if "\n## " in page else page.replace("\n### ", "\n## ")
     return written
 
 

@@ -135,7 +135,8 @@ def quoted_commands(path: Path) -> Iterator[str]:
         comments = "\n".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
         lines = comments.replace("\\\n", " ").splitlines()
     else:
-        blocks = "\n".join(re.findall(r"```(?:bash|sh|text)?\n(.*?)```", text, re.DOTALL))
+        fences = re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+        blocks = "\n".join(block for language, block in fences if language in ("", "bash", "sh", "text"))
         lines = blocks.replace("\\\n", " ").splitlines()
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
     # "…" stands for the options of an earlier command.
