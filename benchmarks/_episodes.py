@@ -34,6 +34,6 @@ def add_success(report: Report, name: str, outcomes: Sequence[Outcome], goal: fl
     """Add the row of how many episodes were successes, and how the others ended."""
     found = wilson(sum(outcome.success for outcome in outcomes), len(outcomes))
     causes = Counter(outcome.event.cause for outcome in outcomes if not outcome.success)
-    words = "" if goal is None else f"at least {100 * goal:g}%"
+    words = "" if goal is None else f"at least {100 * goal:g} %"
     met = None if goal is None else found.value >= goal
     report.add(f"{name}: success in {len(outcomes)}", rate(asdict(found), dict(causes.most_common())), words, met=met)

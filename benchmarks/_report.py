@@ -130,7 +130,7 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
     """Return a rate with its interval, and how the episodes ended that were no success; a dash for one of nothing."""
     if estimate["value"] is None:
         return "–"
-    text = f"{estimate['value']:.1%} ({estimate['low']:.1%} to {estimate['high']:.1%})"
+    text = f"{100 * estimate['value']:.1f} % ({100 * estimate['low']:.1f} to {100 * estimate['high']:.1f})"
     causes = ", ".join(f"{count} {cause}" for cause, count in outcomes.items() if cause != "success")
     return f"{text}; {causes}" if causes else text
 

@@ -424,7 +424,7 @@ def add_conditions(report: Report, busy: float, notes: Iterable[str]) -> None:
     """Add rows of what was refused, and of other programs."""
     for note in notes:
         report.add(note, "")
-    used = f"{busy:.0%} of the processors" + (": THE MACHINE IS NOT IDLE" if busy > BUSY else "")
+    used = f"{100 * busy:.0f} % of the processors" + (": THE MACHINE IS NOT IDLE" if busy > BUSY else "")
     report.add("used by other programs before the run", used)
 
 

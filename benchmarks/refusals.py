@@ -9,11 +9,12 @@ not show a brain that takes anything.
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from benchmarks._report import parse_options, write
+from benchmarks._report import parse_options, rate, write
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, TableScene
 from bhd_lerobot.control.commands import Goals
 from bhd_lerobot.envs.stage import Stage
@@ -101,12 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not count["tables"]:
                 continue
             key = "right" if kind == "there" else "went"
-            rate = wilson(count[key], count["tables"])
+            found_rate = rate(asdict(wilson(count[key], count["tables"])), {})
             words = "went for it" if kind == "there" else "went for something"
-            print(
-                f"{world}, asked for what is {kind}: {words} {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of "
-                f"{count['tables']}"
-            )
+            print(f"{world}, asked for what is {kind}: {words} {found_rate} of {count['tables']}")
     write(options.json, found)
     return 0
 

@@ -291,13 +291,13 @@ def summarise_blocks(report: Report, blocks: Sequence[dict[str, Any]], fps: int 
         report.add(heading, value, f"at most {goal:g} x", met=over <= goal)
         more = statistics.median(a["late_share"] - b["late_share"] for a, b in zip(own, quiet, strict=True))
         stopped = f"; stopped and run again {stops}, beside noop {stops_beside}" if stops else ""
-        shares = f"{middle['late_share']:.2%}, beside noop {beside['late_share']:.2%}"
+        shares = f"{100 * middle['late_share']:.2f} %, beside noop {100 * beside['late_share']:.2f} %"
         value = f"{shares}; missed {missed}, beside noop {missed_beside}{stopped}"
         is_met, goal = more <= GOALS["late_share"] and stops <= stops_beside, GOALS["late_share"]
-        report.add(f"{what}: ticks later than 0.1 ms", value, f"at most {goal:.1%} more", met=is_met)
+        report.add(f"{what}: ticks later than 0.1 ms", value, f"at most {100 * goal:.1f} % more", met=is_met)
         frames, goal = middle["frames_per_s"], GOALS["frames_per_s"]
         value = f"{frames:.2f}, beside noop {beside['frames_per_s']:.2f}; {middle['cpu_ms']:.1f} CPU ms each"
-        report.add(f"{what}: frames/s", value, f"at least {goal:.0%} of {fps}", met=frames >= goal * fps)
+        report.add(f"{what}: frames/s", value, f"at least {100 * goal:.0f} % of {fps}", met=frames >= goal * fps)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

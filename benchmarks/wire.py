@@ -442,11 +442,17 @@ def main(arguments: list[str] | None = None) -> int:
     for space in ("wheels", MONITORED, "joints", "impedance"):
         for n in options.n:
             check, whole = share(space, n)
-            shares.add_row(space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}")
+            shares.add_row(
+                space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{100 * check / whole:.1f} %"
+            )
     for n in options.n:
         check, whole = distance_share(n)
         shares.add_row(
-            "joints, distances", str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}"
+            "joints, distances",
+            str(n),
+            f"{check * 1e6:.1f} us",
+            f"{whole * 1e6:.0f} us",
+            f"{100 * check / whole:.1f} %",
         )
     console.print(shares)
     return status(met=not unsafe)

@@ -81,7 +81,7 @@ def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
             shown += 1
             position = robot.simulation.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
             print(
-                f"{seconds:6.2f} s  feedback  {feedback.phase.name.lower()} {feedback.progress:4.0%}, "
+                f"{seconds:6.2f} s  feedback  {feedback.phase.name.lower()} {100 * feedback.progress:3.0f} %, "
                 f"{feedback.remaining_s:4.2f} s left, tool at {position.round(3).tolist()}"
             )
         if estop_after is not None and seconds >= estop_after and not stopped:

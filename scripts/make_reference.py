@@ -1,13 +1,12 @@
-"""Write docs/reference/options.md: every option and every dataset column, from the code that defines them.
+"""Write docs/reference/options.md and the pages in options/: every option and dataset column, from the code.
 
-python scripts/make_reference.py          write the file
-python scripts/make_reference.py --check  exit with 1 if the file is not what would be written
+python scripts/make_reference.py
 """
 
 import ast
 import dataclasses
 import inspect
-import sys
+import re
 import textwrap
 import typing
 from collections.abc import Iterator, Sequence
@@ -36,42 +35,69 @@ from bhd_lerobot.training.config import BhdTrainConfig, own_fields
 from bhd_lerobot.training.dagger.config import AggregationConfig
 from bhd_lerobot.training.rl.config import RlConfig
 
-FILE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "options.md"
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 
-_INTRODUCTION = """\
-# Reference
-
-Written by `python scripts/make_reference.py` from the code; do not edit it by hand. A test fails when it is out of
-date.
+_INDEX = """\
+# Options and columns
 
 Options are written `--key=value` on the command line, or as nested keys in a YAML file that `--config_path=FILE` names;
 the command line wins. `type` chooses among several classes. *Required* means that there is no default. "Nothing" is
 written `null`.
+
+| page | options |
+| --- | --- |
+| [`bhd-record`](options/record.md) | of a recording |
+| [`bhd-replay`](options/replay.md) | of a replay |
+| [`bhd-eval`](options/eval.md) | of an evaluation |
+| [`bhd-train`](options/train.md) | of a training, also with `algorithm: ppo` and `algorithm: dagger` |
+| [`bhd_brain`](options/bhd_brain.md) | of the teleoperator, for LeRobot's own commands |
+| [`robot`](options/robot.md), [`brain`](options/brain.md), [`task`](options/task.md) | of each type |
+"""
+_TRAIN = """\
+LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their names and
+meaning; they are not listed here.
+"""
+_TELEOPERATOR = """\
+For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`.
 """
 
+# Groups of classes whose options are listed already: what they are options of, and the page and anchor.
+Listed = dict[frozenset[type], tuple[str, str]]
 
-def reference() -> str:
-    """Return the whole document."""
-    listed: dict[frozenset[type], str] = {}
+
+def pages() -> dict[Path, str]:
+    """Return every page, by its file."""
+    listed: Listed = {}
+    groups = {name: _choices(kind) for name, kind, _ in options_of(RecordConfig)}
+    texts = {name: [f"# `{name}`\n"] for name in ("robot", "brain", "task")}
+    for name in texts:
+        listed[frozenset(groups[name].values())] = name, f"{name}.md"
+    for name, text in texts.items():
+        for chosen, one in groups[name].items():
+            text += [f"## `{name}.type={chosen}`\n", *_options(one, f"{name}.", f"{name}.md", listed)]
+    texts["record"] = ["# `bhd-record`\n", *_options(RecordConfig, "", "record.md", listed)]
+    texts["replay"] = ["# `bhd-replay`\n", *_options(ReplayConfig, "", "replay.md", listed)]
+    texts["eval"] = ["# `bhd-eval`\n", *_options(EvalConfig, "", "eval.md", listed)]
+    texts["train"] = [
+        *("# `bhd-train`\n", _TRAIN, *_options(BhdTrainConfig, "", "train.md", listed, own_fields())),
+        *("## `bhd-train` with `algorithm: ppo`\n", *_options(RlConfig, "", "train.md", listed)),
+        *("## `bhd-train` with `algorithm: dagger`\n", *_options(AggregationConfig, "", "train.md", listed)),
+    ]
+    texts["bhd_brain"] = [
+        *("# Teleoperator `bhd_brain`\n", _TELEOPERATOR),
+        *_options(BhdBrainConfig, "teleop.", "bhd_brain.md", listed),
+    ]
+    written = {FOLDER / "options.md": _index()}
+    for name, parts in texts.items():
+        page = "\n".join(parts)
+        # A page of one command has no headings of the second level of its own.
+        written[FOLDER / "options" / f"{name}.md"] = page if "\n## " in page else page.replace("\n### ", "\n## ")
+    return written
+
+
+def _index() -> str:
     parts = [
-        _INTRODUCTION,
-        "## `bhd-record`\n",
-        *_options(RecordConfig, "", listed),
-        "## `bhd-replay`\n",
-        *_options(ReplayConfig, "", listed),
-        "## `bhd-eval`\n",
-        *_options(EvalConfig, "", listed),
-        "## `bhd-train`\n",
-        "LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their "
-        "names and their meaning. Beside them:\n",
-        *_options(BhdTrainConfig, "", listed, own_fields()),
-        "## `bhd-train` with `algorithm: ppo`\n",
-        *_options(RlConfig, "", listed),
-        "## `bhd-train` with `algorithm: dagger`\n",
-        *_options(AggregationConfig, "", listed),
-        "## Teleoperator `bhd_brain`\n",
-        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`.\n",
-        *_options(BhdBrainConfig, "teleop.", listed),
+        _INDEX,
         "## Dataset columns\n",
         _columns(),
         "### Modes\n\nIn `control.mode`.\n",
@@ -96,18 +122,19 @@ def reference() -> str:
 
 
 def _options(
-    config_class: type, prefix: str, listed: dict[frozenset[type], str], only: Sequence[str] | None = None
+    config_class: type, prefix: str, page: str, listed: Listed, only: Sequence[str] | None = None
 ) -> Iterator[str]:
     """Yield the table of a class's plain options, and then those of the classes inside it.
 
     Args:
         config_class: a dataclass.
         prefix: of its options.
-        listed: groups of classes whose options are listed already, and the options that they are of; it is extended.
+        page: the name of the page that they are on.
+        listed: it is extended.
         only: names of the fields to list; all if None.
     """
     described = meanings_of(config_class)
-    rows, inner, above = [], [], []
+    rows, inner, elsewhere = [], [], []
     for name, kind, default in options_of(config_class):
         if only is not None and name not in only:
             continue
@@ -125,20 +152,21 @@ def _options(
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
             rows.append((f"`{key}`", _type_name(kind), shown, meaning))
         if classes := frozenset(groups.values()):
-            first = next((where for known, where in listed.items() if classes <= known), None)
-            if first is None:
-                listed[classes] = key
-                inner += [(title, one, f"{key}.") for title, one in groups.items()]
+            first, where = next((found for known, found in listed.items() if classes <= known), ("", ""))
+            if first:
+                link = f"[`{first}.*`]({where.removeprefix(page) or where})"
+                elsewhere.append(link if first == key else f"`{key}.*`, as {link}")
             else:
-                above.append(f"`{key}.*`" if first == key else f"`{key}.*`, as `{first}.*`")
+                listed[classes] = key, f"{page}#{re.sub(r'[^a-z0-9_-]', '', next(iter(groups)))}"
+                inner += [(title, one, f"{key}.") for title, one in groups.items()]
     yield summary_of(config_class) + "\n"
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
-    if above:
-        yield f"Listed above: {'; '.join(above)}.\n"
+    if elsewhere:
+        yield f"Also: {'; '.join(elsewhere)}.\n"
     for title, one, inner_prefix in inner:
         yield f"### `{title}`\n"
-        yield from _options(one, inner_prefix, listed)
+        yield from _options(one, inner_prefix, page, listed)
 
 
 def _choices(kind: Any) -> dict[str, type]:
@@ -261,20 +289,12 @@ def _table(headings: tuple[str, ...], rows: Any) -> str:
     return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |\n" for line in lines)
 
 
-def main(arguments: list[str]) -> int:
-    """Write the file, or compare it; return the exit status."""
-    text = reference()
-    if arguments == ["--check"]:
-        same = FILE.exists() and FILE.read_text(encoding="utf-8") == text
-        if not same:
-            print(f"{FILE} is out of date; run: python scripts/make_reference.py", file=sys.stderr)
-        return int(not same)
-    if arguments:
-        print(f"Unknown argument {arguments[0]!r}. Valid: --check.", file=sys.stderr)
-        return 2
-    FILE.write_text(text, encoding="utf-8")
-    return 0
+def main() -> None:
+    """Write every page."""
+    for path, text in pages().items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main()

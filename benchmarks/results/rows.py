@@ -132,7 +132,7 @@ class Rows:
         found = dict(
             zip(("value", "low", "high"), recovered(*(self._get(one, seeds[0]) for one in paths)), strict=True)
         )
-        text = f"{found['value']:.0%} ({found['low']:.0%} to {found['high']:.0%})"
+        text = f"{100 * found['value']:.0f} % ({100 * found['low']:.0f} to {100 * found['high']:.0f})"
         value = "not defined: nothing was lost" if math.isnan(found["value"]) else text
         yield _judged(f"{spec['what']}, share of what was lost", value, spec, found)
 
@@ -157,7 +157,7 @@ class Rows:
         """How often a brain takes another object than the one that is named."""
         brain = self._brain(refs[0], seeds[0])
         found = asdict(wilson(brain["outcomes"].get("wrong_object", 0), brain["episodes"]))
-        by_chance = f"; chance {1 - chance(brain['episodes']):.1%}"
+        by_chance = f"; chance {100 * (1 - chance(brain['episodes'])):.1f} %"
         yield Row(f"{spec['shown']} takes another object, in {brain['episodes']}", rate(found, {}) + by_chance)
 
 
@@ -167,7 +167,7 @@ def _judged(what: str, value: str, spec: Mapping[str, Any], found: Mapping[str, 
 
 
 def is_met(goal: str, found: Mapping[str, float | None]) -> bool:
-    """Return whether a number meets a goal: "[lower end|upper end|its interval] at least|at most|above N[%]", ….
+    """Return whether a number meets a goal: "[lower end|upper end|its interval] at least|at most|above N[ %]", ….
 
     Args:
         goal: the words; several with commas between them.
@@ -175,7 +175,7 @@ def is_met(goal: str, found: Mapping[str, float | None]) -> bool:
     """
     for clause in goal.split(", "):
         end, relation, number, percent = re.match(
-            r"(lower end |upper end |its interval |)(at least|at most|above) (-?[\d.]+)(%?)", clause
+            r"(lower end |upper end |its interval |)(at least|at most|above) (-?[\d.]+)( %|)", clause
         ).groups()  # type: ignore[union-attr]
         key = {"": "value", "upper end ": "high"}.get(end, "low")
         value, limit = found.get(key), float(number) / (100 if percent else 1)
@@ -188,7 +188,7 @@ def is_met(goal: str, found: Mapping[str, float | None]) -> bool:
 
 
 def _beside_chance(spec: Mapping[str, Any], episodes: int) -> str:
-    return f"; chance {chance(episodes, int(spec['least_objects'])):.1%}" if "least_objects" in spec else ""
+    return f"; chance {100 * chance(episodes, int(spec['least_objects'])):.1f} %" if "least_objects" in spec else ""
 
 
 def chance(episodes: int, least: int = 1) -> float:
@@ -206,7 +206,7 @@ def chance(episodes: int, least: int = 1) -> float:
 def over_seeds(rates: Sequence[float], episodes: int) -> str:
     """Return the mean success of policies from several training seeds, with its interval, and each of their rates."""
     found = over_trainings(rates, episodes)
-    return f"{rate(asdict(found), {})}; {', '.join(f'{one:.1%}' for one in rates)}"
+    return f"{rate(asdict(found), {})}; {', '.join(f'{100 * one:.1f} %' for one in rates)}"
 
 
 def over_trainings(rates: Sequence[float], episodes: int) -> Estimate:

@@ -118,9 +118,9 @@ def test_a_section_shows_rows_seeds_remarks_and_each_command_once(tmp_path: Path
 @each_case(
     ("goal", "met"),
     [
-        ("at least 90%", True),
-        ("at least 90.1%", False),
-        ("lower end at least 80%", True),
+        ("at least 90 %", True),
+        ("at least 90.1 %", False),
+        ("lower end at least 80 %", True),
         ("upper end at least 1", False),
         ("at most 0.9 of 1", True),
         ("above 0.9", False),
@@ -169,9 +169,9 @@ def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_both_rules(
 def test_the_interval_over_trainings_is_over_the_episodes_that_they_share_too() -> None:
     # Of equal trainings it is what one of them would have, Wilson's; of many episodes Student's: 4.3027 / sqrt(3)
     # deviations to either side, within what a rate can be.
-    assert over_seeds([0.9, 0.9, 0.9], 500) == "90.0% (87.1% to 92.3%); 90.0%, 90.0%, 90.0%"
-    assert over_seeds([0.1, 0.2, 0.3], 10**9) == "20.0% (0.0% to 44.8%); 10.0%, 20.0%, 30.0%"
-    assert over_seeds([0.97, 0.99, 1.0], 10**9) == "98.7% (94.9% to 100.0%); 97.0%, 99.0%, 100.0%"
+    assert over_seeds([0.9, 0.9, 0.9], 500) == "90.0 % (87.1 to 92.3); 90.0 %, 90.0 %, 90.0 %"
+    assert over_seeds([0.1, 0.2, 0.3], 10**9) == "20.0 % (0.0 to 44.8); 10.0 %, 20.0 %, 30.0 %"
+    assert over_seeds([0.97, 0.99, 1.0], 10**9) == "98.7 % (94.9 to 100.0); 97.0 %, 99.0 %, 100.0 %"
     for rates, episodes in (([0.1, 0.2, 0.3], 20), ([0.974, 0.974, 0.976], 500), ([1.0, 0.0, 0.0], 100)):
         found, value, rounding = over_trainings(rates, episodes), sum(rates) / 3, 0.5 / episodes + 1e-4
         own, half = wilson(round(value * episodes), episodes), 4.3027 * np.std(rates, ddof=1) / math.sqrt(3)

@@ -1,5 +1,7 @@
 """The tutorials run as they stand: each notebook is its tutorial, and every cell of it works."""
 
+import os
+import re
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,8 @@ SHOWN = {
     "from_a_ros2_bag": ["control.applied_action", "valid, no errors"],
     "your_own": ["4 of 4 episodes succeeded", "gap_follower 4 of 4"],
 }
+# Its outputs are not kept: it takes a quarter of an hour.
+LONG = {"cameras"}
 # The short form of what takes longer than a few seconds.
 SHORTER = {
     "cameras": {
@@ -47,6 +51,27 @@ def test_every_tutorial_is_known_and_its_notebook_is_up_to_date() -> None:
     for path in TUTORIALS:
         written = path.parent / "notebooks" / f"{path.stem}.ipynb"
         assert written.read_text(encoding="utf-8") == script.notebook(path), "run: python scripts/make_notebooks.py"
+
+
+def test_outputs_are_those_of_the_whole_tutorial() -> None:
+    for path in TUTORIALS:
+        text = path.read_text(encoding="utf-8")
+        outputs = "".join(re.findall(r"^```output\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+        assert path.stem in LONG or outputs, path
+        if path.stem not in SHORTER:
+            assert [shown for shown in SHOWN[path.stem] if shown not in outputs] == [], path
+
+
+def test_an_output_replaces_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("COLUMNS", "PATH"):
+        monkeypatch.setenv(name, os.environ.get(name, "80"))
+    script = load_script("make_notebooks")
+    text = "# Title\n\n```python\nprint('in', 2)\n```\n\n```output\nold\n```\n\nText.\n\n```bash\nseq 30; pwd\n```\n"
+    once = script.run(text)
+    assert "```output\nin 2\n```\n\nText." in once
+    assert "\n16\n… 11 lines …\n28\n" in once
+    assert "old" not in once
+    assert script.run(once).count("```output") == 2
 
 
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)

@@ -207,8 +207,8 @@ def check_throttling(folder: Path = Path("/proc/sys/kernel")) -> list[Finding]:
         return [wrong("throttling.off", "off")]
     share = runtime / period
     if share < 0.5:
-        return [wrong("throttling.low", f"{share:.0%}", share=f"{share:.0%}")]
-    return [fine("RT throttling", f"real-time processes may use {share:.0%}")]
+        return [wrong("throttling.low", f"{100 * share:.0f} %", share=f"{100 * share:.0f} %")]
+    return [fine("RT throttling", f"real-time processes may use {100 * share:.0f} %")]
 
 
 def check_clock(folder: Path = Path("/sys/devices/system/clocksource/clocksource0")) -> list[Finding]:
@@ -286,7 +286,7 @@ def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) ->
     for robot, rate in robots.items():
         share = worst * rate
         found = f"{robot}, {rate} Hz: at worst {worst * 1e6:.0f} µs late, {100 * share:.1f} % of {1e3 / rate:g} ms"
-        values = {"rate": rate, "share": f"{share:.0%}", "timeout": f"{1e3 * timeout_s:g} ms"}
+        values = {"rate": rate, "share": f"{100 * share:.0f} %", "timeout": f"{1e3 * timeout_s:g} ms"}
         # The last command was written a period before the one that is late.
         if worst + 1 / rate >= timeout_s:
             findings.append(wrong("latency.stopped", found, **values))

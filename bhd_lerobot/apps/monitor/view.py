@@ -177,7 +177,7 @@ def _goal(state: MonitorState) -> list[Text]:
     done = min(max(goal["progress"], 0.0), 1.0)
     bar = "█" * round(20 * done) + "░" * (20 - round(20 * done))
     line = Text(f" {'goal':<{_LABEL}}{goal['task_id'][:16]:<16} {goal['phase'].lower():<10}")
-    return [line.append(bar, "green").append(f" {done:4.0%}, {max(0.0, goal['remaining_s']):5.1f} s left")]
+    return [line.append(bar, "green").append(f" {100 * done:3.0f} %, {max(0.0, goal['remaining_s']):5.1f} s left")]
 
 
 def _pose(state: MonitorState) -> list[Text]:

@@ -199,8 +199,8 @@ class LanguageBrain(PickBrain):
         options, name = self.settings.perception, scene_object(target).name
         if not target.certainty >= options.min_certainty:
             raise PerceptionError(
-                f"It is not certain that there is a {name}: {target.certainty:.0%}, which is less than "
-                f"perception.min_certainty ({options.min_certainty:.0%})."
+                f"It is not certain that there is a {name}: {100 * target.certainty:.0f} %, which is less than "
+                f"perception.min_certainty ({100 * options.min_certainty:.0f} %)."
             )
         if not target.error_90_m <= options.max_error_m:
             raise PerceptionError(

@@ -279,9 +279,9 @@ class _RobotBag:
             for timeout, (blind, against) in counts.items()
         )
         raise DatasetError(
-            f"{self._bag.path}: the robot moves in {moving} of {n} frames ({moving / n:.0%}) without a command of "
-            f"{self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove it "
-            f"with --cmd, or say what is in force while no command comes. {choices}."
+            f"{self._bag.path}: the robot moves in {moving} of {n} frames ({100 * moving / n:.0f} %) without a command "
+            f"of {self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove "
+            f"it with --cmd, or say what is in force while no command comes. {choices}."
         )
 
     def save(self, episode: _Episode) -> int:

@@ -69,7 +69,7 @@ class CameraImages:
                     if image is None or broken > max(1, MOST_LOST * total):
                         raise DatasetError(
                             f"{broken} of {total} images of an episode cannot be decoded, which is more than "
-                            f"{MOST_LOST:.0%}: too many to go on without them. The first: {reason}"
+                            f"{100 * MOST_LOST:.0f} %: too many to go on without them. The first: {reason}"
                         ) from error
                 before = row
             assert image is not None

@@ -212,7 +212,7 @@ class _Rounds:
         for column in ("round", "episodes", "expert drove", "success, 95 %", "score, 95 %", "time so far"):
             table.add_column(column)
         for row in self._rows.values():
-            share = "all" if row["expert_share"] is None else f"{row['expert_share']:.1%}"
+            share = "all" if row["expert_share"] is None else f"{100 * row['expert_share']:.1f} %"
             level = _interval(row["success"]), _interval(row["score"])
             spent = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f} min"
             table.add_row(str(row["round"]), str(row["episodes"]), share, *level, spent)

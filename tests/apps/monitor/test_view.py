@@ -174,7 +174,7 @@ def test_requested_against_applied_with_units_and_without_a_request_under_a_goal
 
 def test_progress_of_a_goal() -> None:
     goal = {"task_id": "2-down", "phase": "EXECUTING", "progress": 0.5, "remaining_s": 1.25}
-    assert "2-down           executing ██████████░░░░░░░░░░  50%,   1.2 s left" in text(state(goal=goal))
+    assert "2-down           executing ██████████░░░░░░░░░░  50 %,   1.2 s left" in text(state(goal=goal))
 
 
 @each_case(

@@ -72,7 +72,7 @@ def test_a_topic_that_is_mostly_unreadable_is_refused_with_the_numbers(tmp_path,
     bag = write(tmp_path / "bag", messages, "sqlite3")
     total = shorten(bag, "/odom", range(0, 60, 3))
     error = refused(bag, tmp_path / "d", capsys)
-    assert f"20 of the {total} messages of /odom cannot be read, which is more than 10%" in error
+    assert f"20 of the {total} messages of /odom cannot be read, which is more than 10 %" in error
     assert "of 40 bytes cannot be read as nav_msgs/msg/Odometry" in error
 
 
@@ -373,7 +373,7 @@ def test_images_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messa
         images[place][2].data = images[place][2].data[:100]
     bag = write(tmp_path / "broken", sorted([*messages, *images], key=lambda one: one[1]))
     error = refused(bag, tmp_path / "e", capsys, *arguments)
-    assert "images of an episode cannot be decoded, which is more than 10%" in error
+    assert "images of an episode cannot be decoded, which is more than 10 %" in error
 
 
 def test_a_scanner_of_shorter_reach_is_reported(tmp_path, messages, capsys):

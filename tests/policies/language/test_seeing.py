@@ -182,7 +182,7 @@ def test_it_takes_the_side_of_a_box_that_leaves_room_for_errors_unless_something
         ([()], {}, "Nothing on the table is 'red cup'"),
         ([(seen(BOX, 0),)], {}, "Nothing on the table is 'red cup'. On the table: blue box"),
         ([(seen(CUP, 0), seen(CUP, 1, off=0.2))], {}, "fits 2 objects"),
-        ([(seen(CUP, 0, certainty=0.4),)], {"min_certainty": 0.5}, "not certain that there is a red cup: 40%"),
+        ([(seen(CUP, 0, certainty=0.4),)], {"min_certainty": 0.5}, "not certain that there is a red cup: 40 %"),
         ([(seen(CUP, 0, error=0.04),)], {}, "known to 40 mm only"),
         ([(seen(CUP, 0, error=0.01),)], {"max_error_m": 0.005}, "known to 10 mm only"),
     ],
