@@ -86,12 +86,6 @@ def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.M
             np.testing.assert_allclose(data.joint(joint).xanchor, frames[number][:3, 3], atol=1e-12)
 
 
-def test_the_chain_is_the_published_one() -> None:
-    assert CHAIN.a == (0, -0.425, -0.39225, 0, 0, 0)
-    assert CHAIN.d == (0.089159, 0, 0, 0.10915, 0.09465, 0.0823)
-    np.testing.assert_allclose(np.degrees(CHAIN.alpha), (90, 0, 0, 90, -90, 0), atol=1e-12)
-
-
 def test_masses_and_centres_of_mass_are_the_published_ones(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     masses = (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879)
     centres = np.array(
@@ -123,29 +117,6 @@ def test_inertias_are_those_of_bodies_as_large_as_the_links(model: mujoco.MjMode
         assert (inertia > 0).all()
         assert 2 * inertia.max() <= inertia.sum()
         assert np.sqrt(inertia / model.body_mass[body]).max() < length / 2
-
-
-def test_mass_matrix_gravity_and_jacobian_agree_with_pinocchio(
-    model: mujoco.MjModel, data: mujoco.MjData, peer: pinocchio.Model
-) -> None:
-    assert [peer.names[i] for i in range(1, 9)] == [model.joint(i).name for i in range(8)]
-    work = peer.createData()
-    wrist, hand = peer.getJointId("wrist_3"), model.body("gripper").id
-    rng = np.random.default_rng(3)
-    mass, linear, angular = np.empty((8, 8)), np.empty((3, 8)), np.empty((3, 8))
-    for q in postures(20, 1):
-        v = rng.uniform(-3, 3, 8)
-        data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, mass)
-        np.testing.assert_allclose(pinocchio.crba(peer, work, q), mass, atol=1e-11)
-        np.testing.assert_allclose(pinocchio.nonLinearEffects(peer, work, q, v), data.qfrc_bias, atol=1e-10)
-        pinocchio.forwardKinematics(peer, work, q)
-        jacobian = pinocchio.computeJointJacobian(peer, work, q, wrist)
-        rotation = work.oMi[wrist].rotation
-        mujoco.mj_jac(model, data, linear, angular, work.oMi[wrist].translation, hand)
-        np.testing.assert_allclose(rotation @ jacobian[:3], linear, atol=1e-11)
-        np.testing.assert_allclose(rotation @ jacobian[3:], angular, atol=1e-11)
 
 
 def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjModel, data: mujoco.MjData) -> None:

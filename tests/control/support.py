@@ -1,9 +1,6 @@
 """A plant with perfect wheels on a virtual clock, and the processes that share memory with a test."""
 
 import mmap
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -107,12 +104,6 @@ def shared_block(path: Path, size: int = 0) -> mmap.mmap:
         return mmap.mmap(file.fileno(), 0)
 
 
-def start(job: str, path: Path, count: int = 0) -> subprocess.Popen:
-    """Run one of the functions below in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    return subprocess.Popen([sys.executable, __file__, job, str(path), str(count)], env=environment)
-
-
 def push_commands(path: Path, count: int) -> None:
     """Push numbered commands as fast as the reader makes room."""
     fifo = CommandFifo(*FIFO_SHAPE, buffer=shared_block(path))
@@ -133,10 +124,6 @@ def publish_states(path: Path, count: int) -> None:
         ring.publish(state)
 
 
-def set_word(path: Path, _: int) -> None:
+def set_word(path: Path) -> None:
     """Press the emergency stop of the second of two simulations."""
     EstopWord(2, shared_block(path)).press(np.array([1]))
-
-
-if __name__ == "__main__":
-    globals()[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]))

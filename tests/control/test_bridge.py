@@ -144,32 +144,6 @@ def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[
     assert bridge.cerebellum.refusals[Reason.ESTOP, 0] == 20
 
 
-def test_a_twist_that_is_asked_for_is_driven() -> None:
-    bridge, world = simulated(3)
-    commands = np.array([(0.2, 0.0), (0.0, 1.5), (-0.1, -0.8)])
-    for _ in range(20):
-        bridge.send(commands)
-        bridge.advance_frame()
-    np.testing.assert_allclose(bridge.state().measured, commands, atol=0.01)
-    np.testing.assert_allclose(bridge.state().command, commands)
-    np.testing.assert_allclose(world.qvel[:, 5], commands[:, 1], rtol=0.02, atol=1e-3)
-
-
-def test_odometry_follows_the_truth_and_drifts_a_little() -> None:
-    bridge, world = simulated()
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        command = rng.uniform((-0.05, -1.0), (0.2, 1.0))
-        for _ in range(10):
-            bridge.send(command[None])
-            bridge.advance_frame()
-    odometry, truth = bridge.state().odometry[0], world.base_pose[0]
-    error = np.hypot(*(odometry[:2] - truth[:2]))
-    assert 1e-6 < error < 0.1
-    turn = (odometry[2] - truth[2] + np.pi) % (2 * np.pi) - np.pi
-    assert 1e-6 < abs(turn) < 0.15
-
-
 def test_a_robot_that_pushes_a_wall_has_no_limits_broken() -> None:
     bridge, world = simulated()
     arena = random_arena(3)

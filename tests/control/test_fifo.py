@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.control.fifo import CommandFifo, RingReader, StateRing
 from bhd_lerobot.errors import ConfigError
 from tests.control import support
+from tests.forks import Fork
 
 ALL = np.ones(1, np.bool_)
 
@@ -119,7 +120,7 @@ def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path
     reader = CommandFifo(
         *support.FIFO_SHAPE, buffer=support.shared_block(path, CommandFifo.nbytes(*support.FIFO_SHAPE))
     )
-    process = support.start("push_commands", path, count)
+    process = Fork(support.push_commands, path, count)
     for number in range(count):
         while (popped := pop(reader)) is None:
             assert process.poll() is None or len(reader) > 0
@@ -192,7 +193,7 @@ def test_states_from_another_process_are_never_torn(tmp_path: Path) -> None:
     count = 20_000
     path = tmp_path / "block"
     ring = StateRing(support.STATE, 2, support.shared_block(path, StateRing.nbytes(support.STATE, 2)))
-    process = support.start("publish_states", path, count)
+    process = Fork(support.publish_states, path, count)
     last = 0
     while last < count:
         latest = ring.latest()

@@ -7,38 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
-from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
-from tests.control import support
-from tests.control.goal_rig import ARM, HOME, HZ, joints
+from tests.control import arm_rig, support
+from tests.control.goal_rig import HZ, joints
 
 TICK_NS = NANOSECONDS // HZ
-
-
-class ObedientArm(Plant):
-    """A plant that is where it is commanded to be."""
-
-    n = 1
-
-    def __init__(self) -> None:
-        self.controller: ArmController | None = None
-        self.fault = False
-
-    def read(self, out: PlantReading) -> None:
-        out.position[:] = HOME if self.controller is None else self.controller.command
-        out.velocity[:] = 0.0 if self.controller is None else self.controller.velocity
-        out.safety[:] = self.fault
-
-    def write(self, ctrl: NDArray[np.float64]) -> None:
-        assert np.isfinite(ctrl).all()
 
 
 class Pair:
@@ -46,11 +24,7 @@ class Pair:
 
     def __init__(self, capacity: int = 4, events: int = 4, active: bool = True) -> None:
         self.now_ns, self.alive = 0, True
-        plant, controller = ObedientArm(), ArmController(ARM, 1, HZ, HZ // 50)
-        controller.configure(np.array([0]), self.reading(plant))
-        plant.controller = controller
-        self.plant = plant
-        self.cerebellum = Cerebellum(ARM, plant, HZ, controller=controller)
+        self.cerebellum = arm_rig.Rig(active=False).cerebellum
         blocks = [bytearray(Mailbox.nbytes(dtype, size)) for dtype, size in self.shapes(capacity, events)]
         ours, theirs = (
             [Mailbox(*shape, block) for shape, block in zip(self.shapes(capacity, events), blocks, strict=True)]
@@ -66,12 +40,6 @@ class Pair:
     @staticmethod
     def shapes(capacity: int, events: int) -> list[tuple[np.dtype, int]]:
         return [(request_dtype(6), capacity), (EVENT_DTYPE, events)]
-
-    @staticmethod
-    def reading(plant: ObedientArm) -> PlantReading:
-        reading = PlantReading(1, 7)
-        plant.read(reading)
-        return reading
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):

@@ -12,7 +12,7 @@ from bhd_lerobot.control.arm.rotations import rotation_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
-from tests.robots.impedance_rig import ARM, START, WALL, Rig, forward_posture
+from tests.robots.impedance_rig import ARM, START, WALL, Rig
 
 ROOT = Path(__file__).resolve().parents[2]
 EFFORT = np.array(ARM.limits.effort[:6])
@@ -254,10 +254,6 @@ def test_a_base_has_no_fixtures() -> None:
 
     with pytest.raises(SimulationError, match="Fixtures"):
         World(turtlebot3_burger(), fixtures=(WALL,))
-
-
-def test_a_posture_at_the_start_points_forward() -> None:
-    assert np.isfinite(forward_posture()).all()
 
 
 def test_the_example_settles_at_the_force_that_is_asked_for(

@@ -198,13 +198,6 @@ def test_a_scan_lasts_a_fifth_of_a_second(robot):
     assert fresh == [False, True] * 3
 
 
-def test_fewer_beams_are_the_same_beams(tmp_path):
-    with make(tmp_path, lidar_noise_std=0.0) as full, make(tmp_path, lidar_noise_std=0.0, beams=36) as few:
-        all_beams, some = full.get_observation(), few.get_observation()
-    for beam in range(36):
-        assert some[f"scan_{beam:03d}.pos"] == pytest.approx(all_beams[f"scan_{beam * 10:03d}.pos"], abs=1e-9)
-
-
 def test_odometry_follows_the_truth_and_drifts(tmp_path):
     with make(tmp_path, arena="empty", odometry=True) as robot:
         for k in range(60):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -101,9 +101,12 @@ def without(topic: str) -> Callable[[Message], bool]:
     return lambda message: message[0] != topic
 
 
-def write(path: Path, messages: list[Message], storage: str = "mcap") -> Path:
-    """Write a bag, messages in the order given."""
-    with Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+def write(path: Path, messages: list[Message], storage: str = "mcap", compression: str = "") -> Path:
+    """Write a bag, messages in the order given; compressed by file, message or storage."""
+    writer = Writer(path, version=9 if compression else 8, storage_plugin=StoragePlugin[storage.upper()])
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
         for topic, received, message in messages:
             kind = message.__msgtype__

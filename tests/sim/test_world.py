@@ -75,25 +75,16 @@ def sixty_four() -> list[bytes]:
     return [everything(world, sim) for sim in range(64)]
 
 
-def test_simulations_differ(sixty_four: list[bytes]) -> None:
-    assert len(set(sixty_four)) == 64
-
-
-@pytest.mark.parametrize(("n", "threads"), [(1, None), (7, None), (7, 1), (64, 1), (64, 5)])
+@each_case(("sims", "threads"), [(1, None), (7, None), (7, 1), (64, 1), (64, 5), ((20, 23), None)])
 def test_the_same_commands_give_the_same_bytes_for_any_number_of_simulations_and_threads(
-    n: int, threads: int | None, sixty_four: list[bytes]
+    sims: int | tuple[int, int], threads: int | None, sixty_four: list[bytes]
 ) -> None:
-    world = World(BODY, n, threads=threads)
-    fill(world, range(n))
-    roam(world, range(n))
-    assert [everything(world, sim) for sim in range(n)] == sixty_four[:n]
-
-
-def test_a_simulation_does_not_depend_on_its_place(sixty_four: list[bytes]) -> None:
-    world = World(BODY, 3)
-    fill(world, range(20, 23))
-    roam(world, range(20, 23))
-    assert [everything(world, sim) for sim in range(3)] == sixty_four[20:23]
+    assert len(set(sixty_four)) == 64
+    which = range(sims) if isinstance(sims, int) else range(*sims)
+    world = World(BODY, len(which), threads=threads)
+    fill(world, which)
+    roam(world, which)
+    assert [everything(world, sim) for sim in range(len(which))] == sixty_four[which.start : which.stop]
 
 
 def test_an_episode_does_not_depend_on_the_one_before(sixty_four: list[bytes]) -> None:

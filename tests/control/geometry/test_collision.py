@@ -113,17 +113,6 @@ def test_the_shoulder_turns_nothing_nearer() -> None:
         np.testing.assert_allclose(before, after, atol=1e-12)
 
 
-def test_home_is_clear() -> None:
-    assert min(map(float, CollisionModel(CHAIN).distances(HOME))) > 2 * CHAIN.min_distance
-
-
-def test_a_stretched_arm_is_clear_and_a_folded_one_is_not() -> None:
-    model = CollisionModel(CHAIN)
-    assert float(model.distances(np.array([0, -1.5, 0, -1.5, 0, 0]))[0]) > 0
-    assert float(model.distances(np.array([0, -1.5, 3.1, 0, 0, 0]))[0]) < 0
-    assert float(model.distances(np.array([0, 0.5, 0, 0, 0, 0]))[1]) < 0  # below the table
-
-
 def test_an_empty_collision_check_returns_infinity() -> None:
     nothing = CollisionModel(dataclasses.replace(CHAIN, capsules=(), disjoint=()))
     assert [float(distance) for distance in nothing.distances(HOME)] == [math.inf, math.inf]

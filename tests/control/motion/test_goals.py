@@ -131,16 +131,6 @@ def test_a_goal_that_settles_is_cancelled_where_it_stands() -> None:
     assert not rig.manager.busy.any()
 
 
-def test_a_goal_that_preempts_and_is_cancelled_at_once_leaves_no_motion_behind() -> None:
-    rig = started()
-    rig.go("b", joint_target=NEAR, preempt=True)
-    rig.manager.cancel(0, "b")
-    rig.run()
-    assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.CANCELLED)]
-    assert at_rest(rig)
-    assert rig.position[0, 0] < FAR[0]
-
-
 # --- preempt ---------------------------------------------------------------------------------------------------------
 
 
@@ -186,17 +176,6 @@ def test_a_goal_that_preempts_a_brake_takes_over_but_never_a_hard_one() -> None:
     assert rig.results() == [("a", ResultCode.ESTOP), ("b", ResultCode.SUCCEEDED)]
 
 
-def test_a_goal_that_does_not_preempt_waits_until_the_brake_is_over() -> None:
-    rig = started()
-    rig.stop(ResultCode.CANCELLED, hard=False)
-    rig.go("b", joint_target=NEAR)
-    while not at_rest(rig):
-        assert rig.phase == GoalPhase.CONVERTING
-        rig.tick()
-    rig.run()
-    assert rig.results() == [("a", ResultCode.CANCELLED), ("b", ResultCode.SUCCEEDED)]
-
-
 def test_a_goal_that_cannot_be_planned_brakes_what_others_moved() -> None:
     rig = Rig()
     rig.velocity[0, 2] = 1.0
@@ -217,16 +196,6 @@ def test_a_gripper_that_was_stopped_stays_where_it_stopped() -> None:
     rig.go("b", joint_target=NEAR)
     rig.run()
     assert rig.position[0, 6] == stopped
-
-
-def test_a_goal_that_preempts_but_cannot_be_planned_leaves_a_braking_arm() -> None:
-    rig = started()
-    rig.go("b", target_pose=moved(2.0), preempt=True)
-    rig.tick()
-    assert rig.phase == GoalPhase.ERROR
-    assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.UNREACHABLE)]
-    rig.run()
-    assert at_rest(rig)
 
 
 def test_a_goal_that_is_refused_preempts_nothing() -> None:
@@ -534,23 +503,7 @@ def test_a_restart_forgets_everything_and_reports_nothing() -> None:
     assert rig.phase == GoalPhase.IDLE
 
 
-def test_results_and_feedback_are_separate_for_each_arm() -> None:
-    rig = Rig(3)
-    rig.go("a", 1, joint_target=NEAR)
-    rig.run()
-    assert [rig.results(sim) for sim in range(3)] == [[], [("a", ResultCode.SUCCEEDED)], []]
-    assert rig.position[0].tolist() == HOME.tolist()
-
-
 # --- the rest --------------------------------------------------------------------------------------------------------
-
-
-def test_convert_leaves_the_reference_unchanged() -> None:
-    rig = started()
-    before = [array.copy() for array in rig.reference]
-    plans = [rig.manager.convert(0, rig.manager._books[0].followed, rig.reference) for _ in range(2)]  # type: ignore[arg-type]
-    assert np.array_equal(plans[0].target, plans[1].target)  # type: ignore[union-attr]
-    assert all(np.array_equal(one, other) for one, other in zip(before, rig.reference, strict=True))
 
 
 def test_every_code_is_produced_by_some_test() -> None:

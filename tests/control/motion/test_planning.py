@@ -298,15 +298,6 @@ def test_a_goal_in_a_brake_waits_for_its_end_or_preempts_it(preempt: bool) -> No
     assert rig.results() == [("a", code), ("b", ResultCode.SUCCEEDED)]
 
 
-def test_feedback_names_the_goal_that_is_planned() -> None:
-    rig, _ = rig_of(NEVER)
-    rig.go("a", joint_target=FAR)
-    rig.tick(5)
-    feedback = rig.manager.feedback(0)
-    assert feedback is not None
-    assert (feedback.task_id, feedback.phase, feedback.progress) == ("a", GoalPhase.CONVERTING, 0.0)
-
-
 # --- laws ------------------------------------------------------------------------------------------------------------
 
 latencies = st.lists(st.integers(1, 30) | st.integers(1, 2 * TIMEOUT) | st.just(NEVER), max_size=12)

@@ -10,7 +10,7 @@ import pytest
 from backports import zstd
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer as McapWriter
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.find import find_bags
@@ -69,16 +69,7 @@ def test_both_storages_read_back_also_as_a_bare_file(bags, messages, storage):
     [("FILE", "MCAP"), ("FILE", "SQLITE3"), ("MESSAGE", "SQLITE3"), ("MESSAGE", "MCAP"), ("STORAGE", "MCAP")],
 )
 def test_compressed_bags(tmp_path, messages, mode, storage):
-    writer = Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin[storage])
-    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-    with writer:
-        connections = {}
-        for topic, received, message in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], received, STORE.serialize_cdr(message, kind))
-    assert check(tmp_path / "b", messages) == len(messages)
+    assert check(write(tmp_path / "b", messages, storage, mode), messages) == len(messages)
     if mode == "MESSAGE":
         (tmp_path / "b" / "metadata.yaml").unlink()
         assert check(tmp_path / "b", messages, problems=2) == len(messages)  # no metadata, so the mode was guessed
@@ -154,15 +145,7 @@ def test_a_bag_that_is_cut_off_anywhere_gives_what_is_before_or_is_refused(tmp_p
 
 
 def test_a_cut_compressed_chunk_gives_what_can_be_decompressed(tmp_path, messages):
-    writer = Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    with writer:
-        kind = "sensor_msgs/msg/LaserScan"
-        connection = writer.add_connection("/scan", kind, typestore=STORE)
-        for topic, received, message in messages:
-            if topic == "/scan":
-                writer.write(connection, received, STORE.serialize_cdr(message, kind))
-    path = tmp_path / "b" / "b.mcap"
+    path = write(tmp_path / "b", [one for one in messages if one[0] == "/scan"], "mcap", "STORAGE") / "b.mcap"
     path.write_bytes(path.read_bytes()[:2000])
     (bag,) = find_bags(tmp_path / "b")
     read = bag.read(["/scan"])
