@@ -45,8 +45,6 @@ class PerfectPlant(Plant):
 
 
 class Rig:
-    """A cerebellum on a perfect plant, and the clock that moves it."""
-
     def __init__(self, n: int = 1, active: bool = True, **options: object) -> None:
         self.plant = PerfectPlant(n)
         self.cerebellum = Cerebellum(BODY, self.plant, HZ, BaseController(BODY, n, HZ), **options)  # type: ignore[arg-type]
@@ -90,8 +88,6 @@ class Rig:
         return int(self.cerebellum.refusals[reason, 0])
 
 
-# --- what runs in other processes ------------------------------------------------------------------------------------
-
 FIFO_SHAPE = (3, 2, 8)  # n, width, capacity
 STATE = np.dtype([("number", np.int64), ("copies", np.int64, (500,))])
 
@@ -105,7 +101,6 @@ def shared_block(path: Path, size: int = 0) -> mmap.mmap:
 
 
 def push_commands(path: Path, count: int) -> None:
-    """Push numbered commands as fast as the reader makes room."""
     fifo = CommandFifo(*FIFO_SHAPE, buffer=shared_block(path))
     for number in range(count):
         values = np.full((3, 2), float(number))
@@ -115,7 +110,6 @@ def push_commands(path: Path, count: int) -> None:
 
 
 def publish_states(path: Path, count: int) -> None:
-    """Publish numbered states as fast as possible."""
     ring = StateRing(STATE, 2, buffer=shared_block(path))
     state = np.zeros((), STATE)
     for number in range(1, count + 1):

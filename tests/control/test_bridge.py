@@ -41,9 +41,6 @@ def twist(*values: float) -> np.ndarray:
     return np.array([values])
 
 
-# --- time ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rates", [Rates(400, 200, 10), Rates(600, 300, 30), Rates(70, 7, 7)])
 def test_a_frame_is_a_frame_without_drift(rates: Rates) -> None:
     bridge = perfect(rates=rates)
@@ -108,9 +105,6 @@ def test_the_life_of_a_robot() -> None:
     assert bridge.reset().accepted.all()
     assert bridge.activate(np.array([1])).accepted.all()
     assert bridge.send(np.tile(twist(0.2, 0.0), (2, 1))).reasons.tolist() == [Reason.NOT_ACTIVE, Reason.ACCEPTED]
-
-
-# --- on the simulated robot ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rates", [Rates(200, 200, 10), Rates(1000, 200, 10)], ids=str)

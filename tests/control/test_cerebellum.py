@@ -226,9 +226,6 @@ def test_simulations_are_independent_byte_for_byte(history: list[tuple[int, tupl
             assert (rig.cerebellum.refusals[:, 0] == together.cerebellum.refusals[:, k]).all()
 
 
-# --- commands --------------------------------------------------------------------------------------------------------
-
-
 @each_case(
     "values",
     [
@@ -283,9 +280,6 @@ def test_integer_commands_are_accepted() -> None:
     assert rig.cerebellum.offer(Setpoint(1, 0, np.array([[0, 1]]))).accepted.all()
     rig.tick(95)
     assert rig.command == [0, 1]
-
-
-# --- limits ----------------------------------------------------------------------------------------------------------
 
 
 @each_case(
@@ -343,9 +337,6 @@ def test_wheels_that_are_too_slow_for_the_turning_limit_are_an_error() -> None:
     slow = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, max_wheel_speed=5.0))
     with pytest.raises(ConfigError, match=r"theta.vel is 2.84.*2\.06"):
         BaseController(slow, 1, HZ)
-
-
-# --- state -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_state_is_a_copy() -> None:

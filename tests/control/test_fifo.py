@@ -129,9 +129,6 @@ def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path
     assert pop(reader) is None
 
 
-# --- the state ring --------------------------------------------------------------------------------------------------
-
-
 def test_the_ring_keeps_the_newest_and_hands_out_copies() -> None:
     ring = StateRing(support.STATE, 4)
     assert ring.latest() is None

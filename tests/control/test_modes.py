@@ -167,9 +167,6 @@ def test_configuring_on_a_broken_plant_is_refused() -> None:
     assert np.isfinite(rig.cerebellum.state(rig.now).odometry).all()
 
 
-# --- the watchdog ----------------------------------------------------------------------------------------------------
-
-
 def test_a_command_that_grows_old_ramps_to_zero_and_motion_resumes_with_the_next() -> None:
     rig = Rig()
     rig.send(0.1, 1.0)
@@ -243,9 +240,6 @@ def test_a_command_takes_effect_when_it_is_due() -> None:
     assert rig.command[0] == 0.1
     rig.tick(11)
     assert rig.command[0] > 0.1
-
-
-# --- latches ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("twist", [(0.22, 0.0), (0.0, 2.84), (-0.1, -1.5), (0.1, 1.5)])

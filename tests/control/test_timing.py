@@ -54,8 +54,6 @@ def test_lateness_beyond_the_last_bin_is_reported() -> None:
     assert summary.lateness_p50 == 60.0
 
 
-# --- skipped ticks, the grid -----------------------------------------------------------------------------------------
-
 TICKS = st.lists(st.tuples(st.integers(0, PERIOD - 1), st.integers(0, 20_000_000), st.integers(0, 4)), max_size=40)
 
 
@@ -108,9 +106,6 @@ def test_quantiles_are_at_most_one_bin_too_high_and_never_too_low(times: list[in
     assert summary.duration_p99 <= summary.duration_max == summary.lateness_max == max(times) / 1e9
 
 
-# --- shared memory ---------------------------------------------------------------------------------------------------
-
-
 def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
     memory = SharedMemory(create=True, size=TimingStatistics.nbytes + 100)
     try:
@@ -147,9 +142,6 @@ def test_memory_without_statistics_is_refused() -> None:
             make(bytearray(TimingStatistics.nbytes - 1))
     with pytest.raises(ConfigError, match="period_ns is 0"):
         TimingStatistics(0)
-
-
-# --- summaries -------------------------------------------------------------------------------------------------------
 
 
 def test_a_summary_survives_json() -> None:

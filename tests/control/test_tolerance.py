@@ -109,9 +109,6 @@ def test_a_tolerance_that_cannot_be_honoured_is_refused(values: dict[str, float]
         TimingTolerance(**values)  # type: ignore[arg-type]
 
 
-# --- the verdict -----------------------------------------------------------------------------------------------------
-
-
 def summary(late: int, frames: int, **changes: float) -> TimingSummary:
     measured = TimingStatistics(2_000_000).summary(
         clock="realtime",

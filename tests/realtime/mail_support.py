@@ -52,7 +52,6 @@ class RampPlanner:
 
 
 def post_numbers(path: Path, count: int) -> None:
-    """Post as fast as the reader makes room."""
     mailbox = Mailbox(RECORD, CAPACITY, shared_block(path))
     for number in range(count):
         while not mailbox.post(record(number)):
@@ -60,7 +59,6 @@ def post_numbers(path: Path, count: int) -> None:
 
 
 def serve_plans(path: Path, count: int) -> None:
-    """Answer so many requests."""
     planner = RampPlanner()
     server = PlanServer(shared_block(path), planner, duration_s=DURATION_S)  # type: ignore[arg-type]
     server.serve(lambda: len(planner.planned) == count, lambda: time.sleep(1e-4))

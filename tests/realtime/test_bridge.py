@@ -94,15 +94,6 @@ def drive(value: float) -> np.ndarray:
     return np.array([[value, 0.0]])
 
 
-def test_modes_are_asked_for_and_setpoints_move_the_robot(rig: Rig) -> None:
-    assert rig.bridge.state().mode.tolist() == [Mode.HOLD]
-    assert rig.bridge.send(drive(0.1)).accepted.all()
-    rig.tick(30)
-    state = rig.bridge.state()
-    assert state.mode.tolist() == [Mode.TRACKING]
-    assert state.command[0, 0] == pytest.approx(0.1)
-
-
 def test_invalid_setpoints_are_refused_at_once_with_the_reason(rig: Rig) -> None:
     bridge = rig.bridge
 

@@ -43,9 +43,6 @@ def answer(link: PlanLink) -> Plan:
     return plan
 
 
-# --- one request -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -73,18 +70,6 @@ def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(comman
     assert np.array_equal(plan.target, expected.target)
     assert not server.serve_once()
     assert link.poll(0) is None  # once
-
-
-@pytest.mark.parametrize("opening", [None, 0.0, 0.04])
-def test_the_state_and_the_opening_arrive(opening: float | None) -> None:
-    link, server, _, _ = linked()
-    link.request(0, ramp(3, 0.5), STATE, opening, 0)
-    server.serve_once()
-    plan = answer(link)
-    for name in ("position", "velocity", "acceleration"):
-        expected = getattr(STATE, name) + 0.5 * np.arange(1, 4)[:, None]
-        assert np.array_equal(getattr(plan.trajectory, name), expected)
-    assert plan.target.tolist() == [-1.0 if opening is None else opening] * 7
 
 
 def test_what_the_gripper_holds_arrives() -> None:
@@ -139,9 +124,6 @@ def test_a_trajectory_that_is_too_long_for_the_memory_is_a_failure() -> None:
         if isinstance(plan, PlanFailure):
             assert plan.code == ResultCode.PLANNING_FAILED
             assert "there is room for 6 s" in plan.message
-
-
-# --- requests that are not wanted any more ---------------------------------------------------------------------------
 
 
 def test_what_is_dropped_is_not_planned() -> None:
@@ -228,9 +210,6 @@ def test_the_rows_that_are_played_are_never_written_to(steps: list[str]) -> None
             assert polled.trajectory.position[0, 0] == asked
 
 
-# --- processes that end ----------------------------------------------------------------------------------------------
-
-
 def test_a_half_written_request_is_not_read() -> None:
     link, server, planner, block = linked()
     link.request(0, ramp(3), STATE, None, 0)
@@ -274,18 +253,6 @@ def test_a_restarted_planner_answers_only_open_requests() -> None:
     assert answer(link).trajectory.ticks == 5
 
 
-def test_serve_runs_until_stop_returns_true() -> None:
-    link, server, planner, _ = linked()
-    sleeps = []
-
-    def sleep() -> None:
-        sleeps.append(len(planner.planned))
-        link.request(0, ramp(2), STATE, None, 0)
-
-    server.serve(lambda: len(planner.planned) == 3, sleep)
-    assert sleeps == [0, 1, 2]
-
-
 def test_another_process_plans(tmp_path: Path) -> None:
     path, count = tmp_path / "block", 200
     block = shared_block(path, PlanLink.nbytes(6, 100, DURATION_S))
@@ -306,9 +273,6 @@ def test_another_process_plans(tmp_path: Path) -> None:
             link.begin(0)
             playing_rows = plan.rows, plan.rows.copy()
     assert process.wait() == 0
-
-
-# --- all together ----------------------------------------------------------------------------------------------------
 
 
 class Scribbler(PlanServer):
@@ -348,9 +312,6 @@ def test_whatever_happens_while_another_process_plans(script: list, latencies: l
     assert Counter(result.task_id for result in results) == +due
     assert all(result.message for result in results)
     assert not rig.velocity.any()
-
-
-# --- numbers ---------------------------------------------------------------------------------------------------------
 
 
 def test_another_process_plans_for_one_arm_only() -> None:

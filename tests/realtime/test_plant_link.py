@@ -213,8 +213,6 @@ def test_sections_are_as_large_as_the_rings_need() -> None:
     assert set(sizes) == {"plant_commands", "plant_states"}
 
 
-# --- two processes ---------------------------------------------------------------------------------------------------
-
 COUNT = 20_000
 
 

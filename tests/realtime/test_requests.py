@@ -68,37 +68,6 @@ def goal(name: str, target: float = 0.2, **fields: Any) -> BrainCommand:
     return BrainCommand(name, joint_target=joints(target), **fields)
 
 
-# --- each kind of request --------------------------------------------------------------------------------------------
-
-
-def test_modes() -> None:
-    pair = Pair(active=False)
-    assert pair.client.request(Request.ACTIVATE) == Reason.WRONG_MODE
-    assert pair.client.request(Request.CONFIGURE) == Reason.ACCEPTED
-    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
-    assert pair.mode == Mode.HOLD
-    pair.cerebellum.estop.press()
-    pair.tick()
-    assert pair.client.request(Request.ACTIVATE) == Reason.ESTOP
-    assert pair.client.request(Request.RESET) == Reason.NOT_AT_REST
-    pair.tick(50)  # until it would have given way to what it touches
-    assert pair.client.request(Request.RESET) == Reason.ACCEPTED
-    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
-    assert pair.client.request(Request.DEACTIVATE) == Reason.ACCEPTED
-    pair.tick(2)
-    assert pair.mode == Mode.SAFE_OFF
-
-
-def test_goals_and_their_results() -> None:
-    pair = Pair()
-    assert pair.client.submit(goal("a")) is None
-    assert pair.client.submit(goal("b", 0.3)) is None
-    pair.rest()
-    assert pair.results() == [("a", ResultCode.SUCCEEDED), ("b", ResultCode.SUCCEEDED)]
-    assert pair.results() == []
-    assert pair.cerebellum.command[0, :6].tolist() == list(joints(0.3))
-
-
 @pytest.mark.parametrize(
     ("command", "code", "words"),
     [
@@ -167,9 +136,6 @@ def test_a_robot_without_goals_refuses_them_with_a_reason() -> None:
     assert "takes setpoints" in refusal.message
     assert client.cancel("a") == ResultCode.UNKNOWN_ID
     assert client.request(Request.DEACTIVATE) == Reason.ACCEPTED
-
-
-# --- who does not answer ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", RequestKind)
@@ -246,19 +212,12 @@ def test_a_reply_that_comes_too_late_is_not_taken_for_another_ones() -> None:
 def test_a_new_client_ignores_replies_to_an_earlier_one() -> None:
     pair = Pair()
     pair.client.submit(goal("a", 2.0))
-    pair.requests.post(pair_request(pair, 1))
+    record = np.zeros(1, request_dtype(6))[0]
+    record["number"], record["expires_ns"], record["mode"] = 1, pair.now_ns + NANOSECONDS, Request.ACTIVATE
+    pair.requests.post(record)
     pair.tick()
     later = RequestClient(pair.requests, pair.events, pair.tick, 0.1, lambda: pair.now_ns)
     assert later.cancel("nobody") == ResultCode.UNKNOWN_ID
-
-
-def pair_request(pair: Pair, number: int) -> Any:
-    record = np.zeros(1, request_dtype(6))[0]
-    record["number"], record["expires_ns"], record["mode"] = number, pair.now_ns + NANOSECONDS, Request.ACTIVATE
-    return record
-
-
-# --- laws ------------------------------------------------------------------------------------------------------------
 
 
 def test_results_wait_until_they_are_taken() -> None:

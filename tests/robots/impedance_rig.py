@@ -77,11 +77,9 @@ class Rig:
         return Mode(int(self.cerebellum.mode[0]))
 
     def wait(self, seconds: float) -> None:
-        """Let time go by without commands."""
         self.bridge.advance_ticks(round(seconds * 500))
 
     def keep(self, seconds: float) -> None:
-        """Send the target in every frame."""
         for _ in range(round(seconds * 25)):
             self.bridge.send(self.target)
             self.bridge.advance_frame()

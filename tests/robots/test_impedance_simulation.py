@@ -39,9 +39,6 @@ def pushing(speed: float = 0.02, peak: float = 25.0) -> Rig:
     return rig
 
 
-# --- contact ---------------------------------------------------------------------------------------------------------
-
-
 def test_it_pushes_on_a_rigid_wall_until_no_commands_come_and_lets_go_cleanly() -> None:
     rig = pushing()
     rig.cerebellum.take_flags()
@@ -90,9 +87,6 @@ def test_a_wall_in_the_way_of_a_far_target_is_pushed_no_harder_than_allowed() ->
     # On its way in the equilibrium is 250 mm/s faster than the tool, which the damper feels.
     assert rig.logged("force", since)[:, 0].min() > -80
     assert rig.cerebellum.take_flags()[0][0] & Limit.EFFORT
-
-
-# --- stops -----------------------------------------------------------------------------------------------------------
 
 
 def test_an_emergency_stop_in_contact_presses_no_more_and_stays() -> None:
@@ -144,16 +138,6 @@ def test_a_stop_in_motion_brakes_the_equilibrium_and_holds_it_where_it_stops() -
     np.testing.assert_allclose(rig.log["tool"][-1], command[-1], atol=1e-3)
 
 
-# --- the law ---------------------------------------------------------------------------------------------------------
-
-
-def test_it_holds_still() -> None:
-    rig = Rig()
-    rig.wait(1.0)
-    assert np.linalg.norm(rig.logged("tool") - START, axis=1).max() < 1e-6
-    assert rig.mode == Mode.HOLD
-
-
 @pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (-5.0, 8.0, -12.0)])
 def test_a_force_moves_the_tool_by_force_over_stiffness_and_is_felt(force: tuple[float, float, float]) -> None:
     stiffness = np.diag([400.0, 800.0, 600.0, 40.0, 40.0, 40.0])
@@ -195,21 +179,6 @@ def test_a_free_response_loses_energy_in_every_tick(damping: tuple[float, ...] |
     assert energies[-1] < 1e-3 * energies[0]
 
 
-def test_a_far_target_causes_no_jump() -> None:
-    rig = Rig()
-    rig.target[:, :3] += (0.05, -0.3, -0.05)
-    rig.target[:, 3:7] = (0.0, 0.0, 1.0, 0.0)  # the tool points down
-    rig.keep(2.6)
-    command, torque = rig.logged("command"), rig.logged("torque")
-    velocity = np.diff(command[:, :3], axis=0) * 500
-    assert np.linalg.norm(velocity, axis=1).max() <= 0.25 + 1e-9
-    assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() * 500 <= 1.0 + 1e-6
-    assert (np.abs(torque) <= EFFORT).all()
-    assert (np.abs(np.diff(torque, axis=0)) <= EFFORT / 50 + 1e-9).all()
-    np.testing.assert_allclose(rig.log["tool"][-1], rig.target[0, :3], atol=1e-3)
-    assert rig.cerebellum.take_flags()[0][0] & Limit.VELOCITY
-
-
 def test_no_contact_is_felt_in_free_motion_at_full_speed() -> None:
     rig = Rig()
     rig.move((0, -0.25, 0), 0.25)
@@ -244,9 +213,6 @@ def test_one_of_several_arms_does_bit_for_bit_what_one_does() -> None:
         rig.keep(0.2)
         logs.append(np.concatenate([rig.logged(name) for name in ("tool", "estimate", "torque", "command")], axis=1))
     assert logs[0].tobytes() == logs[1].tobytes()
-
-
-# --- around it -------------------------------------------------------------------------------------------------------
 
 
 def test_a_base_has_no_fixtures() -> None:

@@ -140,18 +140,6 @@ def test_an_arm_whose_poses_are_refused_stops_at_the_time_out(simulation) -> Non
     assert not report.limits[0] & Limit.NON_FINITE
 
 
-def test_the_arm_takes_the_posture_nearest_to_where_it_is(simulation) -> None:
-    action = start(simulation)
-    joints = simulation.cerebellum.command[0, :6].copy()
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        action[:, :3] += rng.uniform(-0.01, 0.01, 3)
-        simulation.step(action)
-        now = simulation.cerebellum.command[0, :6].copy()
-        assert np.abs(now - joints).max() < 0.15  # no other branch of the inverse kinematics
-        joints = now
-
-
 def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
     """Turned far enough about any axis the arm comes to a singular posture, and then to another branch.
 

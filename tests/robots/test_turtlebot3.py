@@ -110,15 +110,6 @@ def test_true_speeds_stay_within_five_per_cent_of_the_limits():
         assert (fastest <= 1.05 * np.array([speed, turn, drive.max_wheel_speed])).all(), (name, fastest)
 
 
-def test_one_action_is_one_frame_of_simulated_time(tmp_path):
-    for fps in (5, 10, 50):
-        with make(tmp_path, arena="empty", fps=fps) as robot:
-            for _ in range(fps):
-                robot.send_action(GO)
-            assert robot.simulation.bridge.now_ns == 1_000_000_000
-            assert robot.simulation.world.time[0] == pytest.approx(1.0)
-
-
 def test_calls_before_connect_and_after_disconnect(tmp_path):
     robot = make(tmp_path)
     for _ in range(2):

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import mujoco
@@ -12,11 +13,13 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
+from tests.cases import each_case
 from tests.control.goal_rig import KINEMATICS
 
 BODY = ur5()
@@ -85,9 +88,6 @@ def everything(world: World, table: Tabletop, sim: int) -> bytes:
     return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
 
 
-# --- determinism -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def five() -> list[bytes]:
     world, table = laid(5, threads=2)
@@ -122,9 +122,6 @@ def test_placing_some_leaves_the_others_alone() -> None:
     table.place([random_scene(40), random_scene(41)], np.array([1, 2]))
     after = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
     assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, False, True]
-
-
-# --- objects ---------------------------------------------------------------------------------------------------------
 
 
 def test_each_simulation_has_objects_of_its_own() -> None:
@@ -213,9 +210,6 @@ def test_friction_decides_whether_a_push_moves_an_object() -> None:
     world.model_field("opt.gravity")[:] = (0.5 * 9.81, 0, -9.81)
     world.step(250)
     assert (np.abs(table.object_poses[:, 0, 0] - 0.5) > 0.01).tolist() == [True, True, False, False]
-
-
-# --- surroundings ----------------------------------------------------------------------------------------------------
 
 
 def test_variations_reach_light_camera_and_fingers() -> None:
@@ -310,9 +304,6 @@ def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_diff
     np.testing.assert_array_equal(along.body_inertia, across.body_inertia)
 
 
-# --- touch -----------------------------------------------------------------------------------------------------------
-
-
 def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, bool, list[bool]]:
     """The flags of one simulation from its list of contacts: arm on table, on itself, on an object; gripper on each."""
     mujoco.mj_forward(model, data)
@@ -384,9 +375,6 @@ def test_the_tool_pushed_down_stops_at_the_table() -> None:
     assert table.tool_pose[0, 2] > 0.0
 
 
-# --- grasp -----------------------------------------------------------------------------------------------------------
-
-
 def reach(position: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Joint angles near q at which the tool is there, and points down."""
     pose = KINEMATICS.tool(HOME[:6])
@@ -447,9 +435,6 @@ def test_what_is_gripped_does_not_slip() -> None:
     assert not (table.arm_on_object | table.arm_on_table).any()
 
 
-# --- the plant, and what is for bases only ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("actuation", ["position", "torque"])
 def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
     world = World(ur5(actuation=actuation), 3)  # type: ignore[arg-type]
@@ -458,45 +443,34 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
     scenes = [random_scene(seed, 0) for seed in range(3)]
     table.place(scenes)
 
-    class Reading:
-        position = np.zeros((3, 7))
-        velocity = np.zeros((3, 7))
-        effort = np.zeros((3, 7))
-
-    plant.read(Reading)  # type: ignore[arg-type]
-    np.testing.assert_allclose(Reading.position, [scene.posture for scene in scenes], atol=1e-15)
-    np.testing.assert_array_equal(Reading.velocity, 0)
+    reading = PlantReading(3, 7)
+    plant.read(reading)
+    np.testing.assert_allclose(reading.position, [scene.posture for scene in scenes], atol=1e-15)
+    np.testing.assert_array_equal(reading.velocity, 0)
     command = np.arange(21.0).reshape(3, 7) / 100
     plant.write(command)
     for number, name in enumerate(world.body.actuators):  # type: ignore[attr-defined]
         np.testing.assert_array_equal(world.ctrl[:, world.model.actuator(name).id], command[:, number])
     world.step(5)
-    plant.read(Reading)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(Reading.velocity[:, 6], world.qvel[:, 6] + world.qvel[:, 7])
-    assert np.abs(Reading.velocity[:, 6]).min() > 0
+    plant.read(reading)
+    np.testing.assert_array_equal(reading.velocity[:, 6], world.qvel[:, 6] + world.qvel[:, 7])
+    assert np.abs(reading.velocity[:, 6]).min() > 0
 
 
-def test_what_is_for_bases_is_refused_to_arms_and_the_reverse() -> None:
-    arm, base = World(BODY), World(turtlebot3_burger())
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        _ = arm.base_pose
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.place([()])
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.rays("tool", np.array([[1.0, 0.0, 0.0]]))
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.reset(poses=np.zeros((1, 3)))
-    with pytest.raises(SimulationError, match="is a MobileBase"):
-        Tabletop(base)
-    with pytest.raises(SimulationError, match="is a MobileBase"):
-        base.hold()
-
-
-def test_scenes_that_do_not_fit_are_refused() -> None:
-    table = Tabletop(World(BODY, 2))
-    with pytest.raises(SimulationError, match="1 scenes were given for 2"):
-        table.place([random_scene(0)])
-    with pytest.raises(SimulationError, match="posture"):
-        table.place([TableScene("short", (), (0.0,) * 6)], [0])
-    with pytest.raises(SimulationError, match="Did you mean 'tool'"):
-        table.world.site("toool")
+@each_case(
+    ("call", "message"),
+    [
+        (lambda arm: arm.base_pose, "'ur5' is a Arm"),
+        (lambda arm: arm.place([()]), "'ur5' is a Arm"),
+        (lambda arm: arm.rays("tool", np.array([[1.0, 0.0, 0.0]])), "'ur5' is a Arm"),
+        (lambda arm: arm.reset(poses=np.zeros((1, 3))), "'ur5' is a Arm"),
+        (lambda _: Tabletop(World(turtlebot3_burger())), "is a MobileBase"),
+        (lambda _: World(turtlebot3_burger()).hold(), "is a MobileBase"),
+        (lambda arm: Tabletop(arm).place([random_scene(0)] * 2), "2 scenes were given for 1"),
+        (lambda arm: Tabletop(arm).place([TableScene("short", (), (0.0,) * 6)], [0]), "posture"),
+        (lambda arm: arm.site("toool"), "Did you mean 'tool'"),
+    ],
+)
+def test_what_does_not_fit_a_body_or_its_scene_is_refused(call: Callable[[World], object], message: str) -> None:
+    with pytest.raises(SimulationError, match=message):
+        call(World(BODY))

@@ -65,8 +65,6 @@ IMAGE = value({"spread": 70, "driver": "llvmpipe"})
 VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shared": None})
 
 
-# --- processes -------------------------------------------------------------------------------------------------------
-
 TRIALS = r"""
 import os, sys, time
 from bhd_lerobot.apps.doctor import trials
@@ -141,9 +139,6 @@ def test_real_trials_are_understood() -> None:
         assert finding.found
 
 
-# --- the grid, on a virtual clock ------------------------------------------------------------------------------------
-
-
 class VirtualTime:
     """A clock on which each sleep takes longer than requested by the next of some delays."""
 
@@ -186,9 +181,6 @@ def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:
     assert summary["histogram"] == [99, 1, *[0] * 9]
     assert (summary["p50"], summary["p99"], summary["max"]) == pytest.approx((5e-6, 10e-6, 10.001e-6))
     assert latency_test.summarise([11_000_000], 1000, 1)["histogram"][-1] == 1
-
-
-# --- a healthy machine -----------------------------------------------------------------------------------------------
 
 
 def kernel_folder(folder: Path, runtime: int = 950_000) -> Path:
@@ -284,9 +276,6 @@ def test_each_plugin_is_named_with_what_it_registered_or_why_it_failed(
     assert "'lerobot_robot_delta'" in causes[0]
     assert causes[1].startswith("The plug-in lerobot_camera_gamma cannot be imported")
     assert causes[1].endswith("ImportError: no driver")
-
-
-# --- what can be wrong -----------------------------------------------------------------------------------------------
 
 
 def installed(**versions: str | None) -> Callable[[str], str]:
@@ -449,12 +438,7 @@ def test_the_documentation_names_the_shares_and_rates() -> None:
     assert "TurtleBot3 200 Hz, 5 ms; UR5 500 Hz, 2 ms" in text
 
 
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
 class FakeTrials:
-    """Answers instead of processes."""
-
     def __init__(self, answers: dict[str, Outcome] | None = None) -> None:
         self.answers = {
             "rights": grants(),

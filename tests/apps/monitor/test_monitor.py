@@ -102,9 +102,6 @@ def only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor, "names", lambda: [name for name in names() if name.startswith(NAME)])
 
 
-# --- the block -------------------------------------------------------------------------------------------------------
-
-
 def test_who_watches_can_write_nothing_but_the_emergency_stop(robot: Robot) -> None:
     _, block = robot.sampler()
     with pytest.raises(ValueError, match="read-only"):
@@ -167,9 +164,6 @@ def test_what_nobody_holds_any_more_is_not_watched() -> None:
         SharedBlock.watch(name)
     shared_memory.sweep()
     assert not files(name)
-
-
-# --- states ----------------------------------------------------------------------------------------------------------
 
 
 def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
@@ -311,9 +305,6 @@ def test_before_anything_is_published_there_is_something_to_show() -> None:
     made.close()
 
 
-# --- how robots end --------------------------------------------------------------------------------------------------
-
-
 def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
     sampler, block = robot.sampler()
     assert sampler.end() is None
@@ -345,9 +336,6 @@ def test_a_robot_that_ends_while_it_is_watched(robot: Robot, capsys: pytest.Capt
         assert message in printed.err
         assert NAME in printed.out  # no terminal: a line now and then
         ender.cancel()
-
-
-# --- finding ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("only")
@@ -387,9 +375,6 @@ def test_bad_arguments_end_with_a_message_and_status_2(
     assert message in capsys.readouterr().err
 
 
-# --- without a terminal ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("only")
 def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
     robot.block.words[Word.PHASE] = Phase.STANDING
@@ -420,9 +405,6 @@ def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
         assert not keys.there
     assert len(shown) == 3
     block.close()
-
-
-# --- keys ------------------------------------------------------------------------------------------------------------
 
 
 # It is to be its controlling terminal, in whose foreground it is.

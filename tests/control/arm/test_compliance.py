@@ -21,9 +21,6 @@ HOME = np.array(ARM.home)
 ALL = np.ones(1, np.bool_)
 
 
-# --- compliance ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("ratio", [0.3, 0.7, 1.0])
 def test_every_mode_has_the_damping_ratio(ratio: float) -> None:
     rng = np.random.default_rng(1)
@@ -73,8 +70,6 @@ def test_a_compliance_cannot_be_changed_behind_its_checks() -> None:
     with pytest.raises(ValueError, match="read-only"):
         np.asarray(compliance.stiffness)[0, 0] = -1.0
 
-
-# --- equilibrium -----------------------------------------------------------------------------------------------------
 
 LIMITS = EquilibriumLimits()
 
@@ -140,9 +135,6 @@ def test_without_a_setpoint_it_brakes_and_stays() -> None:
 def test_impossible_limits_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=name):
         EquilibriumLimits(**{name: 0.0})
-
-
-# --- contact ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_estimate_follows_a_step_with_its_time_constant() -> None:

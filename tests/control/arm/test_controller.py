@@ -9,8 +9,6 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Request, Watchdog
 from tests.control.arm_rig import FRAME, HOME, HZ, LIMITS, SWEEP, TICK_NS, TIMEOUT_TICKS, Rig, off, posture
 
-# --- goals -----------------------------------------------------------------------------------------------------------
-
 
 def test_a_goal_is_tracked_and_then_held() -> None:
     rig = Rig()
@@ -50,9 +48,6 @@ def test_goals_that_wait_follow_each_other_without_a_hold_between() -> None:
     assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in ("1", "2", "3")]
     assert [row[0] for row in rig.modes].count(Mode.HOLD) == 1
     rig.check()
-
-
-# --- setpoints -------------------------------------------------------------------------------------------------------
 
 
 def test_a_moving_arm_is_where_it_is_commanded() -> None:
@@ -124,9 +119,6 @@ def test_a_setpoint_of_one_arm_does_not_end_the_goal_of_another() -> None:
     rig.tick(1500)
     assert rig.results(0) == [("1", ResultCode.REPLACED_BY_SETPOINT)]
     assert rig.results(1) == [("2", ResultCode.SUCCEEDED)]
-
-
-# --- stops -----------------------------------------------------------------------------------------------------------
 
 
 def test_an_emergency_stop_ends_a_goal_and_latches() -> None:
@@ -225,9 +217,6 @@ def test_non_finite_queue_entries_stop_the_arm() -> None:
     rig.check()
 
 
-# --- the start, the limits -------------------------------------------------------------------------------------------
-
-
 def test_it_starts_from_the_posture_that_the_arm_is_in() -> None:
     rig = Rig(active=False)
     rig.plant.position[0] = off(j0=0.4, j3=-0.2, j6=-0.05)
@@ -300,8 +289,6 @@ def test_servo_effort_is_zero_at_rest() -> None:
     assert np.abs(state.joint_efforts).max() < 1e-9
     assert state.odometry.shape == (1, 0)
 
-
-# --- everything at once ----------------------------------------------------------------------------------------------
 
 actions = st.one_of(
     st.tuples(st.just("goal"), st.floats(-1, 1)),

@@ -153,9 +153,6 @@ def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
     assert np.abs(gentle.position).max() <= 2 * np.pi + 1e-9
 
 
-# --- the way ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("fields", "code"),
     [

@@ -207,9 +207,6 @@ def test_non_finite_numbers_return_a_failure(bad: float) -> None:
         assert answer.message
 
 
-# --- lines -----------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=40)
 @given(*[st.floats(-1, 1)] * 4)
 def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: float, turn: float) -> None:
@@ -278,9 +275,6 @@ def test_a_line_can_turn_the_tool_on_the_spot_or_do_nothing() -> None:
     tools = KINEMATICS.tool(turning.position)
     assert np.linalg.norm(tools[:, :3, 3] - TOOL[:3, 3], axis=1).max() < 5e-5
     assert planned(along_line(HOME[:6], TOOL, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).ticks == 1
-
-
-# --- playing ---------------------------------------------------------------------------------------------------------
 
 
 def numbered(ticks: int, first: float) -> Trajectory:
