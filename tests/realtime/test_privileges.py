@@ -26,6 +26,7 @@ from bhd_lerobot.realtime.privileges import (
     RealtimeSettings,
     SystemCalls,
 )
+from tests.cases import each_case
 
 FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 NAMES = ["collector", "memory lock", "cpu latency", "timer slack", "scheduler"]
@@ -161,62 +162,54 @@ def test_only_wanted_privileges_are_requested() -> None:
     assert kernel.state == INITIAL
 
 
-@pytest.mark.parametrize("name", ["affinity", "memory lock", "cpu latency", "timer slack", "scheduler"])
-def test_one_refusal_is_reported_with_a_remedy_and_stops_nothing_else(name: str) -> None:
-    kernel = FakeKernel(name, capabilities=())
-    with Privileges(kernel) as privileges:
-        grants = privileges.acquire(RealtimeSettings(affinity=one_cpu()))
-        # Without the capability and within a limit, what comes later is not locked, so that is a refusal, too.
-        refused = {name, "memory lock"}
-        assert {grant.name for grant in grants if not grant.granted} == refused
-        grant = next(grant for grant in grants if grant.name == name)
-        assert "Operation not permitted" in grant.detail
-        assert grant.remedy
-    assert kernel.state == INITIAL
-
-
-def test_without_the_right_the_fall_back_is_named_with_every_way_to_the_right() -> None:
-    kernel = FakeKernel("scheduler", capabilities=())
-    with Privileges(kernel) as privileges:
-        grant = privileges.acquire(RealtimeSettings(priority=97))[-1]
-        assert kernel.state["scheduler"] == (os.SCHED_OTHER, 0)
-        assert kernel.state["slack"] == 1
-    assert "SCHED_OTHER with a timer slack of 1 ns" in grant.detail
-    for part in (
-        f"setcap cap_sys_nice,cap_ipc_lock+ep {os.path.realpath(sys.executable)}",
-        "@realtime - rtprio 97",  # a limit of 95 would not do for this priority
-        "--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio=97 --ulimit memlock=-1",
-    ):
-        assert part in grant.remedy
-
-
-@pytest.mark.parametrize(
-    ("capabilities", "limit"), [((CAP_SYS_NICE,), 0), ((), 80), ((), 95), ((), resource.RLIM_INFINITY)]
+MEMORY = "memory lock"  # without the right and within a limit, what comes later is not locked: a refusal, too
+NO_RIGHT = (
+    "Operation not permitted",
+    "SCHED_OTHER with a timer slack of 1 ns",
+    f"setcap cap_sys_nice,cap_ipc_lock+ep {os.path.realpath(sys.executable)}",
+    "@realtime - rtprio 97",  # a limit of 95 would not do for this priority
+    "--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio=97 --ulimit memlock=-1",
 )
-def test_a_refusal_despite_the_right_names_control_groups(capabilities: tuple[int, ...], limit: int) -> None:
-    with Privileges(FakeKernel("scheduler", capabilities=capabilities, limit=limit)) as privileges:
-        assert privileges.acquire(RealtimeSettings())[-1].remedy == GRANT_BANDWIDTH
+NICE, LOCK, INFINITE = (CAP_SYS_NICE,), (CAP_IPC_LOCK,), resource.RLIM_INFINITY
 
 
-def test_a_limit_below_the_priority_is_no_right() -> None:
-    with Privileges(FakeKernel("scheduler", capabilities=(), limit=79)) as privileges:
-        assert "setcap" in privileges.acquire(RealtimeSettings())[-1].remedy
-
-
-def test_within_a_limit_future_memory_is_not_locked_because_an_allocation_could_then_fail() -> None:
-    kernel = FakeKernel(capabilities=(CAP_SYS_NICE,), limit=8192 * 1024)
+@each_case(
+    ("kernel", "settings", "refused", "parts"),
+    [
+        (FakeKernel("affinity", capabilities=()), {"affinity": one_cpu()}, {"affinity", MEMORY}, ("not permitted",)),
+        (FakeKernel(MEMORY, capabilities=()), {}, {MEMORY}, ("not permitted",)),
+        (FakeKernel("cpu latency", capabilities=()), {}, {"cpu latency", MEMORY}, ("not permitted",)),
+        (FakeKernel("timer slack", capabilities=()), {}, {"timer slack", MEMORY}, ("not permitted",)),
+        (
+            FakeKernel("scheduler", capabilities=()),
+            {"priority": 97},
+            {"scheduler", MEMORY},
+            ("not permitted", *NO_RIGHT),
+        ),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=79), {}, {"scheduler"}, ("setcap",)),  # below the priority
+        # With the right: control groups.
+        (FakeKernel("scheduler", limit=0), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=80), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=95), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=(), limit=INFINITE), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        # An allocation could fail if future memory was locked within a limit.
+        (FakeKernel(capabilities=NICE, limit=8192 * 1024), {}, {MEMORY}, ("8192 KiB", "memlock")),
+        (FakeKernel("cpu latency"), {}, {"cpu latency"}, (GRANT_LATENCY_FILE,)),
+        (FakeKernel("cpu latency", MEMORY), {"require": True}, {"cpu latency", MEMORY}, ("not permitted",)),
+    ],
+)
+def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(
+    kernel: FakeKernel, settings: dict[str, Any], refused: set[str], parts: tuple[str, ...]
+) -> None:
     with Privileges(kernel) as privileges:
-        grant = next(g for g in privileges.acquire(RealtimeSettings()) if g.name == "memory lock")
-        assert kernel.state["locked"] == MCL_CURRENT
-    assert not grant.granted
-    assert "8192 KiB" in grant.detail
-    assert "memlock" in grant.remedy
-
-
-def test_the_latency_file_has_a_remedy_of_its_own() -> None:
-    with Privileges(FakeKernel("cpu latency")) as privileges:
-        refused = [grant for grant in privileges.acquire(RealtimeSettings()) if not grant.granted]
-    assert [grant.remedy for grant in refused] == [GRANT_LATENCY_FILE]
+        grants = privileges.acquire(RealtimeSettings(**settings))
+        assert {grant.name for grant in grants if not grant.granted} == refused
+        assert all(bool(grant.remedy) != grant.granted for grant in grants)
+        said = "\n".join(f"{grant.detail} {grant.remedy}" for grant in grants if not grant.granted)
+        assert [part for part in parts if part not in said] == []
+        assert kernel.state["locked"] == (MCL_CURRENT if MEMORY in refused - kernel.refused else kernel.state["locked"])
+        assert kernel.state["scheduler"] == ((os.SCHED_OTHER, 0) if "scheduler" in refused else (FIFO, 80))
+    assert kernel.state == INITIAL
 
 
 def test_a_required_and_refused_scheduler_is_an_error_and_everything_is_given_back() -> None:
@@ -224,11 +217,6 @@ def test_a_required_and_refused_scheduler_is_an_error_and_everything_is_given_ba
     with pytest.raises(RealtimeError, match=r"SCHED_FIFO priority 80.*refused.*setcap.*require_realtime = false"):
         Privileges(kernel).acquire(RealtimeSettings(require=True))
     assert kernel.state == INITIAL
-
-
-def test_requiring_concerns_the_scheduler_only() -> None:
-    with Privileges(FakeKernel("cpu latency", "memory lock")) as privileges:
-        assert privileges.acquire(RealtimeSettings(require=True))[-1].granted
 
 
 def test_after_an_unexpected_error_everything_is_given_back() -> None:

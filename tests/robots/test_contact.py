@@ -101,6 +101,7 @@ def test_random_setpoints_touch_nothing_and_are_no_false_alarm() -> None:
     assert reached >= 3
 
 
+@pytest.mark.thorough(but=3)
 @pytest.mark.parametrize("where", [INTO_TABLE, INTO_ITSELF, INTO_BOX], ids=["table", "itself", "box"])
 @pytest.mark.parametrize("rate", [0.5, 1.5, 3.0])
 def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: float) -> None:

@@ -63,6 +63,7 @@ def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
     assert is_gone(name)
 
 
+@pytest.mark.thorough
 def test_a_brain_that_is_stopped_at_any_moment_leaves_nothing_half_sent(tmp_path):
     """It sends all the time: some of these moments are within a command that it writes."""
     name = unique("stopped")
@@ -108,6 +109,7 @@ def expect_exact_timeout(states: States, word: Word) -> None:
     assert states.all[hold]["command"].tolist() == [[0.0, 0.0]]
 
 
+@pytest.mark.thorough
 def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
     name = unique("stopped")
     with turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5) as robot:

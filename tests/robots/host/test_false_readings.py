@@ -38,6 +38,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[UR5, Any]]:
         del os.environ[lying_arm.LOG]
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("lie", lying_arm.LIES[1:])
 def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie: str) -> None:
     robot, shared = arm

@@ -437,6 +437,7 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
             block.close()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
 def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
     with moving(kind) as (robot, link):
@@ -509,6 +510,7 @@ def test_a_stopped_cerebellum_goes_on_after_a_reset_and_a_stopped_or_killed_plan
     assert block_name not in names()
 
 
+@pytest.mark.thorough
 def test_a_base_on_the_wall_clock_stops_before_a_wall_that_its_plant_sees() -> None:
     """The scan comes from another process. On a busy machine it comes late, and the base is slower for it."""
     config = live(TurtleBot3Config)

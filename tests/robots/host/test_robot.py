@@ -155,6 +155,7 @@ def test_two_robots_at_once(robot):
     assert NAME in names()
 
 
+@pytest.mark.thorough
 def test_it_keeps_lerobots_contract(robot):
     assert check_robot(lambda: turtlebot(unique("contract")), adversarial=True) == ()
     assert is_gone(unique("contract"))

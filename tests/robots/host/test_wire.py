@@ -74,6 +74,7 @@ def expect_no_jump(states: States, robot: UR5) -> None:
     assert (np.abs(np.diff(positions[:, :6], axis=0)) <= most).all()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("what", ["not a number", "a jump"])
 def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, States], what: str) -> None:
     robot, states = arm
@@ -188,6 +189,7 @@ def pressing() -> Iterator[tuple[UR5, Callable[[], float]]]:
     robot.disconnect()
 
 
+@pytest.mark.thorough
 def test_after_an_emergency_stop_an_arm_presses_no_more_nor_after_a_reset(
     pressing: tuple[UR5, Callable[[], float]],
 ) -> None:
