@@ -89,24 +89,6 @@ def test_a_chunk_is_one_command_a_frame() -> None:
     assert chunked.state().mode.tolist() == [Mode.HOLD]
 
 
-def test_the_life_of_a_robot() -> None:
-    bridge = perfect(2)
-    assert bridge.state().mode.tolist() == [Mode.HOLD] * 2
-    bridge.send(np.tile(twist(0.2, 0.0), (2, 1)))
-    bridge.advance_frame()
-    bridge.estop(np.array([1]))
-    bridge.advance_frame()
-    assert bridge.state().mode.tolist() == [Mode.TRACKING, Mode.ESTOP]
-    assert bridge.deactivate(np.array([0])).accepted.all()
-    for _ in range(4):
-        bridge.advance_frame()
-    assert bridge.state().mode.tolist() == [Mode.SAFE_OFF, Mode.ESTOP]
-    assert bridge.activate().reasons.tolist() == [Reason.WRONG_MODE, Reason.ESTOP]
-    assert bridge.reset().accepted.all()
-    assert bridge.activate(np.array([1])).accepted.all()
-    assert bridge.send(np.tile(twist(0.2, 0.0), (2, 1))).reasons.tolist() == [Reason.NOT_ACTIVE, Reason.ACCEPTED]
-
-
 @pytest.mark.parametrize("rates", [Rates(200, 200, 10), Rates(1000, 200, 10)], ids=str)
 @pytest.mark.parametrize("command", [(0.22, 0.0), (-0.22, 0.0), (0.0, 2.84), (0.0, -2.84), (0.12, 1.2)])
 def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[float, float], rates: Rates) -> None:

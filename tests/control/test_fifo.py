@@ -227,12 +227,5 @@ def test_a_reader_gets_every_state_once_in_order_or_counts_it(steps: list[tuple[
     assert -1 not in seen
 
 
-def test_a_state_that_is_being_written_is_not_read() -> None:
-    ring = StateRing(ring_dtype(), 4)
-    ring.publish(np.array((7,), ring_dtype()))
-    ring._guard[0] += 1  # the writer has begun to overwrite it
-    assert ring.copy(0) is None
-
-
 def ring_dtype() -> np.dtype:
     return np.dtype([("value", np.int64)])

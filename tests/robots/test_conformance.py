@@ -248,10 +248,7 @@ def test_a_broken_robot_is_found(name, config):
 
 
 class MockRobot(GoodRobot):
-    """What LeRobot's `tests.mocks.mock_robot.MockRobot` does, which is not part of its distribution.
-
-    It returns the dict that it was given, and refuses a second `disconnect`.
-    """
+    """As in LeRobot's own tests: it returns the dict that it was given, and refuses a second `disconnect`."""
 
     name = "mock_robot"
     observation_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}

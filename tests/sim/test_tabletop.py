@@ -1,6 +1,5 @@
 """The table and what lies on it: every simulation has its own, and nobody else's."""
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import BrainCommand
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.camera import Camera
@@ -20,7 +21,7 @@ from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 from tests.cases import each_case
-from tests.control.goal_rig import KINEMATICS
+from tests.control.goal_rig import KINEMATICS, pose
 
 BODY = ur5()
 HOME = np.array(BODY.home)
@@ -375,11 +376,11 @@ def test_the_tool_pushed_down_stops_at_the_table() -> None:
     assert table.tool_pose[0, 2] > 0.0
 
 
-def reach(position: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Joint angles near q at which the tool is there, and points down."""
-    pose = KINEMATICS.tool(HOME[:6])
-    pose[:3, 3] = position
-    return KINEMATICS.solve(pose, q).postures[0]
+def tool_at(position: tuple[float, float, float]) -> np.ndarray:
+    """The frame of a tool that is there, and points down."""
+    frame = KINEMATICS.tool(HOME[:6])
+    frame[:3, 3] = position
+    return frame
 
 
 def test_what_is_gripped_does_not_slip() -> None:
@@ -391,8 +392,7 @@ def test_what_is_gripped_does_not_slip() -> None:
         TableObject("box", "red", 0.030, 0.025, 0.10, *spot, mass=0.3),
         TableObject("box", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
     )
-    way = [np.array([*spot, 0.05]), np.array([*spot, 0.20]), np.array([0.5, -0.20, 0.20])]
-    q = reach(way[0], HOME[:6])
+    q = KINEMATICS.solve(tool_at((*spot, 0.05)), HOME[:6]).postures[0]
     world = World(BODY, 4)
     table = Tabletop(world)
     table.place([TableScene("", (thing,), (*q, 0.085)) for thing in things])
@@ -410,22 +410,18 @@ def test_what_is_gripped_does_not_slip() -> None:
         return np.array([table.object_poses[sim, 0, :3] - table.tool_pose[sim, :3] for sim in range(4)])
 
     start, slips = offset(), []
-    speed, acceleration, dt = 0.5, 2.5, 1 / BODY.physics_hz
-    for here, there in itertools.pairwise(way):
-        length, ramp = np.linalg.norm(there - here), speed / acceleration
-        seconds = length / speed + ramp
-        for k in range(1, math.ceil(seconds / dt) + 1):
-            t, left = k * dt, max(seconds - k * dt, 0.0)
-            if t < ramp:
-                done = acceleration * t * t / 2
-            else:
-                done = length - acceleration * left * left / 2 if left < ramp else speed * (t - ramp / 2)
-            before, q = q, reach(here + (there - here) * done / length, q)
-            world.ctrl[:, :6] = q + LAG[:6] * (q - before) / dt
+    planner = GoalPlanner(BODY, BODY.physics_hz, KINEMATICS)
+    for there in ((*spot, 0.20), (0.5, -0.20, 0.20)):
+        goal = BrainCommand(
+            "a", target_pose=pose(tool_at(there)), motion="line", max_velocity=0.5, max_acceleration=2.5
+        )
+        plan = planner.plan(goal, [*q, 0.0], np.zeros(7), np.zeros(7))
+        assert isinstance(plan, Plan), plan
+        for k, (q, velocity) in enumerate(zip(plan.trajectory.position[:, :6], plan.trajectory.velocity, strict=True)):
+            world.ctrl[:, :6] = q + LAG[:6] * velocity[:6]
             world.step()
             if k % 20 == 0:
                 slips.append(np.linalg.norm(offset() - start, axis=1))
-    world.ctrl[:, :6] = q
     world.step(2 * BODY.physics_hz)
     slips.append(np.linalg.norm(offset() - start, axis=1))
     assert np.max(slips) < 0.002

@@ -10,10 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bhd_lerobot.apps.doctor import checks, doctor, latency_test, trials
 from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status, wrong
@@ -137,43 +134,6 @@ def test_real_trials_are_understood() -> None:
     for finding in (*checks.check_ffmpeg(ffmpeg), *checks.check_plugins(plugins)):
         assert finding.status is Status.OK, finding
         assert finding.found
-
-
-class VirtualTime:
-    """A clock on which each sleep takes longer than requested by the next of some delays."""
-
-    def __init__(self, delays: list[int]) -> None:
-        self.now = 10**12
-        self.woken: list[int] = []
-        self._delays = iter(delays)
-
-    def clock(self) -> int:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9) + next(self._delays, 0)
-        self.woken.append(self.now)
-
-
-PERIOD = 1_000_000
-
-
-@given(st.lists(st.integers(0, 4 * PERIOD), max_size=40))
-def test_what_is_late_is_skipped_and_the_phase_is_kept(delays: list[int]) -> None:
-    points = 50
-    virtual = VirtualTime(delays)
-    lateness = latency_test.walk_grid(points, PERIOD, virtual.clock, virtual.sleep)
-    start = 10**12 + PERIOD
-    woken = np.array(virtual.woken)
-    assert len(lateness) == len(woken)
-    point, due = 0, []
-    for late in lateness:
-        due.append(point)
-        point += 1 + late // PERIOD
-    np.testing.assert_array_equal(woken - np.array(lateness), start + np.array(due) * PERIOD)
-    np.testing.assert_array_equal(lateness[: len(delays)], delays[: len(lateness)])
-    summary = latency_test.summarise(lateness, 1000, points)
-    assert sum(summary["histogram"]) + summary["missed"] == points
 
 
 def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:

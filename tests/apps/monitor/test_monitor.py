@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.monitor import monitor
-from bhd_lerobot.apps.monitor.monitor import Keys, find, watch
-from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Sampler, cells
+from bhd_lerobot.apps.monitor.monitor import Keys, find
+from bhd_lerobot.apps.monitor.state import Count, Sampler
 from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
@@ -34,6 +34,7 @@ from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
+from tests.realtime.test_shared_memory import files
 from tests.recording.support import options
 from tests.waiting import until
 
@@ -146,10 +147,6 @@ def test_who_watches_does_not_hold_the_name() -> None:
     again.block.close()
     with pytest.raises(RealtimeError, match="No running robot is called"):
         LiveBlock.watch(f"{NAME}-held")
-
-
-def files(name: str) -> list[Path]:
-    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
 
 
 def test_what_nobody_holds_any_more_is_not_watched() -> None:
@@ -282,19 +279,6 @@ def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
     block.close()
 
 
-def test_every_tick_is_in_one_cell_of_the_histogram() -> None:
-    fine = np.arange(142)
-    shown = cells(fine)
-    assert len(shown) == DECADES * CELLS
-    assert sum(shown) == fine.sum()
-    assert shown[0] == 0 + 1 + 2 + 3 + 4
-    statistics = TimingStatistics(S)
-    for exponent in range(DECADES + 2):
-        statistics.add(0, 10 ** (exponent + 3) + 1, 10 ** (exponent + 3) + 2)
-    found = np.flatnonzero(cells(statistics.histograms[1])).tolist()
-    assert found == [0, 5, 10, 15, 20, 25, 29]
-
-
 def test_before_anything_is_published_there_is_something_to_show() -> None:
     layout = LiveLayout(2, np.dtype([("x", np.float64)]), 4, 4, {})
     made = layout.create(f"{NAME}-bare", {"robot": "ur5", "fps": 25, "control_hz": 500, "commands": []})
@@ -389,22 +373,6 @@ def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixtu
     assert (shown["id"], shown["mode"], shown["control_hz"]) == (NAME, "HOLD", 200)
     assert main(["--json", "--seconds=0.01"]) == 0
     assert [json.loads(line)["id"] for line in capsys.readouterr().out.splitlines()] == [NAME, NAME]
-
-
-def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
-    sampler, block = robot.sampler()
-    shown: list[Any] = []
-    with Keys(lambda: None, None) as keys:
-
-        def show(state: Any) -> None:
-            shown.append(state)
-            if len(shown) == 3:
-                keys.quit.set()
-
-        assert watch(sampler, show, keys, 0.001, float("inf")) is None
-        assert not keys.there
-    assert len(shown) == 3
-    block.close()
 
 
 # It is to be its controlling terminal, in whose foreground it is.

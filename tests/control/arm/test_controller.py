@@ -27,18 +27,6 @@ def test_a_goal_is_tracked_and_then_held() -> None:
     rig.check()
 
 
-def test_goals_need_no_setpoints_and_have_no_age() -> None:
-    rig = Rig()
-    rig.go(joint_target=posture(j0=1.5), max_velocity=0.5)  # 3 s, far longer than the time-out of setpoints
-    for _ in range(60):
-        rig.tick(10)
-        assert rig.cerebellum.command_age_ns(rig.now).tolist() == [0]
-    assert rig.mode == Mode.TRACKING
-    rig.until(Mode.HOLD)
-    assert rig.results() == [("1", ResultCode.SUCCEEDED)]
-    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
-
-
 def test_goals_that_wait_follow_each_other_without_a_hold_between() -> None:
     rig = Rig()
     for change in (0.3, -0.3, 0.1):
@@ -280,14 +268,6 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     change = np.abs(np.diff(rig.plant.written, axis=0)).max(axis=(0, 1))
     assert (change <= rig.cerebellum.guard.limits.change).all()
     assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
-
-
-def test_servo_effort_is_zero_at_rest() -> None:
-    rig = Rig()
-    rig.tick(10)
-    state = rig.cerebellum.state(rig.now)
-    assert np.abs(state.joint_efforts).max() < 1e-9
-    assert state.odometry.shape == (1, 0)
 
 
 actions = st.one_of(

@@ -1,6 +1,5 @@
 """The state machine of goals, edge by edge, and every way in which a goal can end."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -448,23 +447,3 @@ def test_every_code_is_produced_by_some_test() -> None:
     files = ("test_goals.py", "test_planner.py", "test_planning.py", "test_trajectory.py")
     text = "".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in files)
     assert [code.name for code in ResultCode if f"ResultCode.{code.name}" not in text] == []
-
-
-def test_a_tick_without_goals_does_nothing_for_any_robot() -> None:
-    """What it does is counted, not timed: calls of functions, which do not grow with the number of robots."""
-
-    def calls_of(robots: int) -> int:
-        rig, calls = Rig(robots), 0
-
-        def count(frame: object, event: str, argument: object) -> None:
-            nonlocal calls
-            calls += event in ("call", "c_call")
-
-        sys.setprofile(count)
-        try:
-            rig.manager.tick(*rig.reference, rig.measured_position, rig.measured_velocity)
-        finally:
-            sys.setprofile(None)
-        return calls
-
-    assert calls_of(1) == calls_of(64) <= 10

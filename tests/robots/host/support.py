@@ -111,13 +111,7 @@ def drive_on(name: str, options: dict[str, Any]) -> None:
 
 @contextmanager
 def driving_child(name: str, log: Path, **options: Any) -> Iterator[tuple[Fork, dict]]:
-    """Run a program that connects a base and drives it; yield it, and what it says about its robot.
-
-    Args:
-        name: the robot's id.
-        log: where its output goes.
-        options: of `turtlebot`.
-    """
+    """Run a program that connects a base and drives it; yield it, and what it says about its robot."""
     process = Fork(drive_on, name, options, output=log)
     try:
         until(lambda: process.poll() is not None or log.read_text().endswith("\n"), "the base drives")
