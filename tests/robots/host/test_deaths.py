@@ -109,7 +109,6 @@ def expect_exact_timeout(states: States, word: Word) -> None:
     assert states.all[hold]["command"].tolist() == [[0.0, 0.0]]
 
 
-@pytest.mark.thorough
 def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
     name = unique("stopped")
     with turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5) as robot:
