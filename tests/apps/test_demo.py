@@ -1,8 +1,10 @@
 """The demo runs without further input, names files that exist, and takes nothing away from a folder that it finds."""
 
+import io
 import json
 import re
 import signal
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,22 +89,9 @@ def done(tmp_path_factory):
         patch.setattr(demo, "read_steps", read_small)
         patch.setattr(demo, "can_render", lambda _: CAN_RENDER)  # whether there is a video says it otherwise
         patch.setenv("COLUMNS", "160")
-        printed: list[str] = []
-        patch.setattr("sys.stdout", _Kept(printed))
-        assert main([str(folder)]) == 0
-    return folder, "".join(printed)
-
-
-class _Kept:
-    """A text file that is no terminal."""
-
-    def __init__(self, parts: list[str]) -> None:
-        self.write, self.encoding = parts.append, "utf-8"
-
-    def flush(self) -> None: ...
-
-    def isatty(self) -> bool:
-        return False
+        with redirect_stdout(io.StringIO()) as printed:
+            assert main([str(folder)]) == 0
+    return folder, printed.getvalue()
 
 
 def test_the_last_lines_are_a_report_of_each_robot(done):

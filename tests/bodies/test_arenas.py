@@ -147,16 +147,6 @@ def test_clearance_is_the_distance_to_the_outlines(seed: int) -> None:
     assert (distance < 0).any()
 
 
-@each_case("seed", range(3))
-def test_clearance_changes_by_no_more_than_the_way(seed: int) -> None:
-    arena = made(seed)
-    rng = np.random.default_rng(seed)
-    a, b = rng.uniform(-3, 3, (2, 20, 25, 2))
-    change = np.abs(arena.clearance(a) - arena.clearance(b))
-    assert change.shape == (20, 25)
-    assert (change <= np.hypot(*np.moveaxis(a - b, -1, 0)) + 1e-12).all()
-
-
 @each_case(("name", "seed"), [*EVERY_ARENA[:4], *EVERY_ARENA[-4:]])
 @each_case("size", [0.25, 0.4])
 def test_free_cells_are_cells_of_the_grid(name: str, seed: int, size: float) -> None:

@@ -100,11 +100,6 @@ def test_compiled_actuators_have_the_torque_limit_and_the_gain_of_the_body(model
         assert actuator.gear[0] == 1
 
 
-def test_the_stall_torque_is_the_servo_s() -> None:
-    assert BODY.drive.max_torque == 1.4
-    assert BODY.drive.encoder_ticks == 4096
-
-
 def test_a_stop_stays_within_what_the_tyres_can_carry(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Newton and Euler: the friction that each stop deceleration needs, against 0.9 of the weight."""
     mass = model.body_subtreemass[0]

@@ -69,9 +69,6 @@ def postures(count: int, seed: int = 0) -> np.ndarray:
     return np.hstack([rng.uniform(-2 * math.pi, 2 * math.pi, (count, 6)), rng.uniform(0, 0.0425, (count, 2))])
 
 
-# --- geometry and masses ---------------------------------------------------------------------------------------------
-
-
 def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     for q in postures(100):
         data.qpos[:] = q
@@ -84,12 +81,6 @@ def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.M
         for number, joint in enumerate(JOINTS):
             np.testing.assert_allclose(data.joint(joint).xaxis, frames[number][:3, 2], atol=1e-12)
             np.testing.assert_allclose(data.joint(joint).xanchor, frames[number][:3, 3], atol=1e-12)
-
-
-def test_the_chain_is_the_published_one() -> None:
-    assert CHAIN.a == (0, -0.425, -0.39225, 0, 0, 0)
-    assert CHAIN.d == (0.089159, 0, 0, 0.10915, 0.09465, 0.0823)
-    np.testing.assert_allclose(np.degrees(CHAIN.alpha), (90, 0, 0, 90, -90, 0), atol=1e-12)
 
 
 def test_masses_and_centres_of_mass_are_the_published_ones(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -125,29 +116,6 @@ def test_inertias_are_those_of_bodies_as_large_as_the_links(model: mujoco.MjMode
         assert np.sqrt(inertia / model.body_mass[body]).max() < length / 2
 
 
-def test_mass_matrix_gravity_and_jacobian_agree_with_pinocchio(
-    model: mujoco.MjModel, data: mujoco.MjData, peer: pinocchio.Model
-) -> None:
-    assert [peer.names[i] for i in range(1, 9)] == [model.joint(i).name for i in range(8)]
-    work = peer.createData()
-    wrist, hand = peer.getJointId("wrist_3"), model.body("gripper").id
-    rng = np.random.default_rng(3)
-    mass, linear, angular = np.empty((8, 8)), np.empty((3, 8)), np.empty((3, 8))
-    for q in postures(20, 1):
-        v = rng.uniform(-3, 3, 8)
-        data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, mass)
-        np.testing.assert_allclose(pinocchio.crba(peer, work, q), mass, atol=1e-11)
-        np.testing.assert_allclose(pinocchio.nonLinearEffects(peer, work, q, v), data.qfrc_bias, atol=1e-10)
-        pinocchio.forwardKinematics(peer, work, q)
-        jacobian = pinocchio.computeJointJacobian(peer, work, q, wrist)
-        rotation = work.oMi[wrist].rotation
-        mujoco.mj_jac(model, data, linear, angular, work.oMi[wrist].translation, hand)
-        np.testing.assert_allclose(rotation @ jacobian[:3], linear, atol=1e-11)
-        np.testing.assert_allclose(rotation @ jacobian[3:], angular, atol=1e-11)
-
-
 def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     q = postures(1, 5)[0]
     q[FINGERS] = 0.0425
@@ -175,9 +143,6 @@ def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjM
         assert min(np.abs(mine - ends).max(), np.abs(mine[::-1] - ends).max()) < 1e-9
         checked.append(capsule.name)
     assert len(checked) == len(CHAIN.capsules) - 2
-
-
-# --- servos ----------------------------------------------------------------------------------------------------------
 
 
 def clear_postures(count: int, margin: float = 0.05) -> np.ndarray:
@@ -257,18 +222,6 @@ def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray)
         assert (np.abs(world.qpos[:, joint] - start - 1e-3) < 2e-5).all()
 
 
-def test_no_command_drives_a_joint_beyond_its_torque() -> None:
-    world = World(BODY)
-    torque = world.derived("qfrc_actuator")
-    rng, largest = np.random.default_rng(0), np.zeros(8)
-    for _ in range(100):
-        world.ctrl[0] = rng.uniform(BODY.limits.lower, BODY.limits.upper)
-        for _ in range(5):
-            world.step()
-            largest = np.maximum(largest, np.abs(torque[0, :8]))
-    np.testing.assert_array_equal(largest, (*TORQUE, 60.0, 60.0))
-
-
 @pytest.mark.parametrize("actuation", ["position", "torque"])
 def test_the_actuators_are_those_of_the_arm(actuation: str) -> None:
     body = ur5(actuation=actuation)  # type: ignore[arg-type]
@@ -306,9 +259,6 @@ def test_with_pinocchios_gravity_as_torque_the_arm_hovers(peer: pinocchio.Model,
     world.ctrl[:, :6] = 0
     world.step(100)
     assert np.abs(world.qpos[:, :6] - start[:, :6]).max() > 0.1  # without torque it falls
-
-
-# --- gripper ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_gripper_opens_and_closes_with_its_fingers_in_step(clear: np.ndarray) -> None:

@@ -46,8 +46,6 @@ class PerfectArm(Plant):
 
 
 class Rig:
-    """Arms, their cerebellum, the clock, and all commands so far."""
-
     def __init__(self, n: int = 1, active: bool = True, planning: Any = None) -> None:
         self.n, self.plant = n, PerfectArm(n)
         self.controller = ArmController(ARM, n, HZ, FRAME, planning)

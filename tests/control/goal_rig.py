@@ -41,7 +41,6 @@ def moved(dx: float = 0.0, dy: float = 0.0, dz: float = 0.0, turn: float = 0.0) 
 
 
 def joints(*changes: float) -> tuple[float, ...]:
-    """Return the home posture with its first joints changed."""
     return tuple(float(v) for v in HOME[:6] + np.array([*changes, *(0.0,) * (6 - len(changes))]))
 
 
@@ -93,7 +92,6 @@ class Rig:
         return self.position, self.velocity, self.acceleration
 
     def tick(self, ticks: int = 1) -> None:
-        """Tick, and keep what happens for `check`."""
         for _ in range(ticks):
             self.manager.tick(*self.reference, self.measured_position, self.measured_velocity)
             self._stopped.append(self.hard.copy())
@@ -114,7 +112,6 @@ class Rig:
         raise AssertionError("still busy")
 
     def check(self) -> None:
-        """Assert that the reference was within all limits so far."""
         if self._stopped:
             assert broken_limit(np.array(self._rows), np.array(self._stopped)) == ""
 

@@ -1,9 +1,6 @@
 """A plant with perfect wheels on a virtual clock, and the processes that share memory with a test."""
 
 import mmap
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +45,6 @@ class PerfectPlant(Plant):
 
 
 class Rig:
-    """A cerebellum on a perfect plant, and the clock that moves it."""
-
     def __init__(self, n: int = 1, active: bool = True, **options: object) -> None:
         self.plant = PerfectPlant(n)
         self.cerebellum = Cerebellum(BODY, self.plant, HZ, BaseController(BODY, n, HZ), **options)  # type: ignore[arg-type]
@@ -93,8 +88,6 @@ class Rig:
         return int(self.cerebellum.refusals[reason, 0])
 
 
-# --- what runs in other processes ------------------------------------------------------------------------------------
-
 FIFO_SHAPE = (3, 2, 8)  # n, width, capacity
 STATE = np.dtype([("number", np.int64), ("copies", np.int64, (500,))])
 
@@ -107,14 +100,7 @@ def shared_block(path: Path, size: int = 0) -> mmap.mmap:
         return mmap.mmap(file.fileno(), 0)
 
 
-def start(job: str, path: Path, count: int = 0) -> subprocess.Popen:
-    """Run one of the functions below in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    return subprocess.Popen([sys.executable, __file__, job, str(path), str(count)], env=environment)
-
-
 def push_commands(path: Path, count: int) -> None:
-    """Push numbered commands as fast as the reader makes room."""
     fifo = CommandFifo(*FIFO_SHAPE, buffer=shared_block(path))
     for number in range(count):
         values = np.full((3, 2), float(number))
@@ -124,7 +110,6 @@ def push_commands(path: Path, count: int) -> None:
 
 
 def publish_states(path: Path, count: int) -> None:
-    """Publish numbered states as fast as possible."""
     ring = StateRing(STATE, 2, buffer=shared_block(path))
     state = np.zeros((), STATE)
     for number in range(1, count + 1):
@@ -133,10 +118,6 @@ def publish_states(path: Path, count: int) -> None:
         ring.publish(state)
 
 
-def set_word(path: Path, _: int) -> None:
+def set_word(path: Path) -> None:
     """Press the emergency stop of the second of two simulations."""
     EstopWord(2, shared_block(path)).press(np.array([1]))
-
-
-if __name__ == "__main__":
-    globals()[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]))

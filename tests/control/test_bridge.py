@@ -41,9 +41,6 @@ def twist(*values: float) -> np.ndarray:
     return np.array([values])
 
 
-# --- time ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rates", [Rates(400, 200, 10), Rates(600, 300, 30), Rates(70, 7, 7)])
 def test_a_frame_is_a_frame_without_drift(rates: Rates) -> None:
     bridge = perfect(rates=rates)
@@ -92,27 +89,6 @@ def test_a_chunk_is_one_command_a_frame() -> None:
     assert chunked.state().mode.tolist() == [Mode.HOLD]
 
 
-def test_the_life_of_a_robot() -> None:
-    bridge = perfect(2)
-    assert bridge.state().mode.tolist() == [Mode.HOLD] * 2
-    bridge.send(np.tile(twist(0.2, 0.0), (2, 1)))
-    bridge.advance_frame()
-    bridge.estop(np.array([1]))
-    bridge.advance_frame()
-    assert bridge.state().mode.tolist() == [Mode.TRACKING, Mode.ESTOP]
-    assert bridge.deactivate(np.array([0])).accepted.all()
-    for _ in range(4):
-        bridge.advance_frame()
-    assert bridge.state().mode.tolist() == [Mode.SAFE_OFF, Mode.ESTOP]
-    assert bridge.activate().reasons.tolist() == [Reason.WRONG_MODE, Reason.ESTOP]
-    assert bridge.reset().accepted.all()
-    assert bridge.activate(np.array([1])).accepted.all()
-    assert bridge.send(np.tile(twist(0.2, 0.0), (2, 1))).reasons.tolist() == [Reason.NOT_ACTIVE, Reason.ACCEPTED]
-
-
-# --- on the simulated robot ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rates", [Rates(200, 200, 10), Rates(1000, 200, 10)], ids=str)
 @pytest.mark.parametrize("command", [(0.22, 0.0), (-0.22, 0.0), (0.0, 2.84), (0.0, -2.84), (0.12, 1.2)])
 def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[float, float], rates: Rates) -> None:
@@ -142,32 +118,6 @@ def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[
     assert np.hypot(*(world.base_pose[0, :2] - start)) < 1e-3
     assert abs(world.base_pose[0, 2] - yaw) < 5e-3
     assert bridge.cerebellum.refusals[Reason.ESTOP, 0] == 20
-
-
-def test_a_twist_that_is_asked_for_is_driven() -> None:
-    bridge, world = simulated(3)
-    commands = np.array([(0.2, 0.0), (0.0, 1.5), (-0.1, -0.8)])
-    for _ in range(20):
-        bridge.send(commands)
-        bridge.advance_frame()
-    np.testing.assert_allclose(bridge.state().measured, commands, atol=0.01)
-    np.testing.assert_allclose(bridge.state().command, commands)
-    np.testing.assert_allclose(world.qvel[:, 5], commands[:, 1], rtol=0.02, atol=1e-3)
-
-
-def test_odometry_follows_the_truth_and_drifts_a_little() -> None:
-    bridge, world = simulated()
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        command = rng.uniform((-0.05, -1.0), (0.2, 1.0))
-        for _ in range(10):
-            bridge.send(command[None])
-            bridge.advance_frame()
-    odometry, truth = bridge.state().odometry[0], world.base_pose[0]
-    error = np.hypot(*(odometry[:2] - truth[:2]))
-    assert 1e-6 < error < 0.1
-    turn = (odometry[2] - truth[2] + np.pi) % (2 * np.pi) - np.pi
-    assert 1e-6 < abs(turn) < 0.15
 
 
 def test_a_robot_that_pushes_a_wall_has_no_limits_broken() -> None:

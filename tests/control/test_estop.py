@@ -56,7 +56,6 @@ def wire() -> Iterator[tuple[int, int]]:
 
 
 def wait_for_cause(inputs: EstopInputs, cause: str) -> None:
-    """Wait until a cause is among those that pressed."""
     until(lambda: cause in inputs.causes)
 
 
@@ -299,7 +298,6 @@ class Terminal:
         os.write(self.person, keys)
 
     def end(self) -> tuple[int, str]:
-        """Wait for the program's end; return its status and what it complained about."""
         _, error = self.process.communicate()
         return self.process.returncode, error
 
@@ -336,23 +334,21 @@ def test_space_and_e_press_at_once_and_other_keys_do_not(terminal):
     assert one.process.poll() is None
 
 
-def test_ctrl_c_still_interrupts_and_the_terminal_is_as_it_was(terminal):
-    one = terminal("while True: time.sleep(1)")
-    one.expect("key True False")
-    one.type(b"\x03")
-    status, error = one.end()
-    assert status == -signal.SIGINT
-    assert "KeyboardInterrupt" in error
-    assert termios.tcgetattr(one.device) == one.before
-
-
 @pytest.mark.parametrize(
-    ("program", "status"), [("inputs.close()", 0), ("raise RuntimeError('a bug')", 1), ("sys.exit(3)", 3)]
+    ("program", "keys", "status", "error"),
+    [
+        ("while True: time.sleep(1)", b"\x03", -signal.SIGINT, "KeyboardInterrupt"),  # Ctrl-C
+        ("inputs.close()", b"", 0, ""),
+        ("raise RuntimeError('a bug')", b"", 1, "a bug"),
+        ("sys.exit(3)", b"", 3, ""),
+    ],
 )
-def test_however_the_program_ends_the_terminal_is_as_it_was(terminal, program, status):
+def test_however_the_program_ends_the_terminal_is_as_it_was(terminal, program, keys, status, error):
     one = terminal(program)
     one.expect("key True False")
-    assert one.end()[0] == status
+    one.type(keys)
+    ended, said = one.end()
+    assert (ended, error in said) == (status, True)
     assert termios.tcgetattr(one.device) == one.before
 
 

@@ -13,6 +13,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
 from tests.cases import each_case
 from tests.control import support
 from tests.control.support import HZ, TICK_NS, Rig
+from tests.forks import Fork
 
 TIMEOUT_TICKS = HZ // 2
 
@@ -166,45 +167,6 @@ def test_configuring_on_a_broken_plant_is_refused() -> None:
     assert np.isfinite(rig.cerebellum.state(rig.now).odometry).all()
 
 
-def test_the_sequence_of_modes_of_a_run() -> None:
-    rig = Rig(active=False)
-    seen = [rig.mode]
-
-    def note() -> None:
-        if rig.mode != seen[-1]:
-            seen.append(rig.mode)
-
-    def tick(ticks: int) -> None:
-        for _ in range(ticks):
-            rig.tick()
-            note()
-
-    def ask(request: Request) -> None:
-        assert rig.request(request).accepted.all()
-        note()
-
-    tick(3)
-    ask(Request.CONFIGURE)
-    tick(3)
-    ask(Request.ACTIVATE)
-    tick(3)
-    rig.send(0.2)
-    tick(150)
-    rig.send(0.1)
-    tick(5)
-    ask(Request.DEACTIVATE)
-    tick(50)
-    ask(Request.RESET)
-    tick(50)
-    assert seen == [
-        Mode.UNCONFIGURED, Mode.INACTIVE, Mode.HOLD, Mode.TRACKING, Mode.STOPPING, Mode.HOLD,
-        Mode.TRACKING, Mode.STOPPING, Mode.SAFE_OFF, Mode.INACTIVE,
-    ]  # fmt: skip
-
-
-# --- the watchdog ----------------------------------------------------------------------------------------------------
-
-
 def test_a_command_that_grows_old_ramps_to_zero_and_motion_resumes_with_the_next() -> None:
     rig = Rig()
     rig.send(0.1, 1.0)
@@ -280,9 +242,6 @@ def test_a_command_takes_effect_when_it_is_due() -> None:
     assert rig.command[0] > 0.1
 
 
-# --- latches ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("twist", [(0.22, 0.0), (0.0, 2.84), (-0.1, -1.5), (0.1, 1.5)])
 def test_an_emergency_stop_ramps_down_from_the_next_tick(twist: tuple[float, float]) -> None:
     rig = Rig()
@@ -301,20 +260,6 @@ def test_an_emergency_stop_ramps_down_from_the_next_tick(twist: tuple[float, flo
     assert (change >= -np.array([2.5, 20.0]) / HZ - 1e-12).all()
     slowest = max(abs(twist[0]) / 2.5, abs(twist[1]) / 20.0)
     assert (ramp[int(np.ceil(slowest * HZ)) + 1] == 0).all()
-
-
-def test_commands_after_an_emergency_stop_are_refused_and_counted() -> None:
-    rig = in_mode(Mode.ESTOP)
-    for count in range(1, 6):
-        assert rig.send(0.1).reasons.tolist() == [Reason.ESTOP]
-        assert rig.refused(Reason.ESTOP) == count
-        rig.tick()
-
-
-def test_a_command_is_refused_from_the_moment_that_the_word_is_set() -> None:
-    rig = in_mode(Mode.TRACKING)
-    rig.cerebellum.estop.press()
-    assert rig.send(0.1).reasons.tolist() == [Reason.ESTOP]
 
 
 @pytest.mark.parametrize("mode", [Mode.ESTOP, Mode.FAULT, Mode.SAFE_OFF], ids=lambda mode: mode.name)
@@ -382,17 +327,6 @@ def test_a_command_right_after_an_activation_need_not_wait_for_the_queue_of_befo
     assert rig.mode == Mode.TRACKING
 
 
-def test_a_deactivation_is_not_undone_by_a_setpoint() -> None:
-    rig = in_mode(Mode.TRACKING)
-    rig.send(0.2, due=rig.now + 2 * TICK_NS)
-    rig.request(Request.DEACTIVATE)
-    assert rig.send(0.2, due=rig.now + 3 * TICK_NS).reasons.tolist() == [Reason.NOT_ACTIVE]
-    rig.tick(100)
-    assert rig.mode == Mode.SAFE_OFF
-    assert rig.command == [0, 0]
-    assert rig.refused(Reason.NOT_ACTIVE) == 2
-
-
 def test_an_unprocessed_emergency_stop_survives_the_reset_of_another_latch() -> None:
     for mode in (Mode.FAULT, Mode.SAFE_OFF):
         rig = in_mode(mode)
@@ -425,16 +359,6 @@ def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
     assert rig.request(Request.ACTIVATE).accepted.all()
     rig.tick()
     assert rig.cerebellum.state(rig.now).odometry[0].tolist() == [0, 0, 0]
-
-
-def test_only_a_reset_clears_the_latch() -> None:
-    rig = in_mode(Mode.ESTOP)
-    rig.tick(10)
-    assert rig.mode == Mode.ESTOP
-    rig.request(Request.RESET)
-    assert not rig.cerebellum.estop.pressed.any()
-    rig.tick()
-    assert rig.mode == Mode.INACTIVE
 
 
 @given(st.lists(st.sampled_from(["press", "tick", "reset", "activate", "send"]), min_size=1, max_size=40))
@@ -480,7 +404,7 @@ def test_another_process_can_stop_one_of_two_robots(tmp_path: Path) -> None:
     rig.send(0.2)
     rig.tick(20)
     assert (rig.cerebellum.mode == Mode.TRACKING).all()
-    assert support.start("set_word", path).wait() == 0
+    assert Fork(support.set_word, path).wait() == 0
     rig.send(0.2)
     rig.tick()
     assert rig.cerebellum.mode.tolist() == [Mode.TRACKING, Mode.ESTOP]

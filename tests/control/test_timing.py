@@ -23,19 +23,6 @@ def collect(lateness: np.ndarray, duration: np.ndarray | int = 100) -> TimingSta
     return statistics
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("scale", [3e3, 5e4, 2e6])
-def test_quantiles_are_at_most_one_bin_too_high_and_never_too_low(seed: int, scale: float) -> None:
-    lateness = np.random.default_rng(seed).lognormal(np.log(scale), 1.0, 997).astype(np.int64)
-    summary = collect(lateness).summary()
-    for share, measured in ((0.50, summary.lateness_p50), (0.99, summary.lateness_p99)):
-        exact = np.quantile(lateness, share, method="inverted_cdf") / 1e9
-        # Below a microsecond, the first bin, the statistics do not resolve times.
-        assert exact <= measured * (1 + 1e-12)
-        assert measured <= max(exact * BIN * 1.001, 1e-6)
-    assert summary.lateness_max == lateness.max() / 1e9
-
-
 @given(st.lists(st.tuples(st.integers(-10_000, 20_000_000), st.integers(0, 20_000_000)), min_size=1, max_size=40))
 def test_overruns_and_maxima_are_exact(ticks: list[tuple[int, int]]) -> None:
     late, long = np.array(ticks).T
@@ -45,11 +32,6 @@ def test_overruns_and_maxima_are_exact(ticks: list[tuple[int, int]]) -> None:
     assert summary.lateness_max == max(0, late.max()) / 1e9
     assert summary.duration_max == long.max() / 1e9
     assert 0 <= summary.lateness_p50 <= summary.lateness_p99 <= summary.lateness_max
-
-
-def test_a_tick_that_ends_when_the_next_is_due_did_not_overrun() -> None:
-    assert collect(np.array([0, 10]), np.array([PERIOD, PERIOD - 10])).summary().overruns == 0
-    assert collect(np.array([0, 10]), np.array([PERIOD + 1, PERIOD - 9])).summary().overruns == 2
 
 
 def test_a_punctual_loop_is_punctual() -> None:
@@ -62,20 +44,10 @@ def test_a_punctual_loop_is_punctual() -> None:
     assert (summary.lateness_p50, summary.lateness_p99, summary.lateness_max) == (0, 0, 0)
 
 
-def test_a_few_late_ticks_show_in_the_tail_only() -> None:
-    statistics = collect(np.array([3_000_000] * 20))
-    statistics.add_punctual(980)
-    summary = statistics.summary()
-    assert summary.lateness_p50 <= 1e-6
-    assert summary.lateness_p99 == pytest.approx(0.003, rel=BIN - 1)
-
-
 def test_lateness_beyond_the_last_bin_is_reported() -> None:
     summary = collect(np.array([60_000_000_000])).summary()
     assert summary.lateness_p50 == 60.0
 
-
-# --- skipped ticks, the grid -----------------------------------------------------------------------------------------
 
 TICKS = st.lists(st.tuples(st.integers(0, PERIOD - 1), st.integers(0, 20_000_000), st.integers(0, 4)), max_size=40)
 
@@ -118,17 +90,15 @@ def test_no_ticks_give_zeros() -> None:
 
 
 @given(st.lists(st.integers(1, 10**11), min_size=1, max_size=60))
-def test_quantiles_of_durations_are_at_most_one_bin_too_high_and_never_too_low(durations: list[int]) -> None:
-    summary = collect(np.zeros(len(durations)), np.array(durations)).summary()
-    for share, measured in ((0.50, summary.duration_p50), (0.99, summary.duration_p99)):
-        exact = np.quantile(durations, share, method="inverted_cdf") / 1e9
-        assert exact <= measured * (1 + 1e-12)
-        if exact <= 10:
-            assert measured <= max(exact * BIN * 1.001, 1e-6)
-    assert summary.duration_p99 <= summary.duration_max == max(durations) / 1e9
-
-
-# --- shared memory ---------------------------------------------------------------------------------------------------
+def test_quantiles_are_at_most_one_bin_too_high_and_never_too_low(times: list[int]) -> None:
+    summary = collect(np.array(times), np.array(times)).summary()
+    for share, name in ((0.50, "p50"), (0.99, "p99")):
+        exact = np.quantile(times, share, method="inverted_cdf") / 1e9
+        for measured in (getattr(summary, f"lateness_{name}"), getattr(summary, f"duration_{name}")):
+            assert exact <= measured * (1 + 1e-12)
+            if exact <= 10:  # Below a microsecond, the first bin, the statistics do not resolve times.
+                assert measured <= max(exact * BIN * 1.001, 1e-6)
+    assert summary.duration_p99 <= summary.duration_max == summary.lateness_max == max(times) / 1e9
 
 
 def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
@@ -167,9 +137,6 @@ def test_memory_without_statistics_is_refused() -> None:
             make(bytearray(TimingStatistics.nbytes - 1))
     with pytest.raises(ConfigError, match="period_ns is 0"):
         TimingStatistics(0)
-
-
-# --- summaries -------------------------------------------------------------------------------------------------------
 
 
 def test_a_summary_survives_json() -> None:

@@ -77,6 +77,18 @@ def torque_arm() -> StuckRig:
     return rig
 
 
+def planned_arm() -> tuple[arm_rig.Rig, PlanLink, PlanServer]:
+    """Return an arm in the middle of a motion that another process planned."""
+    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
+    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    rig = arm(planning=link)
+    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
+    for _ in range(220):
+        rig.tick()
+        server.serve_once()
+    return rig, link, server
+
+
 BREAK: dict[str, Callable[[Array], None]] = {
     "not a number": lambda values: values.fill(np.nan),
     "one infinity": lambda values: values.__setitem__((..., 0), np.inf),
@@ -85,18 +97,10 @@ BREAK: dict[str, Callable[[Array], None]] = {
     "far away": lambda values: values.fill(1e300),
 }
 
-# --- finding 1: rows of a trajectory that another process wrote ------------------------------------------------------
-
 
 @pytest.mark.parametrize("how", BREAK)
 def test_rows_in_shared_memory_that_were_overwritten_stop_the_arm_and_move_nothing(how: str) -> None:
-    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
-    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
-    rig = arm(planning=link)
-    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
-    for _ in range(220):
-        rig.tick()
-        server.serve_once()
+    rig, link, server = planned_arm()
     assert rig.mode == Mode.TRACKING
     assert np.abs(rig.cerebellum.reading.velocity).max() > 0.5  # under way
     where = rig.plant.position.copy()
@@ -119,9 +123,6 @@ def test_rows_in_shared_memory_that_were_overwritten_stop_the_arm_and_move_nothi
         rig.tick()
         server.serve_once()
     assert rig.results() == [("2", ResultCode.SUCCEEDED)]
-
-
-# --- anything that goes wrong inside ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("how", BREAK)
@@ -170,18 +171,9 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.HOLD
 
 
-# --- rows that alternate: each near to the last, and a torque at its limit -------------------------------------------
-
-
 @pytest.mark.parametrize("by", [3e-3, 1e-3, 5e-4])
 def test_rows_that_alternate_stop_the_arm(by: float) -> None:
-    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
-    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
-    rig = arm(planning=link)
-    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
-    for _ in range(220):
-        rig.tick()
-        server.serve_once()
+    rig, link, _ = planned_arm()
     rows = link._memory.rows
     rows[..., ::2, 0, :6] += by
     rows[..., 1::2, 0, :6] -= by
@@ -196,9 +188,6 @@ def test_rows_that_alternate_stop_the_arm(by: float) -> None:
     assert np.abs(rig.plant.velocity).max() < 1e-6
 
 
-# --- finding 7: ticks that were skipped ------------------------------------------------------------------------------
-
-
 def test_what_was_missed_is_not_caught_up_at_the_wire() -> None:
     rig = arm()
     assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
@@ -210,9 +199,6 @@ def test_what_was_missed_is_not_caught_up_at_the_wire() -> None:
     assert rig.plant.count == before + 4
     rig.until(Mode.HOLD)
     assert rig.results() == [("1", ResultCode.SUCCEEDED)]
-
-
-# --- finding 6: readings that are old, and encoders that stand still --------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [base_rig, arm])
@@ -301,9 +287,6 @@ def test_wheels_that_turn_and_a_gyroscope_that_says_otherwise_are_a_fault(turns:
     if fault_at is not None:
         assert fault_at < 0.75 * support.HZ  # of which the first 0.3 s are those in which it begins to turn
         assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.PLANT
-
-
-# --- finding 8: many commands, late commands, commands for another day -----------------------------------------------
 
 
 def test_however_many_setpoints_are_due_one_counts_and_a_tick_takes_its_time_for_one() -> None:

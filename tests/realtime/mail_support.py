@@ -1,9 +1,5 @@
 """Records for mailboxes, and the processes at the other end of them."""
 
-import mmap
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,18 +11,11 @@ from bhd_lerobot.control.motion.planner import Plan
 from bhd_lerobot.control.motion.trajectory import PlanFailure, Trajectory
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.plan_link import PlanServer
+from tests.control.support import shared_block
 
 RECORD = np.dtype([("number", np.int64), ("flag", np.bool_), ("copies", np.int64, (100,))])  # 809 bytes: not aligned
 CAPACITY = 4
 DURATION_S = 1.0
-
-
-def shared_block(path: Path, size: int = 0) -> mmap.mmap:
-    """Return memory that processes share through a file: a new zeroed block, or what is there if the size is 0."""
-    if size:
-        path.write_bytes(bytes(size))
-    with path.open("r+b") as file:
-        return mmap.mmap(file.fileno(), 0)
 
 
 def record(number: int) -> np.void:
@@ -62,14 +51,7 @@ class RampPlanner:
         return Plan(trajectory, np.full(self.dof + 1, -1.0 if opening is None else opening))
 
 
-def start(job: str, path: Path, count: int) -> subprocess.Popen:
-    """Run one of the functions below in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    return subprocess.Popen([sys.executable, __file__, job, str(path), str(count)], env=environment)
-
-
 def post_numbers(path: Path, count: int) -> None:
-    """Post as fast as the reader makes room."""
     mailbox = Mailbox(RECORD, CAPACITY, shared_block(path))
     for number in range(count):
         while not mailbox.post(record(number)):
@@ -77,11 +59,6 @@ def post_numbers(path: Path, count: int) -> None:
 
 
 def serve_plans(path: Path, count: int) -> None:
-    """Answer so many requests."""
     planner = RampPlanner()
     server = PlanServer(shared_block(path), planner, duration_s=DURATION_S)  # type: ignore[arg-type]
     server.serve(lambda: len(planner.planned) == count, lambda: time.sleep(1e-4))
-
-
-if __name__ == "__main__":
-    globals()[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]))

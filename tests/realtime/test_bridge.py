@@ -10,12 +10,10 @@ import pytest
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Word
 from bhd_lerobot.realtime.bridge import LiveBridge
-from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
 from tests.control.support import BODY, PerfectPlant
@@ -46,23 +44,10 @@ class Rig:
         )
         requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
                             Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
-        server = RequestServer(self.cerebellum, requests, events)
-        self.ring: StateRing = other.ring
+        self.server = RequestServer(self.cerebellum, requests, events)
         self.record = np.zeros((), extended)
-        self.start = self.now
-        self.ticks = 0
+        self.start, self.ticks = self.now, 0
         other.words[Word.START] = self.start
-        self.loop = RealtimeLoop(
-            self.cerebellum,
-            other.words,
-            LoopLimits(),
-            serve=lambda now: server.serve(self.now),
-            advance=lambda ticks: None,
-            publish=self.publish,
-            count=lambda *numbers: None,
-            clock=self.clock,
-            sleep=self.sleep,
-        )
         client = RequestClient(
             Mailbox(request_dtype(0), buffer=self.block.section("requests")),
             Mailbox(EVENT_DTYPE, buffer=self.block.section("events")),
@@ -70,45 +55,23 @@ class Rig:
             clock_ns=self.clock,
         )
         self.bridge = LiveBridge(self.block, Rates(HZ, HZ, FPS), client, self.tick, self.clock)
-        self.until = 0
 
     def clock(self) -> int:
         return self.now
 
-    def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9)
-
-    def publish(self, slot, started, ended, grid) -> None:
-        state = self.cerebellum.state(slot.due_ns - grid.start_ns)
-        for name in STATE.names or ():
-            self.record[name] = getattr(state, name)
-        self.record["tick"], self.record["due_ns"] = self.ticks, slot.due_ns
-        self.ring.publish(self.record)
-        self.ticks += 1
-        if self.ticks >= self.until:
-            self.other.words[Word.PAUSE] = 1
-
     def tick(self, count: int = 1) -> None:
-        """Run some ticks, each segment of which goes on with the time of the one before."""
-        self.until = self.ticks + count
-        words = self.other.words
-        words[Word.PAUSE] = 0
-        # The grid goes on: a segment that starts anew at the next point of the same grid.
-        next_due = self.start + self.ticks * TICK
-        self.now = max(self.now, next_due - TICK // 2)
-        self.cerebellum_time(next_due)
-
-    def cerebellum_time(self, next_due: int) -> None:
-        """Run the loop from a point of the grid on; times stay those since the first start."""
-        first = self.start
-        plain = self.cerebellum.tick
-        offset = next_due - first
-        self.cerebellum.tick = lambda now: plain(now + offset)  # type: ignore[method-assign]
-        try:
-            self.loop.run(next_due)
-        finally:
-            self.cerebellum.tick = plain  # type: ignore[method-assign]
-            self.other.words[Word.START] = first
+        """Do what the loop does in some ticks."""
+        for _ in range(count):
+            self.now = max(self.now, self.start + self.ticks * TICK)
+            elapsed = self.ticks * TICK
+            self.server.serve(self.now)
+            self.cerebellum.tick(elapsed)
+            state = self.cerebellum.state(elapsed)
+            for name in STATE.names or ():
+                self.record[name] = getattr(state, name)
+            self.record["tick"], self.record["due_ns"] = self.ticks, self.start + elapsed
+            self.other.ring.publish(self.record)
+            self.ticks += 1
 
     def close(self) -> None:
         self.block.close()
@@ -129,16 +92,6 @@ def rig() -> Iterator[Rig]:
 
 def drive(value: float) -> np.ndarray:
     return np.array([[value, 0.0]])
-
-
-def test_modes_are_asked_for_and_setpoints_move_the_robot(rig: Rig) -> None:
-    assert rig.bridge.state().mode.tolist() == [Mode.HOLD]
-    assert rig.bridge.send(drive(0.1)).accepted.all()
-    rig.tick(30)
-    state = rig.bridge.state()
-    assert state.mode.tolist() == [Mode.TRACKING]
-    assert state.command[0, 0] == pytest.approx(0.1)
-    assert Phase(int(rig.block.words[Word.PHASE])) == Phase.STANDING
 
 
 def test_invalid_setpoints_are_refused_at_once_with_the_reason(rig: Rig) -> None:

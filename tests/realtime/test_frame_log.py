@@ -31,14 +31,6 @@ class Rig:
         return found
 
 
-def test_a_boundary_is_the_state_that_a_frame_ends_with() -> None:
-    rig = Rig()
-    for tick in range(-1, 3 * F):
-        rig.tick(tick)
-    rig.collector.drain()
-    assert rig.boundaries() == [(0, -1), (1, F - 1), (2, 2 * F - 1), (3, 3 * F - 1)]
-
-
 def test_the_lateness_of_a_frame_is_in_its_boundary() -> None:
     rig = Rig()
     for tick in range(-1, 2 * F):

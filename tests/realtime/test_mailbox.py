@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.mailbox import Mailbox
-from tests.realtime.mail_support import CAPACITY, RECORD, record, shared_block, start
+from tests.control.support import shared_block
+from tests.forks import Fork
+from tests.realtime.mail_support import CAPACITY, RECORD, post_numbers, record
 
 
 def number_of(value: np.void | None) -> int | None:
@@ -73,7 +75,7 @@ def test_the_block_of_memory_has_the_stated_size() -> None:
 def test_between_two_processes_nothing_is_lost_reordered_or_torn(tmp_path: Path) -> None:
     count, path = 1000, tmp_path / "block"
     mailbox = Mailbox(RECORD, CAPACITY, shared_block(path, Mailbox.nbytes(RECORD, CAPACITY)))
-    process = start("post_numbers", path, count)
+    process = Fork(post_numbers, path, count)
     for number in range(count):
         while (taken := mailbox.take()) is None:
             assert process.poll() is None or len(mailbox)

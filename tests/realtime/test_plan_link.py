@@ -17,8 +17,10 @@ from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
-from tests.control.motion.test_goal_properties import goals
-from tests.realtime.mail_support import DURATION_S, RampPlanner, shared_block, start
+from tests.control.motion.test_goal_properties import actions, follow
+from tests.control.support import shared_block
+from tests.forks import Fork
+from tests.realtime.mail_support import DURATION_S, RampPlanner, serve_plans
 
 PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
 STATE = State.of(*np.arange(21.0).reshape(3, 7))
@@ -39,9 +41,6 @@ def answer(link: PlanLink) -> Plan:
     plan = link.poll(0)
     assert isinstance(plan, Plan)
     return plan
-
-
-# --- one request -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -71,18 +70,6 @@ def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(comman
     assert np.array_equal(plan.target, expected.target)
     assert not server.serve_once()
     assert link.poll(0) is None  # once
-
-
-@pytest.mark.parametrize("opening", [None, 0.0, 0.04])
-def test_the_state_and_the_opening_arrive(opening: float | None) -> None:
-    link, server, _, _ = linked()
-    link.request(0, ramp(3, 0.5), STATE, opening, 0)
-    server.serve_once()
-    plan = answer(link)
-    for name in ("position", "velocity", "acceleration"):
-        expected = getattr(STATE, name) + 0.5 * np.arange(1, 4)[:, None]
-        assert np.array_equal(getattr(plan.trajectory, name), expected)
-    assert plan.target.tolist() == [-1.0 if opening is None else opening] * 7
 
 
 def test_what_the_gripper_holds_arrives() -> None:
@@ -137,9 +124,6 @@ def test_a_trajectory_that_is_too_long_for_the_memory_is_a_failure() -> None:
         if isinstance(plan, PlanFailure):
             assert plan.code == ResultCode.PLANNING_FAILED
             assert "there is room for 6 s" in plan.message
-
-
-# --- requests that are not wanted any more ---------------------------------------------------------------------------
 
 
 def test_what_is_dropped_is_not_planned() -> None:
@@ -226,9 +210,6 @@ def test_the_rows_that_are_played_are_never_written_to(steps: list[str]) -> None
             assert polled.trajectory.position[0, 0] == asked
 
 
-# --- processes that end ----------------------------------------------------------------------------------------------
-
-
 def test_a_half_written_request_is_not_read() -> None:
     link, server, planner, block = linked()
     link.request(0, ramp(3), STATE, None, 0)
@@ -272,23 +253,11 @@ def test_a_restarted_planner_answers_only_open_requests() -> None:
     assert answer(link).trajectory.ticks == 5
 
 
-def test_serve_runs_until_stop_returns_true() -> None:
-    link, server, planner, _ = linked()
-    sleeps = []
-
-    def sleep() -> None:
-        sleeps.append(len(planner.planned))
-        link.request(0, ramp(2), STATE, None, 0)
-
-    server.serve(lambda: len(planner.planned) == 3, sleep)
-    assert sleeps == [0, 1, 2]
-
-
 def test_another_process_plans(tmp_path: Path) -> None:
     path, count = tmp_path / "block", 200
     block = shared_block(path, PlanLink.nbytes(6, 100, DURATION_S))
     link = PlanLink(block, 6, 100, duration_s=DURATION_S)
-    process = start("serve_plans", path, count)
+    process = Fork(serve_plans, path, count)
     playing_rows: tuple[np.ndarray, np.ndarray] | None = None
     for number in range(1, count + 1):
         link.request(0, ramp(1 + number % 500, float(number)), STATE, 0.01 * number, 0)
@@ -306,114 +275,43 @@ def test_another_process_plans(tmp_path: Path) -> None:
     assert process.wait() == 0
 
 
-# --- all together ----------------------------------------------------------------------------------------------------
-
-
 class Scribbler(PlanServer):
-    """A planner's side that takes its time, and leaves garbage where it may write while the arm goes on."""
-
-    def __init__(self, world: "World", latencies: list[int]) -> None:
-        super().__init__(world.block, PLANNER, duration_s=world.duration_s)
-        self.world, self.latencies = world, iter(latencies)
+    """A planner's side that leaves garbage where it may write."""
 
     def _plan(self, request: Any, capacity: int) -> Plan | PlanFailure:
-        rows = self._memory.rows[int(request["block"])]
-        rows[:] = np.nan
-        self.world.pass_ticks(next(self.latencies, 0))
-        rows[:] = np.nan
+        self._memory.rows[int(request["block"])] = np.nan
         return super()._plan(request, capacity)
 
 
-class World:
-    """A rig whose planner runs when ticks have passed, and a script of what is done at which tick."""
+class LateLink(PlanLink):
+    """A link whose planner answers at the k-th poll after a request."""
 
-    duration_s = 6.0
+    def __init__(self, latencies: list[int], lead: int) -> None:
+        block = bytearray(PlanLink.nbytes(6, HZ, 6.0))
+        super().__init__(block, 6, HZ, lead_s=lead / HZ, timeout_s=0.4, duration_s=6.0)
+        self.server, self.latencies, self.left = Scribbler(block, PLANNER, duration_s=6.0), iter(latencies), 0
 
-    def __init__(self, script: list, latencies: list[int], lead_s: float) -> None:
-        self.block = bytearray(PlanLink.nbytes(6, HZ, self.duration_s))
-        self.link = PlanLink(self.block, 6, HZ, lead_s=lead_s, timeout_s=0.4, duration_s=self.duration_s)
-        self.rig = Rig(planning=self.link)  # type: ignore[arg-type]
-        self.server = Scribbler(self, latencies)
-        self.shared = np.frombuffer(self.block, np.uint8)
-        self.script = iter(script)
-        self.pause = self.number = 0
-        self.ended = False
-        self.due: Counter = Counter()
-        self.played: tuple[Any, Any] = (None, None)
+    def request(self, *arguments: Any) -> None:
+        self.left = next(self.latencies, 1)
+        super().request(*arguments)
 
-    def pass_ticks(self, ticks: int) -> None:
-        for _ in range(ticks):
-            while self.pause == 0 and not self.ended:
-                self.act()
-            self.pause -= 1
-            self.rig.tick()
-            self.check_rows()
-
-    def act(self) -> None:
-        action = next(self.script, None)
-        if action is None:
-            self.ended = True
-            return
-        (kind, value), self.pause = action
-        name = str(self.number)
-        self.number += 1
-        if kind == "goal":
-            self.rig.go(name, **value)
-            self.due[name] += 1
-        elif kind == "cancel":
-            self.rig.manager.cancel(0, str(value))
-        else:
-            self.rig.stop(ResultCode.ESTOP if value else ResultCode.CANCELLED, value)
-
-    def check_rows(self) -> None:
-        player = self.rig.manager._player
-        source = player._source
-        if not player.active[0] or not np.shares_memory(source, self.shared):
-            self.played = None, None
-            return
-        if self.played[0] is not source:
-            self.played = source, source.copy()
-        assert np.array_equal(source, self.played[1])
-
-    def run(self) -> None:
-        for _ in range(100_000):
-            self.pass_ticks(1)
+    def poll(self, sim: int) -> Plan | PlanFailure | None:
+        self.left -= 1
+        if self.left <= 0:
             self.server.serve_once()
-            if self.ended and not self.rig.manager.busy.any():
-                return
-        raise AssertionError("still busy")
-
-
-others = st.tuples(st.just("cancel"), st.integers(0, 8)) | st.tuples(st.just("stop"), st.booleans())
-actions = st.tuples(st.one_of(goals, goals, others), st.integers(0, 5) | st.integers(0, 400))
+        return super().poll(sim)
 
 
 @settings(max_examples=30)
 @given(st.lists(actions, min_size=1, max_size=7), st.lists(st.integers(0, 300), max_size=10), st.integers(MIN_LEAD, 40))
 def test_whatever_happens_while_another_process_plans(script: list, latencies: list[int], lead: int) -> None:
-    world = World(script, latencies, lead / HZ)
-    world.run()
-    world.rig.check()
-    results = world.rig.manager.take_results(0)
-    assert Counter(result.task_id for result in results) == world.due
+    rig = Rig(planning=LateLink(latencies, lead))  # type: ignore[arg-type]
+    due = follow(rig, 0, script)
+    rig.run()  # checks position, speed, acceleration and jerk at every tick
+    results = rig.taken + rig.manager.take_results(0)
+    assert Counter(result.task_id for result in results) == +due
     assert all(result.message for result in results)
-    assert not world.rig.velocity.any()
-
-
-def test_a_sequence_of_goals_is_played_from_the_shared_memory() -> None:
-    goals_ = [(("goal", {"joint_target": joints(0.3 * k)}), 0) for k in (1, -1, 2)]
-    world = World(goals_, [5, 5, 5], 0.025)
-    shared_ticks = 0
-    while not world.ended or world.rig.manager.busy.any():
-        world.pass_ticks(1)
-        world.server.serve_once()
-        shared_ticks += world.played[0] is not None
-    assert [code for _, code in world.rig.results()] == [ResultCode.SUCCEEDED] * 3
-    assert shared_ticks > HZ
-    assert world.rig.position[0, :6].tolist() == list(joints(0.6))
-
-
-# --- numbers ---------------------------------------------------------------------------------------------------------
+    assert not rig.velocity.any()
 
 
 def test_another_process_plans_for_one_arm_only() -> None:

@@ -1,9 +1,5 @@
 """A cerebellum and a plant in two processes: the plant judges commands by their age, and stops are latched."""
 
-import mmap
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +10,8 @@ from hypothesis import strategies as st
 from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
+from tests.control.support import shared_block
+from tests.forks import Fork
 
 SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, sensors=3, capacity=4)
 MS = 1_000_000
@@ -215,14 +213,11 @@ def test_sections_are_as_large_as_the_rings_need() -> None:
     assert set(sizes) == {"plant_commands", "plant_states"}
 
 
-# --- two processes ---------------------------------------------------------------------------------------------------
-
 COUNT = 20_000
 
 
 def memory_of(path: Path) -> tuple[memoryview, memoryview]:
-    with path.open("r+b") as file:
-        whole = memoryview(mmap.mmap(file.fileno(), 0))
+    whole = memoryview(shared_block(path))
     size = SHAPE.sections()["plant_commands"] // 64 * 64 + 64
     return whole[:size], whole[size:]
 
@@ -245,8 +240,7 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
     link = PlantLink(SHAPE, *memory_of(path))
     guard = CommandGuard(link, 10**12, anything(), MS)
     remote = RemotePlant(link)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    process = subprocess.Popen([sys.executable, __file__, str(path)], env=environment)
+    process = Fork(write_commands, path)
     try:
         seen, newest = 0, 0
         while guard.number < COUNT or len(link.states) < COUNT:
@@ -259,13 +253,8 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
             if state is not None:
                 assert (state["observation"] == state["command"]).all()
                 seen += 1
-        assert process.wait(30) == 0
+        assert process.wait() == 0
     finally:
         process.kill()
-        process.wait()
     assert seen > 0
     assert remote.refresh()["command"] == COUNT
-
-
-if __name__ == "__main__":
-    write_commands(Path(sys.argv[1]))

@@ -26,6 +26,7 @@ from bhd_lerobot.realtime.privileges import (
     RealtimeSettings,
     SystemCalls,
 )
+from tests.cases import each_case
 
 FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 NAMES = ["collector", "memory lock", "cpu latency", "timer slack", "scheduler"]
@@ -117,9 +118,6 @@ def one_cpu() -> tuple[int, ...]:
     return (min(os.sched_getaffinity(0)),)
 
 
-# --- settings --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("priority", [0, 100, -1, True, 80.0])
 def test_a_priority_that_there_is_not_is_refused(priority: Any) -> None:
     with pytest.raises(ConfigError, match=f"{priority!r}; it must be a whole number from 1 to 99"):
@@ -129,9 +127,6 @@ def test_a_priority_that_there_is_not_is_refused(priority: Any) -> None:
 def test_a_processor_that_there_is_not_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"processor\(s\) 4096; this process may run on .*Leave the affinity empty"):
         RealtimeSettings(affinity=(*one_cpu(), 4096))
-
-
-# --- a faked kernel --------------------------------------------------------------------------------------------------
 
 
 def test_everything_is_granted_and_given_back(collections: list[int]) -> None:
@@ -167,62 +162,54 @@ def test_only_wanted_privileges_are_requested() -> None:
     assert kernel.state == INITIAL
 
 
-@pytest.mark.parametrize("name", ["affinity", "memory lock", "cpu latency", "timer slack", "scheduler"])
-def test_one_refusal_is_reported_with_a_remedy_and_stops_nothing_else(name: str) -> None:
-    kernel = FakeKernel(name, capabilities=())
-    with Privileges(kernel) as privileges:
-        grants = privileges.acquire(RealtimeSettings(affinity=one_cpu()))
-        # Without the capability and within a limit, what comes later is not locked, so that is a refusal, too.
-        refused = {name, "memory lock"}
-        assert {grant.name for grant in grants if not grant.granted} == refused
-        grant = next(grant for grant in grants if grant.name == name)
-        assert "Operation not permitted" in grant.detail
-        assert grant.remedy
-    assert kernel.state == INITIAL
-
-
-def test_without_the_right_the_fall_back_is_named_with_every_way_to_the_right() -> None:
-    kernel = FakeKernel("scheduler", capabilities=())
-    with Privileges(kernel) as privileges:
-        grant = privileges.acquire(RealtimeSettings(priority=97))[-1]
-        assert kernel.state["scheduler"] == (os.SCHED_OTHER, 0)
-        assert kernel.state["slack"] == 1
-    assert "SCHED_OTHER with a timer slack of 1 ns" in grant.detail
-    for part in (
-        f"setcap cap_sys_nice,cap_ipc_lock+ep {os.path.realpath(sys.executable)}",
-        "@realtime - rtprio 97",  # a limit of 95 would not do for this priority
-        "--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio=97 --ulimit memlock=-1",
-    ):
-        assert part in grant.remedy
-
-
-@pytest.mark.parametrize(
-    ("capabilities", "limit"), [((CAP_SYS_NICE,), 0), ((), 80), ((), 95), ((), resource.RLIM_INFINITY)]
+MEMORY = "memory lock"  # without the right and within a limit, what comes later is not locked: a refusal, too
+NO_RIGHT = (
+    "Operation not permitted",
+    "SCHED_OTHER with a timer slack of 1 ns",
+    f"setcap cap_sys_nice,cap_ipc_lock+ep {os.path.realpath(sys.executable)}",
+    "@realtime - rtprio 97",  # a limit of 95 would not do for this priority
+    "--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio=97 --ulimit memlock=-1",
 )
-def test_a_refusal_despite_the_right_names_control_groups(capabilities: tuple[int, ...], limit: int) -> None:
-    with Privileges(FakeKernel("scheduler", capabilities=capabilities, limit=limit)) as privileges:
-        assert privileges.acquire(RealtimeSettings())[-1].remedy == GRANT_BANDWIDTH
+NICE, LOCK, INFINITE = (CAP_SYS_NICE,), (CAP_IPC_LOCK,), resource.RLIM_INFINITY
 
 
-def test_a_limit_below_the_priority_is_no_right() -> None:
-    with Privileges(FakeKernel("scheduler", capabilities=(), limit=79)) as privileges:
-        assert "setcap" in privileges.acquire(RealtimeSettings())[-1].remedy
-
-
-def test_within_a_limit_future_memory_is_not_locked_because_an_allocation_could_then_fail() -> None:
-    kernel = FakeKernel(capabilities=(CAP_SYS_NICE,), limit=8192 * 1024)
+@each_case(
+    ("kernel", "settings", "refused", "parts"),
+    [
+        (FakeKernel("affinity", capabilities=()), {"affinity": one_cpu()}, {"affinity", MEMORY}, ("not permitted",)),
+        (FakeKernel(MEMORY, capabilities=()), {}, {MEMORY}, ("not permitted",)),
+        (FakeKernel("cpu latency", capabilities=()), {}, {"cpu latency", MEMORY}, ("not permitted",)),
+        (FakeKernel("timer slack", capabilities=()), {}, {"timer slack", MEMORY}, ("not permitted",)),
+        (
+            FakeKernel("scheduler", capabilities=()),
+            {"priority": 97},
+            {"scheduler", MEMORY},
+            ("not permitted", *NO_RIGHT),
+        ),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=79), {}, {"scheduler"}, ("setcap",)),  # below the priority
+        # With the right: control groups.
+        (FakeKernel("scheduler", limit=0), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=80), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=LOCK, limit=95), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        (FakeKernel("scheduler", capabilities=(), limit=INFINITE), {}, {"scheduler"}, (GRANT_BANDWIDTH,)),
+        # An allocation could fail if future memory was locked within a limit.
+        (FakeKernel(capabilities=NICE, limit=8192 * 1024), {}, {MEMORY}, ("8192 KiB", "memlock")),
+        (FakeKernel("cpu latency"), {}, {"cpu latency"}, (GRANT_LATENCY_FILE,)),
+        (FakeKernel("cpu latency", MEMORY), {"require": True}, {"cpu latency", MEMORY}, ("not permitted",)),
+    ],
+)
+def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(
+    kernel: FakeKernel, settings: dict[str, Any], refused: set[str], parts: tuple[str, ...]
+) -> None:
     with Privileges(kernel) as privileges:
-        grant = next(g for g in privileges.acquire(RealtimeSettings()) if g.name == "memory lock")
-        assert kernel.state["locked"] == MCL_CURRENT
-    assert not grant.granted
-    assert "8192 KiB" in grant.detail
-    assert "memlock" in grant.remedy
-
-
-def test_the_latency_file_has_a_remedy_of_its_own() -> None:
-    with Privileges(FakeKernel("cpu latency")) as privileges:
-        refused = [grant for grant in privileges.acquire(RealtimeSettings()) if not grant.granted]
-    assert [grant.remedy for grant in refused] == [GRANT_LATENCY_FILE]
+        grants = privileges.acquire(RealtimeSettings(**settings))
+        assert {grant.name for grant in grants if not grant.granted} == refused
+        assert all(bool(grant.remedy) != grant.granted for grant in grants)
+        said = "\n".join(f"{grant.detail} {grant.remedy}" for grant in grants if not grant.granted)
+        assert [part for part in parts if part not in said] == []
+        assert kernel.state["locked"] == (MCL_CURRENT if MEMORY in refused - kernel.refused else kernel.state["locked"])
+        assert kernel.state["scheduler"] == ((os.SCHED_OTHER, 0) if "scheduler" in refused else (FIFO, 80))
+    assert kernel.state == INITIAL
 
 
 def test_a_required_and_refused_scheduler_is_an_error_and_everything_is_given_back() -> None:
@@ -230,11 +217,6 @@ def test_a_required_and_refused_scheduler_is_an_error_and_everything_is_given_ba
     with pytest.raises(RealtimeError, match=r"SCHED_FIFO priority 80.*refused.*setcap.*require_realtime = false"):
         Privileges(kernel).acquire(RealtimeSettings(require=True))
     assert kernel.state == INITIAL
-
-
-def test_requiring_concerns_the_scheduler_only() -> None:
-    with Privileges(FakeKernel("cpu latency", "memory lock")) as privileges:
-        assert privileges.acquire(RealtimeSettings(require=True))[-1].granted
 
 
 def test_after_an_unexpected_error_everything_is_given_back() -> None:
@@ -273,8 +255,6 @@ def test_a_collector_that_was_off_stays_off() -> None:
     finally:
         gc.enable()
 
-
-# --- the real kernel, in a child process -----------------------------------------------------------------------------
 
 # Gives up the right to real-time priorities, as an ordinary user has none. Needs no right itself.
 GIVE_UP = """
@@ -319,25 +299,12 @@ REPORT = """
         unwanted=sorted({"torch", "lerobot", "mujoco"} & set(sys.modules)),
     )))
 """
-REQUIRE = """
-    Privileges().acquire(RealtimeSettings(require=True))
-"""
-
-
-def run(*parts: str) -> subprocess.CompletedProcess[str]:
-    program = "".join(textwrap.dedent(part) for part in parts)
-    return subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-        stdin=subprocess.DEVNULL,
-        cwd=Path(__file__).resolve().parents[2],
-    )
 
 
 def report(*parts: str) -> dict[str, Any]:
-    done = run(*parts)
+    program = "".join(textwrap.dedent(part) for part in parts)
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -358,13 +325,6 @@ def test_a_process_without_the_right_falls_back_and_names_the_remedy() -> None:
     # What needs no right is granted all the same.
     assert all(result["grants"][name]["granted"] for name in ("affinity", "collector", "timer slack"))
     assert result["collecting"] == [False, True]
-
-
-def test_a_process_without_the_right_that_requires_it_ends_with_an_error() -> None:
-    done = run(GIVE_UP, START, REQUIRE)
-    assert done.returncode != 0
-    assert "RealtimeError: SCHED_FIFO priority 80, reset on fork is required and was refused." in done.stderr
-    assert "setcap" in done.stderr
 
 
 def test_a_process_has_what_its_grants_say_and_gives_it_back() -> None:

@@ -7,38 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
-from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
-from tests.control import support
-from tests.control.goal_rig import ARM, HOME, HZ, joints
+from tests.control import arm_rig, support
+from tests.control.goal_rig import HZ, joints
 
 TICK_NS = NANOSECONDS // HZ
-
-
-class ObedientArm(Plant):
-    """A plant that is where it is commanded to be."""
-
-    n = 1
-
-    def __init__(self) -> None:
-        self.controller: ArmController | None = None
-        self.fault = False
-
-    def read(self, out: PlantReading) -> None:
-        out.position[:] = HOME if self.controller is None else self.controller.command
-        out.velocity[:] = 0.0 if self.controller is None else self.controller.velocity
-        out.safety[:] = self.fault
-
-    def write(self, ctrl: NDArray[np.float64]) -> None:
-        assert np.isfinite(ctrl).all()
 
 
 class Pair:
@@ -46,11 +24,7 @@ class Pair:
 
     def __init__(self, capacity: int = 4, events: int = 4, active: bool = True) -> None:
         self.now_ns, self.alive = 0, True
-        plant, controller = ObedientArm(), ArmController(ARM, 1, HZ, HZ // 50)
-        controller.configure(np.array([0]), self.reading(plant))
-        plant.controller = controller
-        self.plant = plant
-        self.cerebellum = Cerebellum(ARM, plant, HZ, controller=controller)
+        self.cerebellum = arm_rig.Rig(active=False).cerebellum
         blocks = [bytearray(Mailbox.nbytes(dtype, size)) for dtype, size in self.shapes(capacity, events)]
         ours, theirs = (
             [Mailbox(*shape, block) for shape, block in zip(self.shapes(capacity, events), blocks, strict=True)]
@@ -66,12 +40,6 @@ class Pair:
     @staticmethod
     def shapes(capacity: int, events: int) -> list[tuple[np.dtype, int]]:
         return [(request_dtype(6), capacity), (EVENT_DTYPE, events)]
-
-    @staticmethod
-    def reading(plant: ObedientArm) -> PlantReading:
-        reading = PlantReading(1, 7)
-        plant.read(reading)
-        return reading
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
@@ -98,37 +66,6 @@ class Pair:
 
 def goal(name: str, target: float = 0.2, **fields: Any) -> BrainCommand:
     return BrainCommand(name, joint_target=joints(target), **fields)
-
-
-# --- each kind of request --------------------------------------------------------------------------------------------
-
-
-def test_modes() -> None:
-    pair = Pair(active=False)
-    assert pair.client.request(Request.ACTIVATE) == Reason.WRONG_MODE
-    assert pair.client.request(Request.CONFIGURE) == Reason.ACCEPTED
-    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
-    assert pair.mode == Mode.HOLD
-    pair.cerebellum.estop.press()
-    pair.tick()
-    assert pair.client.request(Request.ACTIVATE) == Reason.ESTOP
-    assert pair.client.request(Request.RESET) == Reason.NOT_AT_REST
-    pair.tick(50)  # until it would have given way to what it touches
-    assert pair.client.request(Request.RESET) == Reason.ACCEPTED
-    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
-    assert pair.client.request(Request.DEACTIVATE) == Reason.ACCEPTED
-    pair.tick(2)
-    assert pair.mode == Mode.SAFE_OFF
-
-
-def test_goals_and_their_results() -> None:
-    pair = Pair()
-    assert pair.client.submit(goal("a")) is None
-    assert pair.client.submit(goal("b", 0.3)) is None
-    pair.rest()
-    assert pair.results() == [("a", ResultCode.SUCCEEDED), ("b", ResultCode.SUCCEEDED)]
-    assert pair.results() == []
-    assert pair.cerebellum.command[0, :6].tolist() == list(joints(0.3))
 
 
 @pytest.mark.parametrize(
@@ -199,9 +136,6 @@ def test_a_robot_without_goals_refuses_them_with_a_reason() -> None:
     assert "takes setpoints" in refusal.message
     assert client.cancel("a") == ResultCode.UNKNOWN_ID
     assert client.request(Request.DEACTIVATE) == Reason.ACCEPTED
-
-
-# --- who does not answer ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", RequestKind)
@@ -278,19 +212,12 @@ def test_a_reply_that_comes_too_late_is_not_taken_for_another_ones() -> None:
 def test_a_new_client_ignores_replies_to_an_earlier_one() -> None:
     pair = Pair()
     pair.client.submit(goal("a", 2.0))
-    pair.requests.post(pair_request(pair, 1))
+    record = np.zeros(1, request_dtype(6))[0]
+    record["number"], record["expires_ns"], record["mode"] = 1, pair.now_ns + NANOSECONDS, Request.ACTIVATE
+    pair.requests.post(record)
     pair.tick()
     later = RequestClient(pair.requests, pair.events, pair.tick, 0.1, lambda: pair.now_ns)
     assert later.cancel("nobody") == ResultCode.UNKNOWN_ID
-
-
-def pair_request(pair: Pair, number: int) -> Any:
-    record = np.zeros(1, request_dtype(6))[0]
-    record["number"], record["expires_ns"], record["mode"] = number, pair.now_ns + NANOSECONDS, Request.ACTIVATE
-    return record
-
-
-# --- laws ------------------------------------------------------------------------------------------------------------
 
 
 def test_results_wait_until_they_are_taken() -> None:

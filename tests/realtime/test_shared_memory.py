@@ -34,7 +34,6 @@ def name() -> Iterator[str]:
 
 
 def files(name: str) -> list[Path]:
-    """Return the files of blocks of a name."""
     return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
 
 
@@ -68,16 +67,6 @@ def test_sections_are_separate_zeroed_and_shared(name: str) -> None:
     other.close()
     assert name not in names()
     assert not files(name)
-
-
-def test_a_held_name_is_taken(name: str) -> None:
-    process = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
-    try:
-        with pytest.raises(RealtimeError, match="running already"):
-            SharedBlock.create(name, {"a": 8}, {})
-    finally:
-        kill(process)
-    SharedBlock.create(name, {"a": 8}, {}).close()
 
 
 def test_a_block_survives_its_maker_and_is_swept_after_its_last_holder(name: str) -> None:

@@ -16,8 +16,6 @@ START = {1: 1100, 2: 1500, 3: 2000, 4: 2500, 5: 2900, 6: 1234}  # encoder steps,
 
 
 class FakePort:
-    """A serial port that is open or not."""
-
     is_open = False
     is_using = False
 

@@ -21,7 +21,6 @@ KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
 RATES = Rates(500, 500, 25)
 START = np.array([0.50, 0.11, 0.35])  # of the tool, which points along x
 WALL = Shape("box", 0.65, 0.11, 0.0, 0.05, 0.3, 0.7)  # its face is at x = 0.60
-FINGERTIPS = 0.0125  # [m] how far they stand out beyond the tool centre point
 
 
 def forward_posture(place: Array = START) -> Array:
@@ -77,11 +76,9 @@ class Rig:
         return Mode(int(self.cerebellum.mode[0]))
 
     def wait(self, seconds: float) -> None:
-        """Let time go by without commands."""
         self.bridge.advance_ticks(round(seconds * 500))
 
     def keep(self, seconds: float) -> None:
-        """Send the target in every frame."""
         for _ in range(round(seconds * 25)):
             self.bridge.send(self.target)
             self.bridge.advance_frame()

@@ -247,50 +247,30 @@ def test_a_broken_robot_is_found(name, config):
         check_robot(lambda: broken(config, changes), adversarial=name in ADVERSARIAL)
 
 
-class MockRobot(Robot):
-    """What LeRobot's `tests.mocks.mock_robot.MockRobot` does, which is not part of its distribution.
+class MockRobot(GoodRobot):
+    """As in LeRobot's own tests: it returns the dict that it was given, and refuses a second `disconnect`."""
 
-    It returns the dict that it was given, and refuses a second `disconnect`.
-    """
-
-    config_class = RobotConfig
     name = "mock_robot"
     observation_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
     action_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
 
-    def __init__(self, config: RobotConfig, position: float = 40.0) -> None:
+    def __init__(self, config: RobotConfig) -> None:
         super().__init__(config)
-        self.cameras: dict[str, Any] = {}
-        self.is_on, self.position = False, position
+        self.cameras = {}
         self.arrived: list[dict[str, float]] = []
 
-    is_connected = property(lambda self: self.is_on)
-    is_calibrated = True
-
-    def connect(self, calibrate: bool = True) -> None:
-        if self.is_on:
-            raise DeviceAlreadyConnectedError
-        self.is_on = True
-
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_observation(self) -> dict[str, Any]:
-        if not self.is_on:
-            raise DeviceNotConnectedError
-        return dict.fromkeys(self.observation_features, self.position)
+        check_connected(self)
+        return dict.fromkeys(self.observation_features, 40.0)
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self.arrived.append(dict(action))
-        if not self.is_on:
-            raise DeviceNotConnectedError
+        check_connected(self)
         return action
 
     def disconnect(self) -> None:
-        if not self.is_on:
-            raise DeviceNotConnectedError
-        self.is_on = False
+        check_connected(self)
+        self._on = False
 
 
 def test_lerobots_mock_robot_gets_findings_and_only_holding_actions(config):

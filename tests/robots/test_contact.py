@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -13,6 +12,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from tests.robots.forces import Contacts
 
 FIRST = np.zeros(1, np.intp)
 LEAST = 0.003  # [m] in the hardest reversals an arm may come so near, of the 0.005 that goals keep
@@ -36,14 +36,12 @@ class Pusher:
         self.limits = self.watchdog = 0
         self.forces: list[float] = []
         self.faulty_since: int | None = None
-        self._model = arm.world.copy_model(0)
-        self._data = mujoco.MjData(self._model)
         if measures:
-            after = arm._after_tick
+            after, contacts = arm._after_tick, Contacts(arm)
 
             def measure() -> None:
                 after()
-                self.forces.append(self._force())
+                self.forces.append(contacts.force())
                 if self.faulty_since is None and self.mode == Mode.FAULT:
                     self.faulty_since = len(self.forces)
 
@@ -65,17 +63,6 @@ class Pusher:
         """How far the arm is from itself and from the table, whichever is less [m]."""
         q = self.arm.cerebellum.reading.position[:, :6]
         return min(float(one[0]) for one in self.arm.kinematics.collision.distances(q))
-
-    def _force(self) -> float:
-        """Return the sum of the normal forces between the arm and what it touches now [N]."""
-        self.arm.world.copy_into(0, self._model, self._data)
-        self._data.ctrl[:] = self.arm.world.ctrl[0]
-        mujoco.mj_forward(self._model, self._data)
-        wrench, total = np.zeros(6), 0.0
-        for contact in range(self._data.ncon):
-            mujoco.mj_contactForce(self._model, self._data, contact, wrench)
-            total += abs(wrench[0])
-        return total
 
 
 @pytest.mark.parametrize("where", [INTO_TABLE, INTO_ITSELF], ids=["table", "itself"])
@@ -114,6 +101,7 @@ def test_random_setpoints_touch_nothing_and_are_no_false_alarm() -> None:
     assert reached >= 3
 
 
+@pytest.mark.thorough(but=3)
 @pytest.mark.parametrize("where", [INTO_TABLE, INTO_ITSELF, INTO_BOX], ids=["table", "itself", "box"])
 @pytest.mark.parametrize("rate", [0.5, 1.5, 3.0])
 def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: float) -> None:
@@ -135,6 +123,36 @@ def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: flo
         for request in (Request.RESET, Request.ACTIVATE):
             assert pusher.arm.cerebellum.request(request).accepted.all()
         pusher.action = pusher.arm.cerebellum.command.copy()
+
+
+@pytest.mark.parametrize("cause", ["fault", "emergency stop"])
+def test_a_stopped_arm_lets_go_of_the_table_and_stays_so_after_reset_and_activate(cause: str) -> None:
+    pusher = Pusher(clearance=False, measures=True)
+    cerebellum: Any = pusher.arm.cerebellum
+    while not pusher.forces or pusher.forces[-1] < 60.0:
+        pusher.step(pusher.action + np.array(INTO_TABLE)[None] * 0.1 / 25)
+    if cause == "fault":
+        read, faults = cerebellum.plant.read, [True]
+
+        def broken(out: Any) -> None:
+            read(out)
+            out.safety[:] = bool(faults) and faults.pop()
+
+        cerebellum.plant.read = broken
+    else:
+        cerebellum.estop.press()
+    pusher.arm.step(None)
+    assert pusher.mode == (Mode.FAULT if cause == "fault" else Mode.ESTOP)
+    for _ in range(round(WITHIN_S * 25)):
+        pusher.arm.step(None)
+    assert pusher.forces[-1] < LIGHT_N
+    where = cerebellum.reading.position.copy()
+    for request in (Request.RESET, Request.ACTIVATE):
+        assert cerebellum.request(request).accepted.all()
+    for _ in range(50):
+        pusher.arm.step(None)
+    assert pusher.forces[-1] < LIGHT_N
+    assert np.abs(cerebellum.reading.position - where)[0, :6].max() < 0.01  # it has not moved on, nor sunk
 
 
 def test_a_goal_into_something_unknown_ends_and_lets_go() -> None:

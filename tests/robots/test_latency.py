@@ -58,32 +58,28 @@ class Line:
         return rows[:, 0].tolist()
 
 
-@given(st.lists(st.integers(0, MAX_LATENCY), min_size=1, max_size=5))
-def test_each_command_arrives_exactly_so_many_ticks_late_and_the_first_holds_until_then(latency: list[int]) -> None:
-    line = Line(latency)
-    line.write(80)
-    for sim, late in enumerate(latency):
-        assert line.arrived(sim) == [float(max(0, tick - late)) for tick in range(80)]
+@given(
+    st.lists(st.integers(0, MAX_LATENCY), min_size=3, max_size=3),
+    st.lists(st.tuples(st.integers(1, 60), st.integers(0, 2), st.integers(0, MAX_LATENCY)), max_size=4),
+)
+def test_each_command_arrives_so_many_ticks_late_and_the_first_of_an_episode_holds_until_then(
+    latency: list[int], episodes: list[tuple[int, int, int]]
+) -> None:
+    """Whatever the latency was before, and whatever the neighbours' are."""
+    line, begun, expected = Line(latency), [0, 0, 0], [[], [], []]
 
+    def write(ticks: int) -> None:
+        for tick in range(line.tick, line.tick + ticks):
+            for sim in range(3):
+                expected[sim].append(float(max(begun[sim], tick - latency[sim])))
+        line.write(ticks)
 
-def test_delayed_commands_do_not_cross_episodes() -> None:
-    line = Line([5, 3])
-    line.write(40)
-    line.late.set_latency(np.array([0]), [7])
-    line.write(40)
-    assert line.arrived(0)[40:] == [float(max(40, tick - 7)) for tick in range(40, 80)]
-    assert line.arrived(1) == [float(max(0, tick - 3)) for tick in range(80)]  # and the neighbour notices nothing
-
-
-@pytest.mark.parametrize("change", [([0], [4]), ([1], [0]), ([0, 1], [0, 0]), ([0, 1], [25, 1])])
-def test_switching_on_and_off_is_between_two_ticks(change: tuple[list[int], list[int]]) -> None:
-    sims, latency = change
-    line = Line([0, 6])
-    line.write(30)
-    line.late.set_latency(np.array(sims), latency)
-    line.write(60)
-    for sim, late in zip(sims, latency, strict=True):
-        assert line.arrived(sim)[30:] == [float(max(30, tick - late)) for tick in range(30, 90)]
+    for ticks, sim, late in episodes:
+        write(ticks)
+        line.late.set_latency(np.array([sim]), [late])
+        begun[sim], latency[sim] = line.tick, late
+    write(80)
+    assert [line.arrived(sim) for sim in range(3)] == expected
 
 
 def test_the_command_may_be_the_same_array_every_time() -> None:
@@ -113,8 +109,6 @@ def test_invalid_latencies_are_refused(ticks: int) -> None:
     line.write(20)
     assert line.arrived(0) == line.arrived(1) == [float(max(0, tick - 3)) for tick in range(20)]
 
-
-# --- what is late is not blocked -------------------------------------------------------------------------------------
 
 SIMS = 4
 SPREAD = np.array([2.5, 0.2, 0.5, 1.5, 1.5, 2.5])  # [rad] of targets beside home, clear of the table

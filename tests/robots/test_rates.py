@@ -22,6 +22,7 @@ def start(n: int, control_hz: int, physics_hz: int, fixtures: tuple[Shape, ...] 
     return arm
 
 
+@pytest.mark.thorough(but=2)
 @pytest.mark.parametrize(("control_hz", "physics_hz"), RATES)
 def test_at_any_rates_free_goals_succeed_and_press_on_nothing(control_hz: int, physics_hz: int) -> None:
     arm, rng, codes, most = start(POSTURES, control_hz, physics_hz), np.random.default_rng(1), [], 0.0
@@ -38,6 +39,7 @@ def test_at_any_rates_free_goals_succeed_and_press_on_nothing(control_hz: int, p
     assert most < MOST_FREE_N
 
 
+@pytest.mark.thorough(but=2)
 @pytest.mark.parametrize(("control_hz", "physics_hz"), RATES)
 def test_at_any_rates_an_arm_that_presses_on_something_stops(control_hz: int, physics_hz: int) -> None:
     arm = start(1, control_hz, physics_hz, BOX)

@@ -20,18 +20,6 @@ from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
 
 
-def test_poses_agree_with_scipy() -> None:
-    rng = np.random.default_rng(0)
-    for rotation in Rotation.random(50, rng=rng):
-        x, y, z, w = rotation.as_quat()
-        sign = rng.choice([-1, 1])  # a quaternion and its negative are one orientation
-        matrix, problem = pose_matrices(np.array([1.0, 2.0, 3.0, *(sign * np.array([w, x, y, z]))]))
-        assert problem is None
-        assert matrix[:3, 3].tolist() == [1, 2, 3]
-        assert np.allclose(matrix[:3, :3], rotation.as_matrix(), atol=1e-12)
-        assert matrix[3].tolist() == [0, 0, 0, 1]
-
-
 def test_quaternions_near_unit_length_are_normalised_and_others_refused() -> None:
     unit = np.array([0.5, 0.5, -0.5, 0.5])
     expected, _ = pose_matrices(np.array([0, 0, 0, *unit]))
@@ -140,18 +128,6 @@ def test_an_arm_whose_poses_are_refused_stops_at_the_time_out(simulation) -> Non
     assert not report.limits[0] & Limit.NON_FINITE
 
 
-def test_the_arm_takes_the_posture_nearest_to_where_it_is(simulation) -> None:
-    action = start(simulation)
-    joints = simulation.cerebellum.command[0, :6].copy()
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        action[:, :3] += rng.uniform(-0.01, 0.01, 3)
-        simulation.step(action)
-        now = simulation.cerebellum.command[0, :6].copy()
-        assert np.abs(now - joints).max() < 0.15  # no other branch of the inverse kinematics
-        joints = now
-
-
 def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
     """Turned far enough about any axis the arm comes to a singular posture, and then to another branch.
 
@@ -168,8 +144,7 @@ def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
     for frame in (*frames, *frames[::-1]):
         for sim, (axis, rotation) in enumerate(zip(axes, first, strict=True)):
             turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * 0.6 * frame / simulation.rates.fps)
-            x, y, z, w = Rotation.from_matrix(turn.as_matrix() @ rotation).as_quat()
-            action[sim, 3:7] = w, x, y, z
+            action[sim, 3:7] = Rotation.from_matrix(turn.as_matrix() @ rotation).as_quat(scalar_first=True)
         report = simulation.step(action)
         off = np.maximum(off, np.linalg.norm(simulation.truth().tool_pose[:, :3] - place, axis=1))
         now = report.sent.reasons == Reason.NO_POSTURE
@@ -188,10 +163,8 @@ def test_the_last_joint_does_not_unwind_by_a_turn() -> None:
     rotation = pose_matrices(action[0, :7])[0][:3, :3]
     last, most = simulation.cerebellum.command[0, 5], 0.0
     for frame in range(700):  # 11 rad about the tool's own axis: beyond the joint's range
-        x, y, z, w = Rotation.from_matrix(
-            rotation @ Rotation.from_rotvec([0, 0, 0.4 * frame / 25]).as_matrix()
-        ).as_quat()
-        action[0, 3:7] = w, x, y, z
+        turned = rotation @ Rotation.from_rotvec([0, 0, 0.4 * frame / 25]).as_matrix()
+        action[0, 3:7] = Rotation.from_matrix(turned).as_quat(scalar_first=True)
         report = simulation.step(action)
         now = simulation.cerebellum.command[0, 5]
         most, last = max(most, abs(now - last)), now
@@ -209,8 +182,8 @@ def test_the_poses_of_a_chunk_follow_each_other() -> None:
     rotation = pose_matrices(action[0, :7])[0][:3, :3]
     rows = []
     for frame in range(60):  # 2.4 rad, in steps of 0.04
-        x, y, z, w = Rotation.from_matrix(rotation @ Rotation.from_rotvec([0, 0, 0.04 * frame]).as_matrix()).as_quat()
-        rows.append([[*action[0, :3], w, x, y, z, action[0, 7]]])
+        turned = Rotation.from_matrix(rotation @ Rotation.from_rotvec([0, 0, 0.04 * frame]).as_matrix())
+        rows.append([[*action[0, :3], *turned.as_quat(scalar_first=True), action[0, 7]]])
     report = simulation.step(Chunk(np.array(rows)))
     assert report.sent.accepted.all()
     for _ in range(70):

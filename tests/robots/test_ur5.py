@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
-from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.errors import CommandRefusedError, ConfigError, RenderingError
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
@@ -56,20 +55,6 @@ def test_features_are_the_joints_and_the_gripper(robot):
     assert names[7:] == [name.replace(".pos", ".vel") for name in names[:7]]
 
 
-def test_bad_actions_are_refused_and_nothing_happens(robot):
-    before, now = robot.simulation.physics_state, robot.simulation.bridge.now_ns
-    for change, message in (
-        ({"elbow.pos": None}, "not a number"),
-        ({"elbow.pos": math.nan}, "'elbow.pos' is nan"),
-        ({"gripper.pos": math.inf}, "'gripper.pos' is inf"),
-        ({"elbo.pos": 1.0}, "Did you mean 'elbow.pos'"),
-    ):
-        with pytest.raises(ActionError, match=message):
-            robot.send_action({**stay(robot), **change})
-    assert np.array_equal(robot.simulation.physics_state, before)
-    assert robot.simulation.bridge.now_ns == now
-
-
 def test_a_setpoint_is_approached_within_the_limits_and_reached(robot):
     target = stay(robot)
     target["elbow.pos"] += 0.5
@@ -85,15 +70,6 @@ def test_a_setpoint_is_approached_within_the_limits_and_reached(robot):
     assert 0.5 < max(speeds) < math.pi
 
 
-def test_a_stream_of_small_steps_is_followed_without_a_lag(robot):
-    start = stay(robot)
-    for frame in range(1, 26):
-        action = {**start, "shoulder_pan.pos": start["shoulder_pan.pos"] + 0.02 * frame}
-        applied = robot.send_action(action)
-    assert applied["shoulder_pan.pos"] == pytest.approx(action["shoulder_pan.pos"], abs=1e-3)
-    assert robot.get_observation()["shoulder_pan.vel"] == pytest.approx(0.02 * 25, rel=0.05)
-
-
 def test_out_of_range_is_clipped_to_the_range_and_no_faster_than_the_limits(robot):
     before = stay(robot)
     applied = robot.send_action({**before, "gripper.pos": 99.0, "elbow.pos": 1e9})
@@ -102,77 +78,30 @@ def test_out_of_range_is_clipped_to_the_range_and_no_faster_than_the_limits(robo
     assert 0 < applied["elbow.pos"] - before["elbow.pos"] <= 10 * 0.002**2 * 20 * 21 / 2 + 1e-9
 
 
-def test_without_new_setpoints_it_decelerates_and_holds(robot):
-    start = stay(robot)
-    for frame in range(1, 6):
-        robot.send_action({**start, "shoulder_pan.pos": start["shoulder_pan.pos"] + 0.04 * frame})
-    bridge = robot.simulation.bridge
-    modes = []
-    for _ in range(25):
-        bridge.advance_frame()
-        modes.append(Mode(int(bridge.state().mode[0])))
-    # The frame of the last setpoint is over when the first of these begins; 100 ms after that its age is too much.
-    assert modes[:2] == [Mode.TRACKING] * 2
-    assert Mode.STOPPING in modes or Mode.HOLD in modes[2:5]
-    assert modes[-1] == Mode.HOLD
-    assert not bridge.state().is_moving[0]
-
-
 def test_an_emergency_stop_ends_a_goal_and_refuses_everything_until_reset_and_activate(robot):
-    bridge = robot.simulation.bridge
-    home = robot.simulation.body.home
-    goal = BrainCommand("a", joint_target=(home[0] - 1.0, *home[1:6]))
-    assert bridge.submit(goal) is None
+    bridge, home = robot.simulation.bridge, robot.simulation.body.home
+    assert bridge.submit(BrainCommand("a", joint_target=(home[0] - 1.0, *home[1:6]))) is None
     for _ in range(10):
         bridge.advance_frame()
     assert bridge.state().is_moving[0]
     robot.estop()
     for _ in range(15):
         bridge.advance_frame()
-    (result,) = bridge.take_results()
-    assert (result.task_id, result.success, result.code) == ("a", False, ResultCode.ESTOP)
-    state = bridge.state()
-    assert state.emergency_stop[0]
-    assert not state.is_moving[0]
-    refusal = bridge.submit(BrainCommand("b", joint_target=home[:6]))
-    assert refusal is not None
-    assert refusal.code == ResultCode.ESTOP
-    assert "reset()" in refusal.message
+    assert [(result.task_id, result.code) for result in robot.take_results()] == [("a", ResultCode.ESTOP)]
+    assert bridge.state().emergency_stop[0]
+    assert not bridge.state().is_moving[0]
     with pytest.raises(CommandRefusedError, match="emergency stop is latched"):
         robot.send_action(stay(robot))
     robot.reset()
-    refusal = bridge.submit(BrainCommand("c", joint_target=home[:6]))
-    assert refusal is not None
-    assert refusal.code == ResultCode.NOT_ACTIVE
-    robot.activate()
-    bridge.take_results()
-    assert bridge.submit(BrainCommand("d", joint_target=home[:6])) is None
+    for code in (ResultCode.NOT_ACTIVE, None):
+        refusal = bridge.submit(BrainCommand(str(code), joint_target=home[:6]))
+        assert (refusal and refusal.code) == code
+        if code:
+            robot.activate()
     for _ in range(60):
         bridge.advance_frame()
-    assert [one.code for one in bridge.take_results()] == [ResultCode.SUCCEEDED]
+    assert [one.code for one in robot.take_results()] == [ResultCode.NOT_ACTIVE, ResultCode.SUCCEEDED]
     assert bridge.state().joint_positions[0] == pytest.approx(home, abs=1e-3)
-
-
-def test_a_goal_tracks_then_holds_and_a_setpoint_takes_over(robot):
-    bridge = robot.simulation.bridge
-    assert bridge.submit(BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), DOWN))) is None
-    bridge.advance_frame()
-    assert bridge.state().mode[0] == Mode.TRACKING
-    for _ in range(40):
-        bridge.advance_frame()
-    assert bridge.state().mode[0] == Mode.HOLD
-    assert bridge.take_results()[0].success
-    tool = robot.simulation.truth().tool_pose[0]
-    assert tool[:3] == pytest.approx((0.4, 0.1, 0.3), abs=5e-4)
-    bridge.submit(BrainCommand("b", target_pose=Pose((0.5, -0.2, 0.3), DOWN)))
-    for _ in range(8):
-        bridge.advance_frame()
-    before = bridge.state().command[0]
-    applied = robot.send_action(stay(robot))
-    assert [one.code for one in robot.take_results()] == [ResultCode.REPLACED_BY_SETPOINT]
-    assert robot.take_results() == []
-    moved = np.abs(np.array(list(applied.values())) - before)
-    assert (moved[:6] < math.pi * 0.04).all()
 
 
 @pytest.mark.parametrize(
@@ -282,60 +211,6 @@ def test_an_impedance_with_too_much_latency_is_refused():
     late = TableScene("empty", (), simulation.body.home, variation=Variation(latency_s=0.011))
     with pytest.raises(ConfigError, match=r"latency_s is 0\.011"):
         simulation.reset(FIRST, [late], [0])
-
-
-def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
-    simulation = robot.simulation
-    simulation.cerebellum.controller.setpoints.clearance = None
-    start = simulation.cerebellum.command.copy()
-    down = start.copy()
-    down[0, 1] += 1.0  # the shoulder lowers the arm into the table
-    reports = []
-    for _ in range(60):
-        reports.append(simulation.step(down))
-        if reports[-1].mode[0] == Mode.FAULT:
-            break
-    assert reports[-1].watchdog[0] & Watchdog.FORCE
-    assert simulation.truth().arm_on_table[0]
-    for _ in range(40):
-        simulation.bridge.advance_frame()
-    state = simulation.bridge.state()
-    assert np.abs(state.command[0, :6] - state.joint_positions[0, :6]).max() < 0.02  # it does not press any more
-    assert (np.abs(state.joint_efforts[0]) <= np.array(simulation.body.limits.effort) + 1e-9).all()
-    with pytest.raises(CommandRefusedError, match="fault is latched"):
-        robot.send_action(stay(robot))
-    robot.reset()
-    robot.activate()
-    up = dict(zip(JOINT_ACTIONS, start[0].tolist(), strict=True))
-    for _ in range(60):
-        robot.send_action(up)
-    assert simulation.bridge.state().joint_positions[0] == pytest.approx(start[0], abs=2e-3)
-
-
-def test_invalid_goals_end_with_a_code(robot):
-    bridge = robot.simulation.bridge
-    for number, (goal, code) in enumerate(
-        (
-            ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),
-            ({"max_velocity": 1e-3}, ResultCode.PLANNING_FAILED),
-            ({"max_acceleration": 1e-6}, ResultCode.PLANNING_FAILED),
-            ({"max_velocity": 1e-4, "motion": "line"}, ResultCode.PLANNING_FAILED),
-            ({"timeout_s": 1e17}, ResultCode.BAD_TIMEOUT),
-            ({"preempt": "no"}, ResultCode.BAD_TARGET),
-            ({"target_pose": (0.3, 0.2, 0.4)}, ResultCode.BAD_TARGET),
-            ({"target_pose": np.eye(4)}, ResultCode.BAD_TARGET),
-        )
-    ):
-        fields = {"task_id": f"bad {number}", "target_pose": Pose((0.4, 0.1, 0.3), DOWN), **goal}
-        refusal = bridge.submit(BrainCommand(**fields))
-        bridge.advance_frame()
-        results = bridge.take_results()
-        assert [result.code for result in results] == [code]
-        assert refusal in (None, results[0])
-        assert bridge.submit(BrainCommand(f"good {number}", gripper=0.05)) is None
-        for _ in range(20):
-            bridge.advance_frame()
-        assert bridge.take_results()[0].success
 
 
 def test_a_goal_for_an_unknown_arm_is_refused(robot):

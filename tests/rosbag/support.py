@@ -1,12 +1,14 @@
-"""Bags as a real TurtleBot3 leaves them, written with `rosbags` and nothing of ours."""
+"""Bags as a real TurtleBot3 leaves them, written with `rosbags` and nothing of ours, and what we read of them."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+
+from bhd_lerobot.rosbag.storage.find import find_bags
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 START = 1_700_000_000 * 10**9
@@ -101,9 +103,12 @@ def without(topic: str) -> Callable[[Message], bool]:
     return lambda message: message[0] != topic
 
 
-def write(path: Path, messages: list[Message], storage: str = "mcap") -> Path:
-    """Write a bag, messages in the order given."""
-    with Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+def write(path: Path, messages: list[Message], storage: str = "mcap", compression: str = "") -> Path:
+    """Write a bag, messages in the order given; compressed by file, message or storage."""
+    writer = Writer(path, version=9 if compression else 8, storage_plugin=StoragePlugin[storage.upper()])
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
         for topic, received, message in messages:
             kind = message.__msgtype__
@@ -111,3 +116,26 @@ def write(path: Path, messages: list[Message], storage: str = "mcap") -> Path:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], received, STORE.serialize_cdr(message, kind))
     return path
+
+
+TOPICS = tuple(sorted(PERIODS))
+
+
+def check(path: Path, messages: list[Message], *problems: str, whole: bool = True) -> int:
+    """Compare what is read with what was written, or with its beginning; return how many messages were read."""
+    (bag,) = find_bags(path)
+    topics, read, total = bag.topics, bag.read(TOPICS), 0
+    assert set(topics) <= set(TOPICS)
+    for topic in TOPICS:
+        wanted = [(at, bytes(STORE.serialize_cdr(one, one.__msgtype__))) for name, at, one in messages if name == topic]
+        found = read[topic]
+        count = len(found.data)
+        total += count
+        assert list(zip(found.received.tolist(), found.data, strict=True)) == wanted[:count]
+        assert (np.diff(found.order) > 0).all()
+        assert topics[topic].count == count if topic in topics else not count
+        assert count == len(wanted) or not whole
+        assert [payload for *_, payload in bag.messages((topic,))] == [payload for _, payload in wanted[:count]]
+    assert len(bag.problems) == len(problems), bag.problems
+    assert all(part in problem for part, problem in zip(problems, bag.problems, strict=True)), bag.problems
+    return total

@@ -35,6 +35,7 @@ def acted(world: World, model: mujoco.MjModel, velocity: np.ndarray) -> np.ndarr
     return inertia @ change + bias - sum(others)
 
 
+@pytest.mark.thorough(but=2)
 @pytest.mark.parametrize("body", [ur5(), turtlebot3_burger()], ids=lambda body: body.name)
 @pytest.mark.parametrize(("physics_hz", "steps"), RATES)
 def test_the_mean_effort_is_what_changed_the_momentum(body, physics_hz: int, steps: int) -> None:

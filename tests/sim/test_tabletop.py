@@ -1,7 +1,7 @@
 """The table and what lies on it: every simulation has its own, and nobody else's."""
 
-import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import mujoco
@@ -12,11 +12,16 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import BrainCommand
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
+from tests.cases import each_case
+from tests.control.goal_rig import KINEMATICS, pose
 
 BODY = ur5()
 HOME = np.array(BODY.home)
@@ -84,9 +89,6 @@ def everything(world: World, table: Tabletop, sim: int) -> bytes:
     return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
 
 
-# --- determinism -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def five() -> list[bytes]:
     world, table = laid(5, threads=2)
@@ -114,20 +116,6 @@ def test_an_episode_does_not_depend_on_the_one_before(five: list[bytes]) -> None
     assert all(expected.startswith(state) for state, expected in zip(states, five, strict=False))
 
 
-def test_a_restored_snapshot_goes_on_bit_exactly() -> None:
-    world, table = laid(3)
-    sweep(world, steps=15)
-    snapshot = world.snapshot()
-    sweep(world, 50, 10)
-    expected = [everything(world, table, sim) for sim in range(3)]
-    table.place([random_scene(seed) for seed in range(30, 33)])
-    elsewhere = World(BODY, 3, threads=1)
-    for target, at in ((world, table), (elsewhere, Tabletop(elsewhere))):
-        target.restore(snapshot)
-        sweep(target, 50, 10)
-        assert [everything(target, at, sim) for sim in range(3)] == expected
-
-
 def test_placing_some_leaves_the_others_alone() -> None:
     world, table = laid(4)
     sweep(world, steps=5)
@@ -135,9 +123,6 @@ def test_placing_some_leaves_the_others_alone() -> None:
     table.place([random_scene(40), random_scene(41)], np.array([1, 2]))
     after = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
     assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, False, True]
-
-
-# --- objects ---------------------------------------------------------------------------------------------------------
 
 
 def test_each_simulation_has_objects_of_its_own() -> None:
@@ -226,9 +211,6 @@ def test_friction_decides_whether_a_push_moves_an_object() -> None:
     world.model_field("opt.gravity")[:] = (0.5 * 9.81, 0, -9.81)
     world.step(250)
     assert (np.abs(table.object_poses[:, 0, 0] - 0.5) > 0.01).tolist() == [True, True, False, False]
-
-
-# --- surroundings ----------------------------------------------------------------------------------------------------
 
 
 def test_variations_reach_light_camera_and_fingers() -> None:
@@ -323,9 +305,6 @@ def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_diff
     np.testing.assert_array_equal(along.body_inertia, across.body_inertia)
 
 
-# --- touch -----------------------------------------------------------------------------------------------------------
-
-
 def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, bool, list[bool]]:
     """The flags of one simulation from its list of contacts: arm on table, on itself, on an object; gripper on each."""
     mujoco.mj_forward(model, data)
@@ -370,39 +349,6 @@ def test_the_flags_agree_with_the_list_of_contacts() -> None:
     assert ((share > 0.005) & (share < 0.9)).all(), share  # the test has seen each flag in both states
 
 
-def gap(a: np.ndarray, b: np.ndarray) -> float:
-    """Distance of two segments, each of shape (2, 3) [m], to a fraction of a millimetre."""
-    share = np.linspace(0, 1, 61)[:, None]
-    first, second = (each[0] + share * (each[1] - each[0]) for each in (a, b))
-    return float(np.linalg.norm(first[:, None] - second[None], axis=2).min())
-
-
-def test_the_arm_touches_itself_where_the_collision_checks_capsules_meet() -> None:
-    world = World(BODY, 300)
-    table = Tabletop(world)
-    rng = np.random.default_rng(4)
-    world.qpos[:, :6] = rng.uniform(-math.pi, math.pi, (300, 6))
-    world.qpos[:, 6:8] = 0.0425  # the fingers' capsules are those of an open gripper
-    world.forward()
-    both = np.zeros(2, int)
-    for sim in range(300):
-        frames = chain_frames(world.qpos[sim, :6])
-        segments = {
-            c.name: np.array([c.start, c.end]) @ frames[c.frame][:3, :3].T + frames[c.frame][:3, 3]
-            for c in BODY.chain.capsules
-        }
-        radius = {c.name: c.radius for c in BODY.chain.capsules}
-        gaps = {(a, b): gap(segments[a], segments[b]) - radius[a] - radius[b] for a, b in BODY.chain.disjoint}
-        # The fingers' capsules hold boxes that are a little slimmer, and stand out at the corners.
-        solid = min(value for pair, value in gaps.items() if not any(name.startswith("finger") for name in pair))
-        if table.self_contact[sim]:
-            assert min(gaps.values()) < BODY.chain.min_distance
-        else:
-            assert solid > -0.001
-        both[int(table.self_contact[sim])] += 1
-    assert both.min() > 20
-
-
 def test_closed_fingers_and_a_fold_at_home_touch_nothing() -> None:
     world = World(BODY)
     table = Tabletop(world)
@@ -430,35 +376,11 @@ def test_the_tool_pushed_down_stops_at_the_table() -> None:
     assert table.tool_pose[0, 2] > 0.0
 
 
-# --- grasp -----------------------------------------------------------------------------------------------------------
-
-
-def chain_frames(q: np.ndarray) -> list[np.ndarray]:
-    """The Denavit-Hartenberg frames 0 to 6 in the base frame, each of shape (4, 4)."""
-    frames, frame = [np.eye(4)], np.eye(4)
-    for angle, a, d, alpha in zip(q, BODY.chain.a, BODY.chain.d, BODY.chain.alpha, strict=True):
-        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
-        frame = frame @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
-        frames.append(frame)
-    return frames
-
-
-def chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tool pose, shape (4, 4), and its Jacobian, shape (6, 6), in the base frame."""
-    frames = chain_frames(q)
-    tool = frames[6].copy()
-    tool[:3, 3] += tool[:3, :3] @ BODY.chain.tool
-    axes = [(np.cross(f[:3, 2], tool[:3, 3] - f[:3, 3]), f[:3, 2]) for f in frames[:6]]
-    return tool, np.array([np.concatenate(axis) for axis in axes]).T
-
-
-def reach(position: np.ndarray, rotation: np.ndarray, q: np.ndarray, rounds: int) -> np.ndarray:
-    """Joint angles near q at which the tool is there."""
-    for _ in range(rounds):
-        tool, jacobian = chain(q)
-        turn = sum(np.cross(tool[:3, i], rotation[:, i]) for i in range(3)) / 2
-        q = q + np.linalg.solve(jacobian, np.concatenate([position - tool[:3, 3], turn]))
-    return q
+def tool_at(position: tuple[float, float, float]) -> np.ndarray:
+    """The frame of a tool that is there, and points down."""
+    frame = KINEMATICS.tool(HOME[:6])
+    frame[:3, 3] = position
+    return frame
 
 
 def test_what_is_gripped_does_not_slip() -> None:
@@ -470,9 +392,7 @@ def test_what_is_gripped_does_not_slip() -> None:
         TableObject("box", "red", 0.030, 0.025, 0.10, *spot, mass=0.3),
         TableObject("box", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
     )
-    down = chain(HOME[:6])[0][:3, :3]
-    way = [np.array([*spot, 0.05]), np.array([*spot, 0.20]), np.array([0.5, -0.20, 0.20])]
-    q = reach(way[0], down, HOME[:6], 20)
+    q = KINEMATICS.solve(tool_at((*spot, 0.05)), HOME[:6]).postures[0]
     world = World(BODY, 4)
     table = Tabletop(world)
     table.place([TableScene("", (thing,), (*q, 0.085)) for thing in things])
@@ -490,22 +410,18 @@ def test_what_is_gripped_does_not_slip() -> None:
         return np.array([table.object_poses[sim, 0, :3] - table.tool_pose[sim, :3] for sim in range(4)])
 
     start, slips = offset(), []
-    speed, acceleration, dt = 0.5, 2.5, 1 / BODY.physics_hz
-    for here, there in itertools.pairwise(way):
-        length, ramp = np.linalg.norm(there - here), speed / acceleration
-        seconds = length / speed + ramp
-        for k in range(1, math.ceil(seconds / dt) + 1):
-            t, left = k * dt, max(seconds - k * dt, 0.0)
-            if t < ramp:
-                done = acceleration * t * t / 2
-            else:
-                done = length - acceleration * left * left / 2 if left < ramp else speed * (t - ramp / 2)
-            before, q = q, reach(here + (there - here) * done / length, down, q, 2)
-            world.ctrl[:, :6] = q + LAG[:6] * (q - before) / dt
+    planner = GoalPlanner(BODY, BODY.physics_hz, KINEMATICS)
+    for there in ((*spot, 0.20), (0.5, -0.20, 0.20)):
+        goal = BrainCommand(
+            "a", target_pose=pose(tool_at(there)), motion="line", max_velocity=0.5, max_acceleration=2.5
+        )
+        plan = planner.plan(goal, [*q, 0.0], np.zeros(7), np.zeros(7))
+        assert isinstance(plan, Plan), plan
+        for k, (q, velocity) in enumerate(zip(plan.trajectory.position[:, :6], plan.trajectory.velocity, strict=True)):
+            world.ctrl[:, :6] = q + LAG[:6] * velocity[:6]
             world.step()
             if k % 20 == 0:
                 slips.append(np.linalg.norm(offset() - start, axis=1))
-    world.ctrl[:, :6] = q
     world.step(2 * BODY.physics_hz)
     slips.append(np.linalg.norm(offset() - start, axis=1))
     assert np.max(slips) < 0.002
@@ -513,9 +429,6 @@ def test_what_is_gripped_does_not_slip() -> None:
     assert (table.object_poses[:, 0, 2] > 0.19).all()
     assert table.finger_on_object[:, 0].all()
     assert not (table.arm_on_object | table.arm_on_table).any()
-
-
-# --- the plant, and what is for bases only ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("actuation", ["position", "torque"])
@@ -526,45 +439,34 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
     scenes = [random_scene(seed, 0) for seed in range(3)]
     table.place(scenes)
 
-    class Reading:
-        position = np.zeros((3, 7))
-        velocity = np.zeros((3, 7))
-        effort = np.zeros((3, 7))
-
-    plant.read(Reading)  # type: ignore[arg-type]
-    np.testing.assert_allclose(Reading.position, [scene.posture for scene in scenes], atol=1e-15)
-    np.testing.assert_array_equal(Reading.velocity, 0)
+    reading = PlantReading(3, 7)
+    plant.read(reading)
+    np.testing.assert_allclose(reading.position, [scene.posture for scene in scenes], atol=1e-15)
+    np.testing.assert_array_equal(reading.velocity, 0)
     command = np.arange(21.0).reshape(3, 7) / 100
     plant.write(command)
     for number, name in enumerate(world.body.actuators):  # type: ignore[attr-defined]
         np.testing.assert_array_equal(world.ctrl[:, world.model.actuator(name).id], command[:, number])
     world.step(5)
-    plant.read(Reading)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(Reading.velocity[:, 6], world.qvel[:, 6] + world.qvel[:, 7])
-    assert np.abs(Reading.velocity[:, 6]).min() > 0
+    plant.read(reading)
+    np.testing.assert_array_equal(reading.velocity[:, 6], world.qvel[:, 6] + world.qvel[:, 7])
+    assert np.abs(reading.velocity[:, 6]).min() > 0
 
 
-def test_what_is_for_bases_is_refused_to_arms_and_the_reverse() -> None:
-    arm, base = World(BODY), World(turtlebot3_burger())
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        _ = arm.base_pose
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.place([()])
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.rays("tool", np.array([[1.0, 0.0, 0.0]]))
-    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
-        arm.reset(poses=np.zeros((1, 3)))
-    with pytest.raises(SimulationError, match="is a MobileBase"):
-        Tabletop(base)
-    with pytest.raises(SimulationError, match="is a MobileBase"):
-        base.hold()
-
-
-def test_scenes_that_do_not_fit_are_refused() -> None:
-    table = Tabletop(World(BODY, 2))
-    with pytest.raises(SimulationError, match="1 scenes were given for 2"):
-        table.place([random_scene(0)])
-    with pytest.raises(SimulationError, match="posture"):
-        table.place([TableScene("short", (), (0.0,) * 6)], [0])
-    with pytest.raises(SimulationError, match="Did you mean 'tool'"):
-        table.world.site("toool")
+@each_case(
+    ("call", "message"),
+    [
+        (lambda arm: arm.base_pose, "'ur5' is a Arm"),
+        (lambda arm: arm.place([()]), "'ur5' is a Arm"),
+        (lambda arm: arm.rays("tool", np.array([[1.0, 0.0, 0.0]])), "'ur5' is a Arm"),
+        (lambda arm: arm.reset(poses=np.zeros((1, 3))), "'ur5' is a Arm"),
+        (lambda _: Tabletop(World(turtlebot3_burger())), "is a MobileBase"),
+        (lambda _: World(turtlebot3_burger()).hold(), "is a MobileBase"),
+        (lambda arm: Tabletop(arm).place([random_scene(0)] * 2), "2 scenes were given for 1"),
+        (lambda arm: Tabletop(arm).place([TableScene("short", (), (0.0,) * 6)], [0]), "posture"),
+        (lambda arm: arm.site("toool"), "Did you mean 'tool'"),
+    ],
+)
+def test_what_does_not_fit_a_body_or_its_scene_is_refused(call: Callable[[World], object], message: str) -> None:
+    with pytest.raises(SimulationError, match=message):
+        call(World(BODY))

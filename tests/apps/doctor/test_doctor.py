@@ -10,10 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bhd_lerobot.apps.doctor import checks, doctor, latency_test, trials
 from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status, wrong
@@ -64,8 +61,6 @@ PLUGINS = value(
 IMAGE = value({"spread": 70, "driver": "llvmpipe"})
 VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shared": None})
 
-
-# --- processes -------------------------------------------------------------------------------------------------------
 
 TRIALS = r"""
 import os, sys, time
@@ -141,54 +136,11 @@ def test_real_trials_are_understood() -> None:
         assert finding.found
 
 
-# --- the grid, on a virtual clock ------------------------------------------------------------------------------------
-
-
-class VirtualTime:
-    """A clock on which each sleep takes longer than requested by the next of some delays."""
-
-    def __init__(self, delays: list[int]) -> None:
-        self.now = 10**12
-        self.woken: list[int] = []
-        self._delays = iter(delays)
-
-    def clock(self) -> int:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9) + next(self._delays, 0)
-        self.woken.append(self.now)
-
-
-PERIOD = 1_000_000
-
-
-@given(st.lists(st.integers(0, 4 * PERIOD), max_size=40))
-def test_what_is_late_is_skipped_and_the_phase_is_kept(delays: list[int]) -> None:
-    points = 50
-    virtual = VirtualTime(delays)
-    lateness = latency_test.walk_grid(points, PERIOD, virtual.clock, virtual.sleep)
-    start = 10**12 + PERIOD
-    woken = np.array(virtual.woken)
-    assert len(lateness) == len(woken)
-    point, due = 0, []
-    for late in lateness:
-        due.append(point)
-        point += 1 + late // PERIOD
-    np.testing.assert_array_equal(woken - np.array(lateness), start + np.array(due) * PERIOD)
-    np.testing.assert_array_equal(lateness[: len(delays)], delays[: len(lateness)])
-    summary = latency_test.summarise(lateness, 1000, points)
-    assert sum(summary["histogram"]) + summary["missed"] == points
-
-
 def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:
     summary = latency_test.summarise([5_000] * 98 + [10_000, 10_001], 1000, 100)
     assert summary["histogram"] == [99, 1, *[0] * 9]
     assert (summary["p50"], summary["p99"], summary["max"]) == pytest.approx((5e-6, 10e-6, 10.001e-6))
     assert latency_test.summarise([11_000_000], 1000, 1)["histogram"][-1] == 1
-
-
-# --- a healthy machine -----------------------------------------------------------------------------------------------
 
 
 def kernel_folder(folder: Path, runtime: int = 950_000) -> Path:
@@ -284,9 +236,6 @@ def test_each_plugin_is_named_with_what_it_registered_or_why_it_failed(
     assert "'lerobot_robot_delta'" in causes[0]
     assert causes[1].startswith("The plug-in lerobot_camera_gamma cannot be imported")
     assert causes[1].endswith("ImportError: no driver")
-
-
-# --- what can be wrong -----------------------------------------------------------------------------------------------
 
 
 def installed(**versions: str | None) -> Callable[[str], str]:
@@ -449,12 +398,7 @@ def test_the_documentation_names_the_shares_and_rates() -> None:
     assert "TurtleBot3 200 Hz, 5 ms; UR5 500 Hz, 2 ms" in text
 
 
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
 class FakeTrials:
-    """Answers instead of processes."""
-
     def __init__(self, answers: dict[str, Outcome] | None = None) -> None:
         self.answers = {
             "rights": grants(),

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.monitor import monitor
-from bhd_lerobot.apps.monitor.monitor import Keys, find, watch
-from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Sampler, cells
+from bhd_lerobot.apps.monitor.monitor import Keys, find
+from bhd_lerobot.apps.monitor.state import Count, Sampler
 from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
@@ -34,6 +34,7 @@ from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
+from tests.realtime.test_shared_memory import files
 from tests.recording.support import options
 from tests.waiting import until
 
@@ -102,9 +103,6 @@ def only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor, "names", lambda: [name for name in names() if name.startswith(NAME)])
 
 
-# --- the block -------------------------------------------------------------------------------------------------------
-
-
 def test_who_watches_can_write_nothing_but_the_emergency_stop(robot: Robot) -> None:
     _, block = robot.sampler()
     with pytest.raises(ValueError, match="read-only"):
@@ -151,10 +149,6 @@ def test_who_watches_does_not_hold_the_name() -> None:
         LiveBlock.watch(f"{NAME}-held")
 
 
-def files(name: str) -> list[Path]:
-    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
-
-
 def test_what_nobody_holds_any_more_is_not_watched() -> None:
     name = f"{NAME}-dead"
     code = (
@@ -167,9 +161,6 @@ def test_what_nobody_holds_any_more_is_not_watched() -> None:
         SharedBlock.watch(name)
     shared_memory.sweep()
     assert not files(name)
-
-
-# --- states ----------------------------------------------------------------------------------------------------------
 
 
 def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
@@ -288,19 +279,6 @@ def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
     block.close()
 
 
-def test_every_tick_is_in_one_cell_of_the_histogram() -> None:
-    fine = np.arange(142)
-    shown = cells(fine)
-    assert len(shown) == DECADES * CELLS
-    assert sum(shown) == fine.sum()
-    assert shown[0] == 0 + 1 + 2 + 3 + 4
-    statistics = TimingStatistics(S)
-    for exponent in range(DECADES + 2):
-        statistics.add(0, 10 ** (exponent + 3) + 1, 10 ** (exponent + 3) + 2)
-    found = np.flatnonzero(cells(statistics.histograms[1])).tolist()
-    assert found == [0, 5, 10, 15, 20, 25, 29]
-
-
 def test_before_anything_is_published_there_is_something_to_show() -> None:
     layout = LiveLayout(2, np.dtype([("x", np.float64)]), 4, 4, {})
     made = layout.create(f"{NAME}-bare", {"robot": "ur5", "fps": 25, "control_hz": 500, "commands": []})
@@ -309,9 +287,6 @@ def test_before_anything_is_published_there_is_something_to_show() -> None:
     assert (shown.phase, shown.mode, shown.episode, shown.lateness) == ("STARTING", None, 0, None)
     block.close()
     made.close()
-
-
-# --- how robots end --------------------------------------------------------------------------------------------------
 
 
 def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
@@ -345,9 +320,6 @@ def test_a_robot_that_ends_while_it_is_watched(robot: Robot, capsys: pytest.Capt
         assert message in printed.err
         assert NAME in printed.out  # no terminal: a line now and then
         ender.cancel()
-
-
-# --- finding ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("only")
@@ -387,9 +359,6 @@ def test_bad_arguments_end_with_a_message_and_status_2(
     assert message in capsys.readouterr().err
 
 
-# --- without a terminal ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("only")
 def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
     robot.block.words[Word.PHASE] = Phase.STANDING
@@ -404,25 +373,6 @@ def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixtu
     assert (shown["id"], shown["mode"], shown["control_hz"]) == (NAME, "HOLD", 200)
     assert main(["--json", "--seconds=0.01"]) == 0
     assert [json.loads(line)["id"] for line in capsys.readouterr().out.splitlines()] == [NAME, NAME]
-
-
-def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
-    sampler, block = robot.sampler()
-    shown: list[Any] = []
-    with Keys(lambda: None, None) as keys:
-
-        def show(state: Any) -> None:
-            shown.append(state)
-            if len(shown) == 3:
-                keys.quit.set()
-
-        assert watch(sampler, show, keys, 0.001, float("inf")) is None
-        assert not keys.there
-    assert len(shown) == 3
-    block.close()
-
-
-# --- keys ------------------------------------------------------------------------------------------------------------
 
 
 # It is to be its controlling terminal, in whose foreground it is.

@@ -8,7 +8,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
 from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
-from bhd_lerobot.control.arm.wrench import ContactObserver, tool_wrench
+from bhd_lerobot.control.arm.wrench import ContactObserver
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
@@ -19,9 +19,6 @@ HZ = 500
 DYNAMICS = ArmDynamics(ARM)
 HOME = np.array(ARM.home)
 ALL = np.ones(1, np.bool_)
-
-
-# --- compliance ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.7, 1.0])
@@ -74,8 +71,6 @@ def test_a_compliance_cannot_be_changed_behind_its_checks() -> None:
         np.asarray(compliance.stiffness)[0, 0] = -1.0
 
 
-# --- equilibrium -----------------------------------------------------------------------------------------------------
-
 LIMITS = EquilibriumLimits()
 
 
@@ -125,49 +120,10 @@ def test_a_steady_stream_is_followed_without_a_lag() -> None:
     assert one.position[0, 0] == pytest.approx(target[0, 0], abs=3e-4)  # a tick's way
 
 
-def test_without_a_setpoint_it_brakes_and_stays() -> None:
-    one = equilibrium()
-    one.set_setpoint(np.array([[1.0, 0, 0]]), one.rotation.copy(), one.opening.copy(), ALL)
-    run(one, 500)
-    one.drop(ALL)
-    log = run(one, 500)
-    assert (np.diff(log["speed"][:, 0, 0]) <= 1e-12).all()
-    assert one.at_rest().all()
-    assert log["position"][-1][0, 0] - log["position"][0][0, 0] == pytest.approx(0.25**2 / 2, rel=0.02)
-
-
 @pytest.mark.parametrize("name", ["speed", "acceleration", "turn_speed", "turn_acceleration"])
 def test_impossible_limits_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=name):
         EquilibriumLimits(**{name: 0.0})
-
-
-# --- contact ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_estimate_follows_a_step_with_its_time_constant() -> None:
-    """An arm that stands still although it is pushed: the motors carry its weight and the push."""
-    q, still = HOME[None, :6], np.zeros((1, 6))
-    terms = DYNAMICS.terms(q, still)
-    observer = ContactObserver(1, 6, HZ, gain=50.0)
-    push = np.array([[5.0, -3.0, 2.0, 1.0, -0.5, 0.2]])
-    answers = []
-    for _ in range(200):
-        observer.update(terms, still, terms.gravity - push)
-        answers.append(observer.torque[0] / push[0])
-    expected = 1.0 - np.exp(-np.arange(200) * 50.0 / HZ)
-    np.testing.assert_allclose(answers, np.tile(expected[:, None], 6), atol=0.06)
-    np.testing.assert_allclose(observer.torque, push, rtol=1e-6)
-    observer.restart(np.array([0]))
-    assert not observer.wrench.any()
-
-
-def test_the_wrench_maps_to_joint_torques() -> None:
-    rng = np.random.default_rng(2)
-    jacobian = DYNAMICS.terms(HOME[None, :6], np.zeros((1, 6))).jacobian
-    wrench = rng.uniform(-20, 20, (1, 6))
-    torque = (jacobian.swapaxes(1, 2) @ wrench[..., None])[..., 0]
-    np.testing.assert_allclose(tool_wrench(jacobian, torque), wrench, rtol=0.01, atol=0.02)
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0, 501.0, float("nan")])

@@ -9,8 +9,6 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Request, Watchdog
 from tests.control.arm_rig import FRAME, HOME, HZ, LIMITS, SWEEP, TICK_NS, TIMEOUT_TICKS, Rig, off, posture
 
-# --- goals -----------------------------------------------------------------------------------------------------------
-
 
 def test_a_goal_is_tracked_and_then_held() -> None:
     rig = Rig()
@@ -29,18 +27,6 @@ def test_a_goal_is_tracked_and_then_held() -> None:
     rig.check()
 
 
-def test_goals_need_no_setpoints_and_have_no_age() -> None:
-    rig = Rig()
-    rig.go(joint_target=posture(j0=1.5), max_velocity=0.5)  # 3 s, far longer than the time-out of setpoints
-    for _ in range(60):
-        rig.tick(10)
-        assert rig.cerebellum.command_age_ns(rig.now).tolist() == [0]
-    assert rig.mode == Mode.TRACKING
-    rig.until(Mode.HOLD)
-    assert rig.results() == [("1", ResultCode.SUCCEEDED)]
-    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
-
-
 def test_goals_that_wait_follow_each_other_without_a_hold_between() -> None:
     rig = Rig()
     for change in (0.3, -0.3, 0.1):
@@ -50,21 +36,6 @@ def test_goals_that_wait_follow_each_other_without_a_hold_between() -> None:
     assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in ("1", "2", "3")]
     assert [row[0] for row in rig.modes].count(Mode.HOLD) == 1
     rig.check()
-
-
-def test_a_cancelled_goal_ends_when_the_arm_is_at_rest() -> None:
-    rig = Rig()
-    rig.go(**SWEEP)
-    rig.tick(200)
-    assert rig.cerebellum.cancel(0, "1") == ResultCode.SUCCEEDED
-    assert rig.cerebellum.cancel(0, "2") == ResultCode.UNKNOWN_ID
-    rig.until(Mode.HOLD)
-    assert rig.results() == [("1", ResultCode.CANCELLED)]
-    assert np.array_equal(rig.rows[-1], rig.rows[-2])
-    rig.check()
-
-
-# --- setpoints -------------------------------------------------------------------------------------------------------
 
 
 def test_a_moving_arm_is_where_it_is_commanded() -> None:
@@ -136,13 +107,6 @@ def test_a_setpoint_of_one_arm_does_not_end_the_goal_of_another() -> None:
     rig.tick(1500)
     assert rig.results(0) == [("1", ResultCode.REPLACED_BY_SETPOINT)]
     assert rig.results(1) == [("2", ResultCode.SUCCEEDED)]
-    # The reference of a protective stop is where the joints are, at once; what the servos get does not jump.
-    change = np.abs(np.diff(rig.plant.written, axis=0)).max(axis=(0, 1))
-    assert (change <= rig.cerebellum.guard.limits.change).all()
-    assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
-
-
-# --- stops -----------------------------------------------------------------------------------------------------------
 
 
 def test_an_emergency_stop_ends_a_goal_and_latches() -> None:
@@ -175,23 +139,6 @@ def test_an_emergency_stop_ends_a_goal_and_latches() -> None:
     rig.until(Mode.HOLD)
     assert [code for _, code in rig.results()] == [ResultCode.SUCCEEDED]
     rig.check()
-
-
-def test_an_emergency_stop_is_harder_than_a_deactivation() -> None:
-    ticks = []
-    for stop in ("estop", "deactivate"):
-        rig = Rig()
-        rig.go(joint_target=posture(j0=2.0))
-        rig.tick(250)
-        if stop == "estop":
-            rig.cerebellum.estop.press()
-        else:
-            rig.request(Request.DEACTIVATE)
-        rig.tick(500)
-        rows = np.array(rig.rows)
-        ticks.append(int(np.abs(np.diff(rows, axis=0)).any(axis=(1, 2)).sum()))
-        rig.check()
-    assert ticks[0] < ticks[1]
 
 
 @pytest.mark.parametrize("by", ["goal", "setpoints"])
@@ -258,9 +205,6 @@ def test_non_finite_queue_entries_stop_the_arm() -> None:
     rig.check()
 
 
-# --- the start, the limits -------------------------------------------------------------------------------------------
-
-
 def test_it_starts_from_the_posture_that_the_arm_is_in() -> None:
     rig = Rig(active=False)
     rig.plant.position[0] = off(j0=0.4, j3=-0.2, j6=-0.05)
@@ -325,16 +269,6 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     assert (change <= rig.cerebellum.guard.limits.change).all()
     assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
 
-
-def test_servo_effort_is_zero_at_rest() -> None:
-    rig = Rig()
-    rig.tick(10)
-    state = rig.cerebellum.state(rig.now)
-    assert np.abs(state.joint_efforts).max() < 1e-9
-    assert state.odometry.shape == (1, 0)
-
-
-# --- everything at once ----------------------------------------------------------------------------------------------
 
 actions = st.one_of(
     st.tuples(st.just("goal"), st.floats(-1, 1)),

@@ -184,6 +184,7 @@ def test_a_broken_encoder_is_a_fault_and_does_not_spread() -> None:
     assert np.isfinite(rig.plant.written).all()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("cause", [Mode.ESTOP, Mode.FAULT], ids=lambda mode: mode.name)
 def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(cause: Mode) -> None:
     rig = StuckRig()

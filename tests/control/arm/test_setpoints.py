@@ -32,7 +32,6 @@ class Stream:
             self.rows.append(np.stack([self.position, self.velocity, self.acceleration]))
 
     def check(self) -> None:
-        """Assert that every limit held at every tick."""
         p, v, a = np.moveaxis(np.array(self.rows), 1, 0)
         assert np.isfinite(self.rows).all()
         assert (p - UPPER).max() <= SLACK
@@ -59,7 +58,6 @@ class Stream:
 
 
 def off(**changes: float) -> np.ndarray:
-    """Return the home posture with some joints moved."""
     values = HOME.copy()
     for name, change in changes.items():
         values[int(name[1:])] += change
@@ -124,7 +122,7 @@ def test_a_steady_motion_is_followed_without_a_lag(speed: float) -> None:
             assert np.allclose(stream.velocity[0, :6], speed / 2, atol=1e-6)
 
 
-@pytest.mark.parametrize("change", [1e-4, 0.01, -0.3, 2.0])
+@pytest.mark.parametrize("change", [0.0, 1e-4, 0.01, -0.3, 2.0])
 def test_a_setpoint_that_stays_is_reached_exactly_and_passed_by_a_braking_distance_at_most(change: float) -> None:
     stream = Stream()
     goal = off(j0=change, j4=-change, j6=-abs(change) / 100)
@@ -145,23 +143,6 @@ def test_after_a_moving_stream_the_last_setpoint_is_reached_exactly_too() -> Non
         stream.frame(off(j1=0.03 * (frame + 1)))
     stream.tick(1000)  # no setpoint any more: the last one counts
     assert np.allclose(stream.position, off(j1=0.6), atol=1e-9)
-
-
-def test_at_the_goal_nothing_moves() -> None:
-    stream = Stream()
-    stream.frame(HOME, 10)
-    assert (stream.history == HOME).all()
-
-
-def test_only_applied_limits_are_flagged() -> None:
-    stream = Stream(3)
-    values = np.tile(HOME, (3, 1))
-    values[1, 0], values[2, 0] = HOME[0] + 7.0, HOME[0] - 2.0
-    stream.set_setpoint(values)
-    assert stream.filter.limited_position.tolist() == [False, True, False]  # beyond 2 pi
-    stream.tick(200)
-    assert stream.filter.limited_velocity.tolist() == [False, True, True]
-    assert stream.filter.limited_acceleration.tolist() == [False, True, True]
 
 
 def test_a_range_s_ends_are_inside() -> None:
@@ -196,19 +177,6 @@ def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_referenc
     stream.rows.clear()
     stream.frame(off(j0=0.001), 50)
     assert np.abs(stream.history[:, 0, 0] - HOME[0]).max() < 0.0011
-
-
-def test_a_restart_clears_the_state_of_the_arm() -> None:
-    used, fresh = Stream(2), Stream(2)
-    used.frame(off(j0=9.0, j1=-1.0), 7)
-    used.filter.restart(np.array([0, 1]))
-    assert not (used.filter.limited_position | used.filter.limited_velocity | used.filter.limited_acceleration).any()
-    used.position[:], used.velocity[:], used.acceleration[:] = HOME, 0, 0
-    for stream in (used, fresh):
-        stream.rows.clear()
-        stream.tick(10)
-        stream.frame(off(j0=0.5), 10)
-    assert np.array_equal(used.history, fresh.history)
 
 
 def test_arms_are_independent() -> None:

@@ -104,26 +104,6 @@ def test_distances_do_not_depend_on_the_batch() -> None:
         np.testing.assert_array_equal(grid.ravel(), all_)
 
 
-def test_the_shoulder_turns_nothing_nearer() -> None:
-    """Only what is fixed to the base may notice the first joint: by its shape, which is round."""
-    model = CollisionModel(CHAIN)
-    postures = np.random.default_rng(2).uniform(-7, 7, (50, 6))
-    turned = postures + np.array([1.234, 0, 0, 0, 0, 0])
-    for before, after in zip(model.distances(postures), model.distances(turned), strict=True):
-        np.testing.assert_allclose(before, after, atol=1e-12)
-
-
-def test_home_is_clear() -> None:
-    assert min(map(float, CollisionModel(CHAIN).distances(HOME))) > 2 * CHAIN.min_distance
-
-
-def test_a_stretched_arm_is_clear_and_a_folded_one_is_not() -> None:
-    model = CollisionModel(CHAIN)
-    assert float(model.distances(np.array([0, -1.5, 0, -1.5, 0, 0]))[0]) > 0
-    assert float(model.distances(np.array([0, -1.5, 3.1, 0, 0, 0]))[0]) < 0
-    assert float(model.distances(np.array([0, 0.5, 0, 0, 0, 0]))[1]) < 0  # below the table
-
-
 def test_an_empty_collision_check_returns_infinity() -> None:
     nothing = CollisionModel(dataclasses.replace(CHAIN, capsules=(), disjoint=()))
     assert [float(distance) for distance in nothing.distances(HOME)] == [math.inf, math.inf]

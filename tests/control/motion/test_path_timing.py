@@ -7,8 +7,9 @@ from scipy.interpolate import CubicSpline
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED
 from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
 from bhd_lerobot.control.motion.path_timing import PathLimits, PathTimer, follow
-from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure
+from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure, State
 from tests.control.goal_rig import ARM, HZ, KINEMATICS
+from tests.control.motion.test_trajectory import excess
 
 LIMITS = MotionLimits.of(ARM.limits)[slice(0, 6)]
 HOME = np.array(ARM.home[:6])
@@ -25,14 +26,11 @@ def test_random_lines_keep_every_limit_and_are_nearly_as_quick_as_one_without_a_
         if isinstance(motion, PlanFailure):
             continue
         line = Line(KINEMATICS.tool(posture), goal)
-        rest = np.zeros((1, 6))
+        assert excess(State.at_rest(posture), motion, LIMITS) < 1e-9
         position = np.concatenate((posture[None], motion.position))
-        velocity = np.concatenate((rest, motion.velocity))
-        acceleration = np.concatenate((rest, motion.acceleration))
-        # Limits, also of what is only written: positions at ticks.
-        assert (np.abs(velocity) <= LIMITS.velocity * (1 + 1e-9)).all()
-        assert (np.abs(acceleration) <= LIMITS.acceleration * (1 + 1e-9)).all()
-        assert (np.abs(np.diff(acceleration, axis=0)) * HZ <= LIMITS.jerk * (1 + 1e-9)).all()
+        velocity, acceleration = (
+            np.concatenate((np.zeros((1, 6)), one)) for one in (motion.velocity, motion.acceleration)
+        )
         assert np.allclose(np.diff(position, axis=0) * HZ, (velocity[1:] + velocity[:-1]) / 2, atol=2e-4)
         assert np.allclose(np.diff(velocity, axis=0) * HZ, (acceleration[1:] + acceleration[:-1]) / 2, atol=0.05)
         assert not velocity[-1].any()

@@ -39,12 +39,7 @@ REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
     ({}, ResultCode.BAD_TARGET, "no target"),
     ({"target_pose": moved(), "joint_target": joints()}, ResultCode.BAD_TARGET, "Both"),
     ({"joint_target": joints(), "motion": "line"}, ResultCode.BAD_TARGET, "line"),
-    ({"joint_target": joints(), "motion": "lime"}, ResultCode.BAD_TARGET, "'line'"),
-    ({"joint_target": (0.0,) * 7}, ResultCode.BAD_TARGET, "6 numbers"),
-    ({"joint_target": "abcdef"}, ResultCode.BAD_TARGET, "abcdef"),
-    ({"joint_target": ((0.0,), (0.0, 1.0), 0, 0, 0, 0)}, ResultCode.BAD_TARGET, "6 numbers"),
-    ({"target_pose": Pose((0.1, 0.2), DOWN)}, ResultCode.BAD_TARGET, "3 numbers"),  # type: ignore[arg-type]
-    ({"gripper": "open"}, ResultCode.BAD_TARGET, "open"),
+    ({"target_pose": np.eye(4)}, ResultCode.BAD_TARGET, "quaternion"),
     ({"joint_target": joints(NAN)}, ResultCode.NON_FINITE, "nan"),
     ({"target_pose": Pose((0.4, INF, 0.3), DOWN)}, ResultCode.NON_FINITE, "inf"),
     ({"target_pose": Pose((0.4, 0.1, 0.3), (NAN, 0, 0, 1))}, ResultCode.NON_FINITE, "nan"),
@@ -57,13 +52,13 @@ REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
     ({"joint_target": joints(), "max_velocity": 0.0}, ResultCode.BAD_VELOCITY, "0.0"),
     ({"joint_target": joints(), "max_velocity": 3.2}, ResultCode.BAD_VELOCITY, "3.14159 rad/s"),
     ({"joint_target": joints(), "max_velocity": NAN}, ResultCode.BAD_VELOCITY, "nan"),
-    ({"joint_target": joints(), "max_velocity": "fast"}, ResultCode.BAD_VELOCITY, "fast"),
     ({"target_pose": moved(0.1), "motion": "line", "max_velocity": 1.1}, ResultCode.BAD_VELOCITY, "1 m/s"),
     ({"joint_target": joints(), "max_acceleration": -1.0}, ResultCode.BAD_ACCELERATION, "-1.0"),
     ({"joint_target": joints(), "max_acceleration": 16.0}, ResultCode.BAD_ACCELERATION, "15 rad/s^2"),
     ({"target_pose": moved(0.1), "motion": "line", "max_acceleration": 6.0}, ResultCode.BAD_ACCELERATION, "5 m/s^2"),
     ({"joint_target": joints(), "timeout_s": 0.0}, ResultCode.BAD_TIMEOUT, "0.0"),
     ({"joint_target": joints(), "timeout_s": INF}, ResultCode.BAD_TIMEOUT, "inf"),
+    ({"joint_target": joints(), "timeout_s": 1e17}, ResultCode.BAD_TIMEOUT, "1e+17"),
     ({"joint_target": joints(), "timeout_s": NAN}, ResultCode.BAD_TIMEOUT, "nan"),
 ]
 
@@ -74,13 +69,6 @@ def test_invalid_goals_are_refused_with_a_reason(fields: dict[str, Any], code: R
     assert failure is not None
     assert (failure.code, plan(**fields)) == (code, failure)
     assert words in failure.message
-
-
-@pytest.mark.parametrize("task_id", ["", None, 7])
-def test_a_goal_needs_a_name(task_id: Any) -> None:
-    failure = PLANNER.check(BrainCommand(task_id, gripper=0.0))
-    assert failure is not None
-    assert failure.code == ResultCode.BAD_TARGET
 
 
 @each_case(
@@ -158,9 +146,6 @@ def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
     assert np.abs(gentle.position).max() <= 2 * np.pi + 1e-9
 
 
-# --- the way ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("fields", "code"),
     [
@@ -169,6 +154,11 @@ def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
         ({"joint_target": joints(0.0, 1.2)}, ResultCode.TABLE_COLLISION),
         ({"target_pose": moved(dz=-0.3)}, ResultCode.TABLE_COLLISION),
         ({"joint_target": joints(0.0, 0.0, 1.5)}, ResultCode.SELF_COLLISION),
+        # Motions that would take hours.
+        ({"target_pose": moved(0.1), "max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),
+        ({"target_pose": moved(0.1), "max_velocity": 1e-3}, ResultCode.PLANNING_FAILED),
+        ({"target_pose": moved(0.1), "max_acceleration": 1e-6}, ResultCode.PLANNING_FAILED),
+        ({"target_pose": moved(0.1), "max_velocity": 1e-4, "motion": "line"}, ResultCode.PLANNING_FAILED),
     ],
 )
 def test_blocked_paths_are_refused(fields: dict[str, Any], code: ResultCode) -> None:
@@ -238,12 +228,6 @@ def test_a_singular_posture_ends_neither_a_pose_nor_lies_on_a_line_but_joints_ma
         KINEMATICS.manipulability(row) for row in made(joint_target=joints(0, 0, 0, 0, 2.5)).trajectory.position[:, :6]
     ]
     assert min(through) < ARM.chain.min_manipulability
-
-
-def test_the_same_goal_gives_the_same_plan() -> None:
-    start = moving_start()
-    first, second = made(start, target_pose=moved(0.1, 0.2)), made(start, target_pose=moved(0.1, 0.2))
-    assert np.array_equal(first.trajectory.position, second.trajectory.position)
 
 
 def test_an_unbrakeable_state_stops_at_once() -> None:

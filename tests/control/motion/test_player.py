@@ -50,17 +50,6 @@ def test_ahead_matches_later_playback(ticks: int, played: int, ahead: int, borro
     assert equal(state, last[:, 0])
 
 
-def test_ahead_with_several_simulations() -> None:
-    player, blocks = TrajectoryPlayer(3, 2), [rows_of(ticks, ticks) for ticks in (5, 9)]
-    player.start(0, trajectory(blocks[0]))
-    player.start(2, trajectory(blocks[1]))
-    play(player, 3)
-    assert equal(player.ahead(0, 2), blocks[0][2])
-    assert equal(player.ahead(2, 2), blocks[1][2])
-    assert equal(player.ahead(0, 99), blocks[0][-1])
-    assert player.ahead(1, 1) is None
-
-
 def test_ahead_returns_a_copy() -> None:
     player, rows = TrajectoryPlayer(1, 2), rows_of(4)
     player.borrow(rows)

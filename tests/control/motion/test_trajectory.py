@@ -207,9 +207,6 @@ def test_non_finite_numbers_return_a_failure(bad: float) -> None:
         assert answer.message
 
 
-# --- lines -----------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=40)
 @given(*[st.floats(-1, 1)] * 4)
 def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: float, turn: float) -> None:
@@ -280,18 +277,6 @@ def test_a_line_can_turn_the_tool_on_the_spot_or_do_nothing() -> None:
     assert planned(along_line(HOME[:6], TOOL, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).ticks == 1
 
 
-def test_the_poses_of_a_line_are_its_ends_and_what_lies_between() -> None:
-    line = Line(TOOL, moved(0.1, 0.2, 0.0, 1.0).matrix())
-    poses = line.poses(np.array([0.0, 0.5, 1.0]))
-    assert np.abs(poses[0] - TOOL).max() < 1e-12
-    assert np.abs(poses[2] - line.goal).max() < 1e-12
-    assert np.abs(poses[1] - moved(0.05, 0.1, 0.0, 0.5).matrix()).max() < 1e-12
-    assert line.length == pytest.approx(np.hypot(0.1, 0.2))
-
-
-# --- playing ---------------------------------------------------------------------------------------------------------
-
-
 def numbered(ticks: int, first: float) -> Trajectory:
     rows = first + np.arange(ticks, dtype=np.float64)[:, None] + np.array([0.0, 0.25])
     return Trajectory(rows, rows + 1000, rows + 2000)
@@ -320,19 +305,6 @@ def test_every_row_is_played_once_and_in_order(script: list[tuple[int, int, int]
     moving = arrays[1].any(axis=1)
     assert np.array_equal(arrays[1][moving], arrays[0][moving] + 1000)
     assert np.array_equal(arrays[2][moving], arrays[0][moving] + 2000)
-
-
-def test_a_trajectory_that_is_stopped_is_not_played_on() -> None:
-    player = TrajectoryPlayer(2, 2)
-    arrays = [np.zeros((2, 2)) for _ in range(3)]
-    player.start(0, numbered(10, 1.0))
-    player.start(1, numbered(10, 1.0))
-    player.tick(*arrays)
-    player.stop(0)
-    player.tick(*arrays)
-    assert arrays[0][:, 0].tolist() == [1.0, 2.0]
-    assert player.active.tolist() == [False, True]
-    assert player.remaining(0) == 0
 
 
 def test_joined_trajectories_wait_for_each_other() -> None:

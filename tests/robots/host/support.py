@@ -46,12 +46,10 @@ _NUMBERS = itertools.count()
 
 
 def unique(name: str) -> str:
-    """Return a robot's id that no other test uses, in this process or in another."""
     return f"test-{name}-{os.getpid()}-{next(_NUMBERS)}"
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process runs: not ended, and no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -59,12 +57,10 @@ def is_alive(pid: int) -> bool:
 
 
 def is_gone(name: str) -> bool:
-    """Return whether nothing of a robot is left in shared memory."""
     return name not in names() and not any(FOLDER.glob(f"{PREFIX}{name}.*"))
 
 
 def mode(robot: Any) -> Mode:
-    """Return a robot's mode."""
     return Mode(int(robot.simulation.modes[0]))
 
 
@@ -79,7 +75,6 @@ def drive(robot: TurtleBot3, speed: float = 0.2) -> None:
 
 
 def watchdog_count(state: Any, watchdog: Watchdog) -> int:
-    """Return how often a watchdog was raised in a segment."""
     return int(state["watchdogs"][WATCHDOGS.index(watchdog)])
 
 
@@ -92,17 +87,14 @@ class States:
         self.all: list[Any] = []
 
     def read(self) -> "States":
-        """Take what is there."""
         while (state := self._reader.read()) is not None:
             self.all.append(state.copy())
         return self
 
     def first(self, wanted: Mode) -> int:
-        """Return the number of the first state in a mode."""
         return next(k for k, state in enumerate(self.all) if state["mode"][0] == wanted)
 
     def has(self, wanted: Mode) -> bool:
-        """Return whether a state in this mode was read so far."""
         return any(state["mode"][0] == wanted for state in self.read().all)
 
 
@@ -119,13 +111,7 @@ def drive_on(name: str, options: dict[str, Any]) -> None:
 
 @contextmanager
 def driving_child(name: str, log: Path, **options: Any) -> Iterator[tuple[Fork, dict]]:
-    """Run a program that connects a base and drives it; yield it, and what it says about its robot.
-
-    Args:
-        name: the robot's id.
-        log: where its output goes.
-        options: of `turtlebot`.
-    """
+    """Run a program that connects a base and drives it; yield it, and what it says about its robot."""
     process = Fork(drive_on, name, options, output=log)
     try:
         until(lambda: process.poll() is not None or log.read_text().endswith("\n"), "the base drives")

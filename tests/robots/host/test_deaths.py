@@ -44,8 +44,7 @@ def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
         ("recorder", "recorder's process was killed by signal 9. The robot decelerates and holds"),
         ("cerebellum", "cerebellum's process was killed by signal 9. The simulated robot ended with it"),
     ):
-        robot.connect()
-        try:
+        with robot:
             drive(robot)
             pids = robot.simulation.link.pids
             states = States(name)
@@ -56,17 +55,15 @@ def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
                 until(lambda read=states: read.has(Mode.HOLD), "the base holds")
                 assert watchdog_count(states.read().all[-1], Watchdog.RECORDER) >= 1
                 expect_exact_timeout(states, Word.RECORDER_ALIVE)
-        finally:
-            robot.disconnect()
-            states.block.close()
+        states.block.close()
         assert is_gone(name)
         assert not any(is_alive(pid) for pid in pids.values())
-    robot.connect()
-    drive(robot)
-    robot.disconnect()
+    with robot:
+        drive(robot)
     assert is_gone(name)
 
 
+@pytest.mark.thorough
 def test_a_brain_that_is_stopped_at_any_moment_leaves_nothing_half_sent(tmp_path):
     """It sends all the time: some of these moments are within a command that it writes."""
     name = unique("stopped")
@@ -114,9 +111,7 @@ def expect_exact_timeout(states: States, word: Word) -> None:
 
 def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
     name = unique("stopped")
-    robot = turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5)
-    robot.connect()
-    try:
+    with turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5) as robot:
         drive(robot)
         recorder = robot.simulation.link.pids["recorder"]
         states = States(name)
@@ -155,9 +150,7 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
                 gaps += 1
                 assert passed - frame <= lost < passed
         assert gaps >= 1
-    finally:
-        robot.disconnect()
-        states.block.close()
+    states.block.close()
     assert is_gone(name)
 
 
@@ -186,9 +179,7 @@ def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_e
 def test_a_cerebellum_that_is_stopped_is_reported_and_ended(monkeypatch):
     monkeypatch.setattr(link, "_END_S", 0.5)
     name = unique("frozen")
-    robot = turtlebot(name)
-    robot.connect()
-    try:
+    with turtlebot(name) as robot:
         drive(robot)
         pids = robot.simulation.link.pids
         os.kill(pids["cerebellum"], signal.SIGSTOP)
@@ -197,8 +188,6 @@ def test_a_cerebellum_that_is_stopped_is_reported_and_ended(monkeypatch):
         for call in (robot.get_observation, lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})):
             with pytest.raises(RealtimeError, match=r"published nothing for .* stopped"):
                 call()
-    finally:
-        robot.disconnect()
     assert is_gone(name)
     assert not any(is_alive(pid) for pid in pids.values())
 

@@ -31,14 +31,14 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[UR5, Any]]:
     try:
         plant = f"{lying_arm.__name__}:LyingArm"
         realtime = relaxed(plant_timeout_s=5.0)
-        robot = UR5(UR5Config(id=unique("lying"), clock="realtime", plant=plant, control_hz=125, realtime=realtime))
-        robot.connect()
-        yield robot, shared
-        robot.disconnect()
+        config = UR5Config(id=unique("lying"), clock="realtime", plant=plant, control_hz=125, realtime=realtime)
+        with UR5(config) as robot:
+            yield robot, shared
     finally:
         del os.environ[lying_arm.LOG]
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("lie", lying_arm.LIES[1:])
 def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie: str) -> None:
     robot, shared = arm

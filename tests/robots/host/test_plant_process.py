@@ -187,9 +187,6 @@ def test_missed_ticks_are_caught_up_within_a_bound(away: int, skipped: int, adva
     assert ticks[-1][1] == (PlantPhase.STOPPED if away * PERIOD > TIMEOUT else PlantPhase.DRIVEN)
 
 
-# --- how each kind of robot stops ------------------------------------------------------------------------------------
-
-
 def test_servos_that_hold_the_arm_follow_a_reading_that_runs_away_no_farther_than_a_brake() -> None:
     stop, reading = ServoStop(ur5()), PlantReading(1, 7)
     stop.begin(reading.position)
@@ -238,20 +235,13 @@ def test_an_arm_comes_to_rest_and_stays_there_by_itself(actuation: Any) -> None:
     assert np.abs(positions[-1][:6] - positions[0][:6]).max() < 0.3  # it braked, and fell nowhere
 
 
-# --- a simulation in two parts ---------------------------------------------------------------------------------------
-
 ARENA = make_arena("random", seed=3)
 
 
-def turtlebot3() -> BaseSimulation:
-    return BaseSimulation(TurtleBot3Config(odometry=True, imu=True), 1, 1)
-
-
-def arm() -> UR5Simulation:
-    return UR5Simulation(UR5Config(), 1, 1)
-
-
-SIMULATIONS: dict[str, Any] = {"turtlebot3": turtlebot3, "ur5": arm}
+SIMULATIONS: dict[str, Any] = {
+    "turtlebot3": lambda: BaseSimulation(TurtleBot3Config(odometry=True, imu=True), 1, 1),
+    "ur5": lambda: UR5Simulation(UR5Config(), 1, 1),
+}
 
 
 class Parts:
@@ -394,9 +384,6 @@ def test_the_process_needs_neither_torch_nor_lerobot() -> None:
     assert done.stdout.strip() == "[]"
 
 
-# --- configuration ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_invalid_plant_time_outs_are_refused(value: float) -> None:
     with pytest.raises(ConfigError, match=r"plant_timeout_s .*cannot be turned off"):
@@ -413,8 +400,6 @@ def test_a_time_out_of_less_than_two_ticks_is_refused_before_anything_starts() -
         TurtleBot3(live(TurtleBot3Config, plant_timeout_s=0.009)).connect()
     assert not [name for name in names() if f"test-plant-{os.getpid()}" in name]  # others are of tests beside this one
 
-
-# --- processes -------------------------------------------------------------------------------------------------------
 
 LONG = 0.2  # [s] time-out of the plant in these tests: other tests may keep all processors busy for longer than 20 ms
 
@@ -452,6 +437,7 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
             block.close()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
 def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
     with moving(kind) as (robot, link):
@@ -524,26 +510,20 @@ def test_a_stopped_cerebellum_goes_on_after_a_reset_and_a_stopped_or_killed_plan
     assert block_name not in names()
 
 
-# --- a base that watches its scan ------------------------------------------------------------------------------------
-
-
+@pytest.mark.thorough
 def test_a_base_on_the_wall_clock_stops_before_a_wall_that_its_plant_sees() -> None:
     """The scan comes from another process. On a busy machine it comes late, and the base is slower for it."""
     config = live(TurtleBot3Config)
     config.arena, config.collision_monitor, config.command_timeout_s = "turtlebot3_world", True, 20.0
-    robot = TurtleBot3(config)
-    robot.connect()
-    simulation: Any = robot.simulation
     speeds: list[float] = []
 
     def stands() -> bool:
         speeds.append(robot.send_action({"x.vel": -0.22, "theta.vel": 0.0})["x.vel"])
         return min(speeds) < -0.2 and speeds[-1] > -0.01
 
-    try:
+    with TurtleBot3(config) as robot:
         until(stands, "it stands before a wall")
+        simulation: Any = robot.simulation
         assert not simulation.truth().touched.any()
         assert int(simulation.modes[0]) == Mode.TRACKING
         assert robot.get_observation()["scan_180.pos"] < 0.25
-    finally:
-        robot.disconnect()

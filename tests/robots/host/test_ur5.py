@@ -24,15 +24,12 @@ def ur5(name: str) -> UR5:
 
 @pytest.fixture(scope="module")
 def arm() -> Iterator[UR5]:
-    robot = ur5(NAME)
-    robot.connect()
-    yield robot
-    robot.disconnect()
+    with ur5(NAME) as robot:
+        yield robot
     assert is_gone(NAME)
 
 
 def goal(name: str, target: int, speed: float = 1.0) -> BrainCommand:
-    """Return a goal for the tool, which points down."""
     pose = Pose(TARGETS[target], (0.0, 1.0, 0.0, 0.0))
     return BrainCommand(name, target_pose=pose, max_velocity=speed, timeout_s=60.0)
 

@@ -32,17 +32,14 @@ DOWN = (0.0, 0.7071067811865476, 0.7071067811865476, 0.0)
 
 @pytest.fixture(scope="module")
 def connected() -> Iterator[tuple[UR5, States]]:
-    robot = UR5(UR5Config(id=NAME, clock="realtime", realtime=relaxed()))
-    robot.connect()
-    states = States(NAME)
-    yield robot, states
-    states.block.close()
-    robot.disconnect()
+    with UR5(UR5Config(id=NAME, clock="realtime", realtime=relaxed())) as robot:
+        states = States(NAME)
+        yield robot, states
+        states.block.close()
 
 
 @pytest.fixture
 def arm(connected: tuple[UR5, States]) -> tuple[UR5, States]:
-    """An arm that holds."""
     robot, states = connected
     if mode(robot) in (Mode.FAULT, Mode.ESTOP):
         lead_out(robot)
@@ -53,8 +50,6 @@ def arm(connected: tuple[UR5, States]) -> tuple[UR5, States]:
 
 
 def lead_out(robot: UR5) -> None:
-    """Reset and activate an arm, as soon as it is at rest."""
-
     def active() -> bool:
         reset = robot.simulation.bridge.reset()
         return bool(reset.accepted.all()) and bool(robot.simulation.bridge.activate().accepted.all())
@@ -63,7 +58,6 @@ def lead_out(robot: UR5) -> None:
 
 
 def turn(robot: UR5, name: str, by: float) -> None:
-    """Send a goal that turns the base, and wait until it is followed."""
     bridge = robot.simulation.bridge
     target = np.asarray(bridge.state().command)[0, :6] + np.array([by, 0, 0, 0, 0, 0])
     assert bridge.submit(BrainCommand(name, joint_target=tuple(target.tolist()), timeout_s=60.0)) is None
@@ -80,6 +74,7 @@ def expect_no_jump(states: States, robot: UR5) -> None:
     assert (np.abs(np.diff(positions[:, :6], axis=0)) <= most).all()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("what", ["not a number", "a jump"])
 def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, States], what: str) -> None:
     robot, states = arm
@@ -194,6 +189,7 @@ def pressing() -> Iterator[tuple[UR5, Callable[[], float]]]:
     robot.disconnect()
 
 
+@pytest.mark.thorough
 def test_after_an_emergency_stop_an_arm_presses_no_more_nor_after_a_reset(
     pressing: tuple[UR5, Callable[[], float]],
 ) -> None:

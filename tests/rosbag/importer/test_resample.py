@@ -150,7 +150,6 @@ def test_readings_beyond_the_range_of_the_scanner_are_no_return(range_min, range
 
 
 def world(angle):
-    """Return a distance for every direction."""
     return 1.5 + 0.5 * np.cos(angle) + 0.3 * np.sin(2 * angle)
 
 

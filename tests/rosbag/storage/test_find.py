@@ -2,7 +2,6 @@
 
 import shutil
 
-import numpy as np
 import pytest
 import yaml
 
@@ -10,9 +9,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.find import find_bags, publishers_of
 from bhd_lerobot.rosbag.storage.read import publishers_in
 from tests.cases import each_case
-from tests.rosbag.support import STORE, drive, write
-
-TOPICS = ("/cmd_vel", "/odom", "/scan")
+from tests.rosbag.support import check, drive, write
 
 
 @pytest.fixture(scope="module")
@@ -41,19 +38,6 @@ def split(tmp_path, parts, messages):
         return bag
 
     return make
-
-
-def check(path, messages, *problems):
-    """Check that a bag is read as it was recorded, and its problems."""
-    (bag,) = find_bags(path)
-    read = bag.read(TOPICS)
-    for topic in TOPICS:
-        wanted = [(at, bytes(STORE.serialize_cdr(one, one.__msgtype__))) for name, at, one in messages if name == topic]
-        assert list(zip(read[topic].received.tolist(), read[topic].data, strict=True)) == wanted
-        assert (np.diff(read[topic].order) > 0).all()
-    assert len(bag.problems) == len(problems), bag.problems
-    for part, problem in zip(problems, bag.problems, strict=True):
-        assert part in problem
 
 
 def test_a_recording_that_was_split_is_one_bag(split, parts, messages):
