@@ -66,6 +66,7 @@ def test_it_pushes_on_a_rigid_wall_until_no_commands_come_and_lets_go_cleanly() 
     np.testing.assert_allclose(rig.log["tool"][-1], rig.target[0, :3], atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_push_by_the_spring_alone() -> None:
     """Stiffness times depth, of an equilibrium behind the wall."""
     rig = Rig(wall=True)
@@ -138,6 +139,7 @@ def test_a_stop_in_motion_brakes_the_equilibrium_and_holds_it_where_it_stops() -
     np.testing.assert_allclose(rig.log["tool"][-1], command[-1], atol=1e-3)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (-5.0, 8.0, -12.0)])
 def test_a_force_moves_the_tool_by_force_over_stiffness_and_is_felt(force: tuple[float, float, float]) -> None:
     stiffness = np.diag([400.0, 800.0, 600.0, 40.0, 40.0, 40.0])
@@ -159,6 +161,7 @@ def test_a_moment_is_felt() -> None:
     np.testing.assert_allclose(rig.log["estimate"][-1], (0, 0, 0, 1.0, 0.5, -1.0), atol=0.05)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("damping", [None, (100.0, 100.0, 100.0, 4.0, 4.0, 4.0)])
 def test_a_free_response_loses_energy_in_every_tick(damping: tuple[float, ...] | None) -> None:
     rig = Rig(compliance=Compliance(damping=damping))
@@ -191,6 +194,7 @@ def test_no_contact_is_felt_in_free_motion_at_full_speed() -> None:
     assert np.linalg.norm(estimate[:, 3:], axis=1).max() < 0.1
 
 
+@pytest.mark.thorough
 def test_a_stretched_arm_stays_calm() -> None:
     """Beyond its reach the arm is singular: the equilibrium goes on, the tool cannot."""
     rig = Rig()
@@ -222,6 +226,7 @@ def test_a_base_has_no_fixtures() -> None:
         World(turtlebot3_burger(), fixtures=(WALL,))
 
 
+@pytest.mark.thorough
 def test_the_example_settles_at_the_force_that_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

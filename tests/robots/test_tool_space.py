@@ -128,6 +128,7 @@ def test_an_arm_whose_poses_are_refused_stops_at_the_time_out(simulation) -> Non
     assert not report.limits[0] & Limit.NON_FINITE
 
 
+@pytest.mark.thorough
 def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
     """Turned far enough about any axis the arm comes to a singular posture, and then to another branch.
 
