@@ -39,9 +39,6 @@ def commands(section: dict[str, Any]) -> list[str]:
     return [shlex.join(shlex.split(one)) for part, words in parts for one in TABLE.commands(part, **words)]
 
 
-# --- the table and the page -------------------------------------------------------------------------------------------
-
-
 def test_the_page_says_what_was_measured() -> None:
     text, _ = page.write(TABLE, KEPT)
     assert text == KEPT.with_suffix(".md").read_text(encoding="utf-8"), "run: make results RESULTS=--kept"
@@ -110,9 +107,6 @@ def test_a_section_shows_rows_seeds_remarks_and_each_command_once(tmp_path: Path
     ):
         assert f"\n{line}\n" in text
     assert text.count("bhd-train x") == 1
-
-
-# --- rows -------------------------------------------------------------------------------------------------------------
 
 
 @each_case(
@@ -224,9 +218,6 @@ def test_the_recovered_share_is_of_what_was_lost() -> None:
     assert high < 0
     for nothing in (([True, False], [True, True], [True, True]), ([], [], [])):
         assert all(math.isnan(one) for one in recovered(*nothing))
-
-
-# --- the runner -------------------------------------------------------------------------------------------------------
 
 
 def ran(folder: Path) -> list[str]:

@@ -129,9 +129,6 @@ def gone(pid: int) -> bool:
         return True
 
 
-# --- recordings -------------------------------------------------------------------------------------------------------
-
-
 def workers_of(raylets: set[int]) -> list[int]:
     """Return the processes of our workers on these machines."""
     found = []
@@ -334,9 +331,6 @@ class TestOnePool:
         run_alone(tmp_path / "local", **{**shorter, "dataset__num_episodes": result.recorded})
         run_alone(tmp_path / "local", **shorter, resume="true")
         assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
-
-
-# --- the pool, with workers that cost nothing -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -63,9 +63,6 @@ def test_an_option_without_a_description_is_found() -> None:
         list(script._options(Undocumented, "", "page.md", {}))
 
 
-# --- links and files -------------------------------------------------------------------------------------------------
-
-
 def without_code(text: str) -> str:
     return re.sub(r"```.*?```", "", text, flags=re.DOTALL)
 
@@ -123,9 +120,6 @@ def test_a_planted_broken_reference_is_found(tmp_path: Path, planted: str) -> No
     document = tmp_path / "notes.md"
     document.write_text(f"{planted}\n[fine](README.md#heading) `docs/reference/options.md`\n")
     assert len(broken_references(document)) == 1
-
-
-# --- commands --------------------------------------------------------------------------------------------------------
 
 
 def quoted_commands(path: Path) -> Iterator[str]:
@@ -210,9 +204,6 @@ def test_a_wrong_command_does_not_parse(monkeypatch: pytest.MonkeyPatch) -> None
             parse_command(line, monkeypatch)
 
 
-# --- messages --------------------------------------------------------------------------------------------------------
-
-
 def texts_in_code() -> str:
     """Return every piece of text in the package's code; what stands between two pieces of a message is not one."""
     pieces = []
@@ -239,9 +230,6 @@ def test_every_quoted_message_is_in_the_code() -> None:
         (m, part) for m in messages for part in re.split("…", m) if part.strip(" .") and part.strip() not in code
     ]
     assert unknown == []
-
-
-# --- columns ---------------------------------------------------------------------------------------------------------
 
 
 def test_every_column_is_described(tmp_path: Path) -> None:

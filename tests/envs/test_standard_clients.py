@@ -25,9 +25,6 @@ FRAMES = 5
 BRIEF: dict[str, Any] = {"robot": {"beams": 8}, "task": {"duration_s": FRAMES / 10}}
 
 
-# --- Stable-Baselines3 ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("learner", "name"), [(PPO, "TurtleBot3Avoid-v0"), (SAC, "UR5Reach-v0")])
 def test_stable_baselines3_learns(learner: Any, name: str) -> None:
     arguments = {**short(name), "normalise_actions": True}
@@ -82,9 +79,6 @@ def test_vec_monitor_and_vec_normalize() -> None:
         ended += [infos[i]["episode"]["l"] for i in np.flatnonzero(done)]
     assert ended == [FRAMES] * 4
     envs.close()
-
-
-# --- Gymnasium's wrappers of single environments ----------------------------------------------------------------------
 
 
 def flat(env: gymnasium.Env) -> gymnasium.Env:
@@ -142,9 +136,6 @@ def test_wrappers_of_single_environments(name: str) -> None:
     env.close()
 
 
-# --- of vector environments -------------------------------------------------------------------------------------------
-
-
 VECTOR: dict[str, Callable[[Any], Any]] = {
     "RecordEpisodeStatistics": vector.RecordEpisodeStatistics,
     "DictInfoToList": vector.DictInfoToList,
@@ -192,9 +183,6 @@ def test_wrappers_of_vector_environments(kind: str, mode: AutoresetMode) -> None
         if name in ("RecordEpisodeStatistics", "everything"):
             assert all(info["episode"]["l"] == FRAMES for info in ended), name
         env.close()
-
-
-# --- how an environment is found --------------------------------------------------------------------------------------
 
 
 FORGET = """

@@ -121,9 +121,6 @@ def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(kind: str, options: 
             assert torch.allclose(chosen[number], wanted, atol=1e-6)
 
 
-# --- refused ----------------------------------------------------------------------------------------------------------
-
-
 @each_case(
     ("kind", "options", "message"),
     [

@@ -75,9 +75,6 @@ class Wave:
         return {"type": "wave"}
 
 
-# --- laws ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("kind", "expert"), [("turtlebot3", GapFollowerConfig()), ("ur5", ReachBrainConfig())], ids=["setpoints", "goals"]
 )
@@ -134,9 +131,6 @@ def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_m
     np.testing.assert_array_equal(episode.columns[keys.ACTION][10:], np.array(advised, np.float32)[10:])
 
 
-# --- goals in the middle of an episode --------------------------------------------------------------------------------
-
-
 def dagger_wave(**values: Any) -> DaggerBrain:
     settings = DaggerConfig(NoopConfig(), ReachBrainConfig(), **{**NOBODY, **values})
     return DaggerBrain(settings, Wave(), ReachBrain())
@@ -185,8 +179,6 @@ def test_an_episode_does_not_depend_on_those_beside_it() -> None:
             assert one.interventions == other.interventions
             assert one.commands == other.commands
 
-
-# --- datasets --------------------------------------------------------------------------------------------------------
 
 AVOID = {"brain__type": "dagger", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}
 TURNS = {"brain__patience_s": 1, "brain__hold_s": 1}
@@ -266,9 +258,6 @@ def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
         assert episode.plan["attempts"] >= 1
 
 
-# --- the log, and frames that went by on the wall clock --------------------------------------------------------------
-
-
 class Stub:
     """Says who drives."""
 
@@ -320,9 +309,6 @@ def test_what_ends_an_episode_is_not_overwritten() -> None:
 )
 def test_spans(mask: list[int], expected: list[tuple[int, int]]) -> None:
     assert spans(np.array(mask, np.bool_)) == expected
-
-
-# --- what the expert would do ----------------------------------------------------------------------------------------
 
 
 def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in_place_of_what_was_done(

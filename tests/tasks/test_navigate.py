@@ -42,9 +42,6 @@ def drive_to_goal(run: Run, steps: int = 50) -> None:
         run.frame((x, GOAL[1], 0.0))
 
 
-# --- scenes ----------------------------------------------------------------------------------------------------------
-
-
 @each_case(
     "config",
     [
@@ -94,9 +91,6 @@ def test_a_distance_that_no_arena_has_is_refused_with_what_it_has() -> None:
         NavigateTask(NavigateConfig(arena="empty", goal_clearance_m=3.5), 1, FPS)
 
 
-# --- what it tells ---------------------------------------------------------------------------------------------------
-
-
 @given(
     st.lists(st.floats(-5, 5), min_size=4, max_size=4),
     st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3),
@@ -127,9 +121,6 @@ def test_the_goal_is_reported_in_the_robots_frame() -> None:
             "goal_sin": math.sin(1.0 - math.pi / 2),
         }
     )
-
-
-# --- how it judges ---------------------------------------------------------------------------------------------------
 
 
 def test_success_needs_place_heading_rest_and_time() -> None:
@@ -216,9 +207,6 @@ def test_score_is_success_weighted_by_path_length() -> None:
     assert run.outcome().score == pytest.approx(0.5)
 
 
-# --- reward ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_rewards_of_a_success_sum_to_one_whatever_the_way() -> None:
     for detour in (0.0, 1.0, -2.9):
         run = Run()
@@ -260,9 +248,6 @@ def test_near_the_goal_turning_to_its_heading_is_rewarded() -> None:
     assert run.frame((*GOAL[:2], 0.0))[0] < -0.005
 
 
-# --- shortest ways ---------------------------------------------------------------------------------------------------
-
-
 def test_a_way_around_a_wall_has_the_length_of_its_geometry() -> None:
     wall = Shape("box", 0.0, -1.0, 0.0, 0.03, 2.0)  # leaves an opening at y > 1
     arena = replace(make_arena("empty", 0), start=(-1.0, -1.0, 0.0), goal=(1.025, -0.975, 0.0))
@@ -301,9 +286,6 @@ def test_between_grid_points_lengths_are_linear_and_outside_as_at_the_border() -
     mean = field.lengths[50, 70:72].mean()
     assert interpolate(fields, origin, middle[None])[0] == pytest.approx(mean)
     assert interpolate(fields, origin, np.array([[99.0, -99.0]]))[0] == field.lengths[0, -1]
-
-
-# --- wrong inputs ----------------------------------------------------------------------------------------------------
 
 
 @each_case("goal", [None, (math.nan, 0.0, 0.0), (1.0, 0.0, math.inf)])

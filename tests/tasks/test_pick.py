@@ -87,9 +87,6 @@ class Run(Judged):
         return self.judge(truth)
 
 
-# --- scenes ----------------------------------------------------------------------------------------------------------
-
-
 def corners(one: TableObject) -> np.ndarray:
     """Return points on the outline of an object, shape (k, 2)."""
     if one.kind == "cup":
@@ -166,9 +163,6 @@ def test_the_instruction_means_the_target_and_nothing_else(language: str, random
         assert 70 < chinese < 150
 
 
-# --- what the task reports to the brain ------------------------------------------------------------------------------
-
-
 def test_the_environment_state_is_what_its_names_say() -> None:
     task = PickTask(PickConfig(), 2, FPS)
     empty = TableScene("pick", SCENE.objects[:1], SCENE.posture, target_object=0)
@@ -226,9 +220,6 @@ def test_a_smaller_table_leaves_nothing_of_a_larger_one() -> None:
 def test_a_scene_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="names no object"):
         PickTask(PickConfig(), 1, FPS).begin(np.array([0]), [TableScene("empty", (), SCENE.posture)])
-
-
-# --- judging ---------------------------------------------------------------------------------------------------------
 
 
 def test_success_needs_the_whole_hold_time() -> None:
@@ -345,9 +336,6 @@ def test_places_without_an_object_lie_at_the_origin_and_are_nobody_s_business() 
     assert event[0] == Event.NOTHING
 
 
-# --- configuration ---------------------------------------------------------------------------------------------------
-
-
 @each_case(("least", "most"), [(0, 3), (1, 6), (3, 2), (-1, -1)])
 def test_an_impossible_number_of_objects_is_refused(least: int, most: int) -> None:
     with pytest.raises(ConfigError, match=f"min_objects is {least} and task.max_objects is {most}.*between 1 and 5"):
@@ -357,9 +345,6 @@ def test_an_impossible_number_of_objects_is_refused(least: int, most: int) -> No
 def test_an_unknown_language_is_an_error_with_the_valid_ones() -> None:
     with pytest.raises(ConfigError, match=r"task.language 'de'.*Valid: any, en, zh"):
         PickConfig(language="de")
-
-
-# --- what is held out, and what is asked for --------------------------------------------------------------------------
 
 
 def scenes(count: int = 60, **options) -> list[TableScene]:

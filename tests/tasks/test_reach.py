@@ -52,9 +52,6 @@ class Run(Judged):
         return self.judge(truth)
 
 
-# --- scenes ----------------------------------------------------------------------------------------------------------
-
-
 def test_every_target_can_be_reached_and_every_start_is_free() -> None:
     task = ReachTask(ReachConfig(), 1, FPS)
     places = []
@@ -121,9 +118,6 @@ def test_a_camera_error_moves_the_reported_target_and_not_the_judged_one() -> No
 def test_a_scene_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="no target pose"):
         ReachTask(ReachConfig(), 1, FPS).begin(np.array([0]), [TableScene("empty", (), ARM.home)])
-
-
-# --- judging ---------------------------------------------------------------------------------------------------------
 
 
 def test_success_needs_the_whole_hold_time() -> None:
@@ -196,6 +190,3 @@ def test_the_rewards_sum_to_the_share_of_the_way(path: list[float]) -> None:
     assert run.rewards[0] == pytest.approx(1 - path[-1] / path[0], abs=1e-9)
     assert run.outcome().score == pytest.approx(min(1.0, max(0.0, run.rewards[0])), abs=1e-9)
     assert run.outcome().details["error_m"] == pytest.approx(path[-1])
-
-
-# --- configuration ---------------------------------------------------------------------------------------------------

@@ -160,9 +160,6 @@ def test_a_least_delay_above_the_largest_is_refused() -> None:
         RandomisationConfig(latency_min_s=0.02, latency_s=0.01)
 
 
-# --- a camera that is not where it is taken to be ---------------------------------------------------------------------
-
-
 def test_a_camera_error_is_the_same_in_every_episode_and_changes_nothing_else_that_is_drawn() -> None:
     off = dataclasses.replace(ON, camera_error_m=[0.01, -0.02, 0.2])
     for make in (

@@ -35,9 +35,6 @@ def places(root):
     return [(source["why"], (source["start_ns"] - START) / NANO) for source in sources]
 
 
-# --- single messages that cannot be read -------------------------------------------------------------------------
-
-
 def shorten(bag, topic, places):
     """Cut messages of a topic of an SQLite bag short."""
     with sqlite3.connect(bag / f"{bag.name}.db3") as file:
@@ -88,9 +85,6 @@ def test_a_row_without_bytes_or_time_does_not_end_the_bag(tmp_path, messages, ca
     assert "1 of the 80 messages of /odom cannot be read" in error
     assert "1 messages that cannot be decompressed, or have no possible time" in error
     assert info.frames > 30
-
-
-# --- topics ------------------------------------------------------------------------------------------------------
 
 
 def test_a_topic_of_two_types_matters_only_if_it_is_read(tmp_path, capsys):
@@ -145,9 +139,6 @@ def test_other_commands_and_other_publishers_are_reported(tmp_path, messages, ca
         assert note in capsys.readouterr().err
         ours, theirs = read_episode(tmp_path / "a", 0), read_episode(tmp_path / f"d_{name}", 0)
         assert np.array_equal(ours["action"], theirs["action"])
-
-
-# --- restarts ----------------------------------------------------------------------------------------------------
 
 
 def reset_odometry(at, *, dx=0.0, turn=0.0):
@@ -264,9 +255,6 @@ def test_stamps_of_two_clocks_are_no_restart(tmp_path, messages, capsys):
     assert "which no restart explains" in capsys.readouterr().err
 
 
-# --- the same drive twice ----------------------------------------------------------------------------------------
-
-
 def test_the_same_drive_is_not_imported_twice(tmp_path, plain, messages, capsys):
     (tmp_path / "link").symlink_to(plain)
     (tmp_path / "hard.mcap").hardlink_to(plain / "plain.mcap")
@@ -283,9 +271,6 @@ def test_the_same_drive_is_not_imported_twice(tmp_path, plain, messages, capsys)
         error = capsys.readouterr().err
         assert f"{plain} and {other} hold the same drive" in error
         assert not (tmp_path / "d").exists()
-
-
-# --- what a bag is recorded with ---------------------------------------------------------------------------------
 
 
 def test_messages_of_an_unknown_compression_are_named(tmp_path, messages, capsys):
@@ -329,9 +314,6 @@ def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
     topics = [f"--{role}=/tb3_1/{topic}" for role, topic in (("scan", "scan"), ("odom", "odom"), ("cmd", "cmd_vel"))]
     assert run(write(tmp_path / "bag", named), tmp_path / "d", *topics) == 0
     assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
-
-
-# --- images and scanners ---------------------------------------------------------------------------------------
 
 
 def jpegs(count=40):

@@ -85,9 +85,6 @@ def simulated(tmp_path_factory):
     return root
 
 
-# --- in lockstep -----------------------------------------------------------------------------------------------------
-
-
 def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
     """A scan is up to 0.2 s old here, and still no frame is late, no episode is bad and no byte is another one."""
     strict = {"timing__max_age_s": 1e-6, "timing__max_late_frames": 0.0, "timing__reject": "true"}
@@ -103,9 +100,6 @@ def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
 def test_a_tolerance_in_the_configuration_is_checked(tmp_path):
     with pytest.raises(ConfigError, match=r"timing\.max_late_frames is 2"):
         run_record(tmp_path / "d", timing__max_late_frames=2)
-
-
-# --- the report ------------------------------------------------------------------------------------------------------
 
 
 def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
@@ -203,9 +197,6 @@ def test_info_shows_the_timing_that_fits_the_terminal(measured, simulated, capsy
     assert "simulated time" in capsys.readouterr().out
 
 
-# --- datasets of before, and of others -------------------------------------------------------------------------------
-
-
 def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "170")
     columns, _ = make_episode(0)
@@ -270,9 +261,6 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
         with pytest.raises(SystemExit) as stop:
             main.main(["timing", *arguments])
         assert stop.value.code == 2
-
-
-# --- the image, and words ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.thorough

@@ -348,9 +348,6 @@ def test_episodes_are_renumbered_without_a_gap(recorded: Recorded, tmp_path: Pat
     assert_valid(root)
 
 
-# --- no episode ever gets what is another's ---------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def sessions(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sessions of three episodes each, with a video of its own for each session."""

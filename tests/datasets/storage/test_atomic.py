@@ -42,9 +42,6 @@ def names(root: Path) -> list[str]:
     return sorted(path.relative_to(root).as_posix() for path in root.rglob("*"))
 
 
-# --- the place --------------------------------------------------------------------------------------------------------
-
-
 def test_files_of_others_in_a_dataset_stay_unchanged(root: Path) -> None:
     (root / "README.md").write_text("mine")
     (root / "own/deep/empty").mkdir(parents=True)
@@ -234,9 +231,6 @@ def test_unusual_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert support.read_back(tmp_path / "left") == 1
 
 
-# --- who else is there ------------------------------------------------------------------------------------------------
-
-
 def test_files_that_another_program_creates_at_the_place_stay(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -290,9 +284,6 @@ def test_two_moves_into_one_folder_exclude_each_other(root: Path, monkeypatch: p
     monkeypatch.setattr(Disk, "write", meanwhile)
     split(root, {"a": [0], "b": [1]}, folder)
     assert sorted(os.listdir(folder)) == ["a", "b", "mine"]
-
-
-# --- a move that was decided ------------------------------------------------------------------------------------------
 
 
 def half_moved(root: Path) -> None:
@@ -365,9 +356,6 @@ def test_a_foreign_marker_moves_nothing(root: Path, how: str) -> None:
     assert names(root.parent) == before
 
 
-# --- an edit that was not reported ------------------------------------------------------------------------------------
-
-
 class KilledError(Exception):
     pass
 
@@ -418,9 +406,6 @@ def test_after_an_unreported_edit_other_episode_numbers_are_refused_once(root: P
     assert names(root) == [name for name in before if name != layout.UNREPORTED]
     assert len(content(root)) == 2
     other(root)
-
-
-# --- signals ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

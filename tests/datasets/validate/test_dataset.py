@@ -113,9 +113,6 @@ def bad(found: DatasetCheck) -> list[Finding]:
     return [finding for finding in found.findings if finding.severity > Severity.NOTE]
 
 
-# --- valid -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
     before = snapshot(valid)
     found = check_dataset(valid, limits)
@@ -128,9 +125,6 @@ def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
 def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:
     root = loader_support.record_stock(tmp_path / "stock", cameras=True)
     assert [finding for finding in check_dataset(root).findings if finding.severity == Severity.ERROR] == []
-
-
-# --- damage ----------------------------------------------------------------------------------------------------------
 
 
 def nan(rows: dict[str, Any]) -> None:
@@ -402,9 +396,6 @@ def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(valid: Path, tm
         (root / name).write_text(json.dumps(value))
         with contextlib.suppress(DatasetError):
             assert check_dataset(root).frames in {0, 135}
-
-
-# --- edits by LeRobot ------------------------------------------------------------------------------------------------
 
 
 def record_with_lerobot(root: Path) -> Path:

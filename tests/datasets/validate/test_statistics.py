@@ -140,9 +140,6 @@ def test_the_rounding_of_lerobots_statistics_is_within_the_bounds(n: int, value:
     assert wrong_statistic(stored, Moments.of(values), n) is None
 
 
-# --- deviations that were rounded away -------------------------------------------------------------------------------
-
-
 def far_from_zero(episode: int, values: foreign.Columns) -> None:
     rng = np.random.default_rng([7, episode])
     size = values["observation.state"].shape

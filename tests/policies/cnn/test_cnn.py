@@ -52,9 +52,6 @@ def batch(made: CnnConfig, samples: dict[str, Tensor]) -> dict[str, Tensor]:
     return make_pre_post_processors(made)[0]({key: values.clone() for key, values in samples.items()})
 
 
-# --- inputs -----------------------------------------------------------------------------------------------------------
-
-
 def test_neither_scan_nor_speed_nor_the_origin_of_odometry_changes_an_action_but_images_and_motion_do() -> None:
     made = config()
     policy, samples = CnnPolicy(made).eval(), raw()
@@ -108,9 +105,6 @@ def test_things_stay_where_they_are_while_the_robot_moves() -> None:
         assert found.numpy() == pytest.approx(wanted, abs=2e-3)
 
 
-# --- learning ---------------------------------------------------------------------------------------------------------
-
-
 def test_it_learns_what_the_image_shows() -> None:
     made = config(n_obs_steps=2, optimizer_lr=3e-3)
     samples = raw(64, images=2)
@@ -138,12 +132,6 @@ def test_only_the_loss_of_the_ranges_depends_on_them() -> None:
     assert torch.equal(policy.forward(ready)[0], policy.forward(other)[0])
     policy.config.range_weight = 0.5
     assert policy.forward(ready)[0] != policy.forward(other)[0]
-
-
-# --- acting -----------------------------------------------------------------------------------------------------------
-
-
-# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def test_it_knows_the_statistics_as_a_perceptron_does() -> None:

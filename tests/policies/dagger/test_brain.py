@@ -89,9 +89,6 @@ def made(n: int = 1, **values: Any) -> tuple[DaggerBrain, Fake, Fake]:
     return brain, learner, expert
 
 
-# --- turns -----------------------------------------------------------------------------------------------------------
-
-
 def test_the_expert_drives_to_the_end_and_the_learner_does_not_act_any_more() -> None:
     brain, learner, expert = made(patience_s=0.5)
     actions, taken = [], []
@@ -142,9 +139,6 @@ def test_a_simulation_that_is_not_running_is_not_flagged() -> None:
     assert brain.interventions().tolist() == [True, False]
 
 
-# --- what is refused -------------------------------------------------------------------------------------------------
-
-
 def test_times_and_shares_are_positive() -> None:
     for name in ("collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"):
         for value in (0, -1.0, math.inf, math.nan):
@@ -187,9 +181,6 @@ def test_the_parameters_name_both_and_are_plain() -> None:
     assert parameters["hold_s"] == 2.0
     assert parameters["learner"] == {"type": "random", "period_s": 1.0, "scale": 0.5}
     assert parameters["expert"]["type"] == "gap_follower"
-
-
-# --- when ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or_backs_off_is_not() -> None:
@@ -241,9 +232,6 @@ def test_disagreement_counts_only_if_it_lasts() -> None:
     for turn in (wide, wide, 0.0, wide, wide, wide, wide):
         looks.append(bool(watch.check(base(), np.zeros((1, 2)), np.array([[0.0, turn]]))[0]))
     assert looks == [False, False, False, False, False, True, True]
-
-
-# --- an expert that gives goals ---------------------------------------------------------------------------------------
 
 
 class Table(Desk):

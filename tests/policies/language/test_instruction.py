@@ -67,8 +67,6 @@ def scenes(draw: Callable[..., Any], smallest: int = 1) -> list[SceneObject]:
     ]
 
 
-# --- what is understood ----------------------------------------------------------------------------------------------
-
 HOLD, GIVE = Skill.HOLD, Skill.HAND_OVER
 
 
@@ -185,9 +183,6 @@ def test_impossible_requests_for_instructions_are_refused(arguments: tuple[Any, 
         instructions_for(SCENE, *arguments)
 
 
-# --- names -----------------------------------------------------------------------------------------------------------
-
-
 @each_case(("colour", "kind"), list(itertools.product(COLOURS, KINDS)))
 def test_every_colour_and_kind_has_words_in_both_languages(colour: str, kind: str) -> None:
     one = thing(0, f"{colour} {kind}")
@@ -202,9 +197,6 @@ def test_names_are_those_that_people_use() -> None:
     assert chinese(SCENE[BIG_BOX]) == "蓝色盒子"
     for language in (ENGLISH, CHINESE):
         assert set(language.names) >= {*COLOURS, *KINDS, *Relation}
-
-
-# --- what is refused -------------------------------------------------------------------------------------------------
 
 
 @each_case(

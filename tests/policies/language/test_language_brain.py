@@ -122,9 +122,6 @@ def test_an_object_that_was_not_seen_is_not_on_the_table() -> None:
     assert place(one, 1) == pytest.approx((CUP.x, CUP.y))
 
 
-# --- what follows the lift -------------------------------------------------------------------------------------------
-
-
 def test_to_hand_over_is_to_bring_it_beside_the_table_and_keep_it() -> None:
     one = desk("hand me the red cup")
     one.look()
@@ -198,9 +195,6 @@ def test_a_planner_that_names_something_else_picks_nothing() -> None:
     one = desk("x", planner=Confused())
     assert one.look() == {}
     assert one.brain.subtasks()[0] == "cannot: the object is gone"
-
-
-# --- in the simulator ------------------------------------------------------------------------------------------------
 
 
 def test_it_picks_what_the_task_asks_for_in_both_languages() -> None:

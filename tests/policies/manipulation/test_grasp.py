@@ -161,9 +161,6 @@ def test_finger_tips_stay_above_the_table_and_the_palm_above_the_object(height: 
     assert grasp.pose(0.2).position == (grasp.x, grasp.y, 0.2)
 
 
-# --- what a brain sees -----------------------------------------------------------------------------------------------
-
-
 def row(**values: float) -> list[float]:
     usual = {"present": 1.0, "qw": 1.0, "x": 0.5, "z": 0.05, "length": 0.06, "width": 0.06, "height": 0.1}
     return [{**usual, **values}.get(name, 0.0) for name in OBJECT_FIELDS]

@@ -29,9 +29,6 @@ def grasp(desk: Desk, sim: int = 0, opening: float = GRASPED) -> None:
     desk.state[sim, 1] = opening
 
 
-# --- the sequence ----------------------------------------------------------------------------------------------------
-
-
 def test_above_down_close_lift_and_done() -> None:
     desk = Desk(PickBrain(), [scene(CUP, BOX)])
     above = desk.look()[0]
@@ -126,9 +123,6 @@ def test_results_of_other_goals_are_not_its_own() -> None:
     new = desk.look({0: [*stray, mine], 7: [mine]})
     assert set(new) == {0}
     assert desk.steps(0) == ["above", "down"]
-
-
-# --- what goes wrong -------------------------------------------------------------------------------------------------
 
 
 def test_a_missed_grasp_is_tried_exactly_once_more() -> None:
@@ -230,9 +224,6 @@ def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     assert "green box does not fit" in desk.brain.plan(0)["problem"]
 
 
-# --- many, again -----------------------------------------------------------------------------------------------------
-
-
 def test_simulations_do_not_influence_each_other() -> None:
     """Three at once, each with a story of its own, and the same three alone."""
     scenes = [scene(CUP), scene(BOX, CUP), scene(CUP, BOX, target=1)]
@@ -275,9 +266,6 @@ def test_a_new_episode_starts_from_nothing() -> None:
 def test_a_task_that_reports_no_objects_is_refused() -> None:
     with pytest.raises(ConfigError, match="'pick' needs the environment feature"):
         PickBrain().bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
-
-
-# --- in the simulator ------------------------------------------------------------------------------------------------
 
 
 def test_it_picks() -> None:

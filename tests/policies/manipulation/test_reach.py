@@ -134,9 +134,6 @@ def test_a_task_without_a_target_is_refused() -> None:
         ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, ()))
 
 
-# --- in the simulator ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("randomised", [False, True])
 def test_it_reaches(randomised: bool) -> None:
     config = ReachConfig(randomisation=RandomisationConfig(enabled=randomised))

@@ -41,9 +41,6 @@ def planned(text: Any, instruction: str = "hand me the red cup") -> Plan:
     return planner.plan(instruction, SCENE)
 
 
-# --- plans -----------------------------------------------------------------------------------------------------------
-
-
 @each_case("end", [(Skill.HOLD,), (Skill.PLACE,), (Skill.HAND_OVER,), (Skill.HOLD, Skill.PLACE)])
 def test_a_plan_in_order_can_be_built(end: tuple[Skill, ...]) -> None:
     plan = make_plan("x", CUP, [*LIFT, *end])
@@ -99,9 +96,6 @@ def test_every_skill_has_words_of_its_own_and_can_be_reached() -> None:
     assert issubclass(InstructionError, ValueError)
 
 
-# --- objects ---------------------------------------------------------------------------------------------------------
-
-
 def test_an_object_on_the_table_has_its_centre_and_its_edges() -> None:
     thing = TableObject("box", "green", size_x=0.03, size_y=0.02, height=0.05, x=0.4, y=-0.1)
     listed = SceneObject.from_table(2, thing)
@@ -125,9 +119,6 @@ def test_impossible_objects_are_refused(change: dict[str, Any], message: str) ->
     fields: dict[str, Any] = {"kind": "cup", "colour": "red", "position": (0.5, 0.2, 0.0), "size": (0.1, 0.1, 0.1)}
     with pytest.raises(ConfigError, match=message):
         SceneObject(0, **{**fields, **change})
-
-
-# --- a language model ------------------------------------------------------------------------------------------------
 
 
 @each_case("text", [answer(), answer(obj=None), f"```json\n{answer()}\n```", f"\n```\n{answer()}\n```\n"])

@@ -59,9 +59,6 @@ def batch(made: MlpConfig, rows: int = 5, seed: int = 0) -> dict[str, Tensor]:
     return result
 
 
-# --- inputs -----------------------------------------------------------------------------------------------------------
-
-
 def test_it_sees_every_number_once_oldest_first() -> None:
     made = config(n_obs_steps=2)
     policy, given = MlpPolicy(made), batch(made)
@@ -224,9 +221,6 @@ def test_cameras_are_left_alone() -> None:
     assert made.image_features == {}
 
 
-# --- losses -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("loss", ["l1", "mse", "huber", "nll"])
 def test_the_loss_is_what_its_name_says_and_leaves_padding_out(loss: str) -> None:
     made = config(loss=loss, gaussian=loss == "nll", initial_log_std=-0.3)
@@ -308,9 +302,6 @@ def test_where_two_ways_are_shown_it_takes_the_likelier_and_not_what_is_between_
     assert float((forward - state[:, 1].sin()).abs().mean()) < 0.15
 
 
-# --- acting -----------------------------------------------------------------------------------------------------------
-
-
 def test_samples_scatter_as_the_deviation_says() -> None:
     made = config(gaussian=True, initial_log_std=math.log(0.2))
     policy, given = MlpPolicy(made), batch(made, rows=1)
@@ -321,12 +312,6 @@ def test_samples_scatter_as_the_deviation_says() -> None:
     torch.manual_seed(1)
     drawn = torch.stack([policy.predict_action_chunk(given) for _ in range(500)])
     assert drawn.std(0).mean().item() == pytest.approx(0.2, rel=0.1)
-
-
-# --- weights in and out -----------------------------------------------------------------------------------------------
-
-
-# --- refused ----------------------------------------------------------------------------------------------------------
 
 
 def test_features_that_it_cannot_be_built_for() -> None:
@@ -358,9 +343,6 @@ def test_batches_that_it_cannot_read() -> None:
         policy.features({key: value[:, 0] for key, value in given.items()})
     with pytest.raises(ConfigError, match="nothing to sample from"):
         policy.predict_action_chunk(given, noise=torch.zeros(5, 4, 2))
-
-
-# --- objects in any order --------------------------------------------------------------------------------------------
 
 
 def told_of_objects(rows: int = 40) -> Tensor:
@@ -412,8 +394,6 @@ def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
     ]
     assert torch.equal(*chunks)
 
-
-# --- changes of positions --------------------------------------------------------------------------------------------
 
 STATS = {
     OBS_STATE: {"mean": torch.linspace(-1, 1, 10), "std": torch.linspace(0.1, 2, 10)},

@@ -62,9 +62,6 @@ def random_scans(n: int, beams: int = 360, seed: int = 0) -> np.ndarray:
     return np.clip(scale * (0.6 + smooth / 2), 0.12, 3.5)
 
 
-# --- decisions -------------------------------------------------------------------------------------------------------
-
-
 @each_case("beams", BEAMS)
 def test_it_drives_straight_in_the_open(beams: int) -> None:
     assert tuple(decide(np.full(beams, 3.5))[0]) == (0.22, 0.0)
@@ -135,9 +132,6 @@ def test_a_measured_twist_that_is_no_number_does_no_lasting_harm() -> None:
     assert np.array_equal(see(brain, scan), see(other, scan))
 
 
-# --- memory ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("side", [-1, 1])
 def test_new_ground_attracts(side: int) -> None:
     """Two ways are equally free; the robot takes the one that it did not come from."""
@@ -171,9 +165,6 @@ def test_an_unexpected_number_of_robots_is_refused() -> None:
         see(bound(90, 2), np.full((3, 90), 1.0))
 
 
-# --- configuration ---------------------------------------------------------------------------------------------------
-
-
 @each_case("beams", [1, 12, 30])
 def test_too_few_beams_are_refused(beams: int) -> None:
     with pytest.raises(ConfigError, match=f"needs at least 36 beams; this robot has {beams}"):
@@ -183,9 +174,6 @@ def test_too_few_beams_are_refused(beams: int) -> None:
 def test_the_measured_twist_is_needed() -> None:
     with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
         GapFollowerBrain().bind(RobotFeatures(("x.vel", *names_of(90)[2:]), ACTIONS, 10, body=BURGER))
-
-
-# --- the table -------------------------------------------------------------------------------------------------------
 
 
 def test_straight_ahead_the_table_is_plain_geometry() -> None:
@@ -236,9 +224,6 @@ def test_an_obstacle_on_a_path_is_met_where_the_path_comes_to_it() -> None:
             assert table.clear(table.rows(scan), 0)[0, path] * QUANTUM <= length
 
 
-# --- n ---------------------------------------------------------------------------------------------------------------
-
-
 def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
     n, steps = 7, 60
     rng = np.random.default_rng(4)
@@ -267,9 +252,6 @@ def test_episodes_do_not_depend_on_how_many_run() -> None:
     seeds = [episode_seed(3, episode, "train") for episode in range(7)]
     together = run(GapFollowerBrain(), seeds, 7, seconds=6)
     assert run(GapFollowerBrain(), seeds[:3], 1, seconds=6) == together[:3]
-
-
-# --- in simulation ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("beams", [36, 360])

@@ -60,9 +60,6 @@ def run(scenes: list[Arena] | list[int], n: int = 8) -> list[Episode]:
     return list(loop.run([EpisodeSpec(index, index) for index in range(len(scenes))]))
 
 
-# --- decisions -------------------------------------------------------------------------------------------------------
-
-
 @each_case("beams", [36, 90, 360])
 def test_it_drives_to_a_goal_ahead(beams: int) -> None:
     forward, turn = see(bound(beams=beams), goal_at(3.0, 0.0), np.full(beams, 3.5))[0]
@@ -139,9 +136,6 @@ def test_blind_it_stops_and_sees_again(blind: float) -> None:
     assert see(brain, goal_at(2.0, 0.0))[0, 0] > 0.19
 
 
-# --- map -------------------------------------------------------------------------------------------------------------
-
-
 def test_ways_lead_around_what_was_seen_and_are_planned_again_only_where_it_is_in_the_way() -> None:
     goal_map = GoalMap(1)
     assert goal_map.blocked[0]
@@ -177,9 +171,6 @@ def test_beyond_the_map_the_distance_counts() -> None:
     assert see(bound(), goal_at(30.0, 0.0))[0, 0] > 0.19  # it sets off
 
 
-# --- what it achieves ------------------------------------------------------------------------------------------------
-
-
 def test_it_reaches_goals_without_touching_anything() -> None:
     seeds = [episode_seed(0, episode, "held_out") for episode in range(6)]
     outcomes = [episode.outcome for episode in run(seeds)]
@@ -202,9 +193,6 @@ def test_an_episode_does_not_depend_on_how_many_run_beside_it() -> None:
     for one, other in zip(run(seeds, 1), run(seeds, 2), strict=True):
         assert one.outcome == other.outcome
         assert all(np.array_equal(value, other.columns[key]) for key, value in one.columns.items())
-
-
-# --- wrong inputs ----------------------------------------------------------------------------------------------------
 
 
 def test_a_task_without_a_goal_is_refused_with_what_is_missing() -> None:

@@ -56,9 +56,6 @@ def trained() -> PerceptionPolicy:
     return policy
 
 
-# --- labels -----------------------------------------------------------------------------------------------------------
-
-
 def test_labels_are_what_the_brain_that_knows_the_truth_reads() -> None:
     values = states(20, randomisation=RandomisationConfig(enabled=True))
     labels = Labels.of(torch.from_numpy(values))
@@ -80,9 +77,6 @@ def test_the_labels_of_cells_are_those_of_the_object_that_they_name() -> None:
     for index in np.ndindex(3, 4, 6):
         assert torch.equal(chosen.position[index], labels.position[index[0], places[index]])
         assert chosen.colour[index] == labels.colour[index[0], places[index]]
-
-
-# --- learning and seeing ----------------------------------------------------------------------------------------------
 
 
 def test_it_finds_what_it_was_not_shown(trained: PerceptionPolicy) -> None:
@@ -172,9 +166,6 @@ def test_an_image_without_objects_is_learned_from_and_nothing_is_found_twice(tra
     for found in trained.detect(painted(states(40))):
         apart = torch.cdist(found.position[:, :2], found.position[:, :2]) + torch.eye(len(found.presence))
         assert not len(apart) or float(apart.min()) > 0.02
-
-
-# --- what it refuses --------------------------------------------------------------------------------------------------
 
 
 def test_images_of_another_size_and_calls_for_actions(trained: PerceptionPolicy) -> None:
@@ -289,8 +280,6 @@ def test_what_is_learned_of_colours_is_nothing_of_kinds_and_the_other_way_round(
     assert others
     assert not moved["colour"] & others
 
-
-# --- a camera that was moved ------------------------------------------------------------------------------------------
 
 MOVED = CameraView((1.24, -0.63, 0.80), (0.42, -0.03, 0.12), SCENE_CAMERA.fovy, 0.04)
 

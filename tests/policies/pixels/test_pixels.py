@@ -57,9 +57,6 @@ def present(samples: dict[str, Tensor], frame: int = 0) -> dict[str, Tensor]:
     return {**shown, OBS_LANGUAGE_TOKENS: samples[OBS_LANGUAGE_TOKENS]}
 
 
-# --- learning ---------------------------------------------------------------------------------------------------------
-
-
 def test_it_learns_to_look_at_what_is_named() -> None:
     policy = PixelsPolicy(made(freeze=False, pointing_weight=1.0, n_cells=10_000))
     optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
@@ -154,9 +151,6 @@ def test_actions_behind_the_end_do_not_count() -> None:
     assert policy.forward(samples)[0] != policy.forward(mild)[0]
 
 
-# --- acting -----------------------------------------------------------------------------------------------------------
-
-
 def test_it_looks_at_the_first_image_only_and_says_what_it_learned_to_say() -> None:
     policy, samples = PixelsPolicy(made()).eval(), batch()
     chunk = policy.predict_action_chunk(present(samples))
@@ -208,9 +202,6 @@ def test_the_room_behind_an_instruction_does_not_matter() -> None:
     assert torch.allclose(*seen, atol=1e-6)
 
 
-# --- checkpoints ------------------------------------------------------------------------------------------------------
-
-
 def save(folder: Path, policy: Any) -> Path:
     policy.save_pretrained(folder)
     for pipeline in make_pre_post_processors(policy.config, dataset_stats={}):
@@ -255,9 +246,6 @@ def test_a_checkpoint_that_is_no_perception_is_named(tmp_path: Path) -> None:
         ConfigError, match=r"policy\.perception is .*, a 'bhd_pixels'; perception is a 'bhd_perception'"
     ):
         PixelsPolicy(made(perception=str(path)))
-
-
-# --- bad input --------------------------------------------------------------------------------------------------------
 
 
 def test_an_instruction_is_needed_and_never_cut_off() -> None:
