@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
-from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
 from bhd_lerobot.control.motion.supervision import Supervisor
@@ -249,13 +249,6 @@ class GoalManager:
                 if self._serve(sim, reference):
                     self._changed(sim)
         self._player.tick(position, velocity, acceleration)
-
-    def convert(self, sim: int, command: BrainCommand, reference: Reference) -> Plan | PlanFailure:
-        """Turn a goal into a trajectory that starts in the reference; changes nothing."""
-        position, velocity, acceleration = (array[sim] for array in reference)
-        return self.planner.plan(
-            command, position, velocity, acceleration, opening=self._opening[sim], held=self._held[sim]
-        )
 
     # --- the state machine -------------------------------------------------------------------------------------------
 

@@ -270,6 +270,14 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
 
 
+def test_servo_effort_is_zero_at_rest() -> None:
+    rig = Rig()
+    rig.tick(10)
+    state = rig.cerebellum.state(rig.now)
+    assert np.abs(state.joint_efforts).max() < 1e-9
+    assert state.odometry.shape == (1, 0)
+
+
 actions = st.one_of(
     st.tuples(st.just("goal"), st.floats(-1, 1)),
     st.tuples(st.just("setpoint"), st.floats(-1, 1)),
