@@ -367,6 +367,7 @@ def test_the_real_time_process_stays_light(packages: tuple[str, ...], unwanted: 
     assert imported_with(modules, unwanted) == []
 
 
+@pytest.mark.thorough
 def test_recording_and_evaluating_rules_start_without_what_networks_need() -> None:
     unwanted = ("diffusers", "torchvision", "transformers", "datasets", "lerobot.configs", "lerobot.datasets")
     programs = [f"{PACKAGE}.cli.record", f"{PACKAGE}.cli.evaluate"]

@@ -156,6 +156,7 @@ except VersionError as error:
 """
 
 
+@pytest.mark.thorough
 def test_only_arms_need_ruckig_and_say_how_to_get_it() -> None:
     program = [sys.executable, "-c", WITHOUT_RUCKIG]
     done = subprocess.run(program, capture_output=True, text=True, check=True, cwd=ROOT)

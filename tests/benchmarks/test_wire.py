@@ -7,7 +7,7 @@ from benchmarks import wire
 from bhd_lerobot.control.guard import Guard
 
 
-@pytest.mark.thorough(but=2)
+@pytest.mark.thorough
 @pytest.mark.parametrize("space", wire.SPACES)
 def test_nothing_unsafe_is_written(space: str) -> None:
     with np.errstate(all="ignore"):
@@ -17,7 +17,7 @@ def test_nothing_unsafe_is_written(space: str) -> None:
     assert vandalised.faults > 0  # the guard had something to do, and the robots went on after a reset
 
 
-@pytest.mark.thorough(but=1)
+@pytest.mark.thorough
 @pytest.mark.parametrize("space", wire.NEEDED)
 def test_whatever_is_read_a_stop_is_followed_by_no_more_motion_than_it_needs(space: str) -> None:
     for lie in wire.LIES:

@@ -132,6 +132,7 @@ def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> 
     return arms
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("declared", [False, True])
 def test_late_servos_follow_far_setpoints_and_goals_without_a_protective_stop(declared: bool) -> None:
     arms, random = late_arms(0.05, declared), np.random.default_rng(0)

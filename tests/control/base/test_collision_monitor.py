@@ -65,6 +65,7 @@ def drive(
     return touched, limits, report.mode, np.array(applied)
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize(("stream", "seconds"), [(straight, 8.0), (backward, 8.0), (circles, 15.0), (anything, 15.0)])
 def test_whoever_commands_it_a_base_touches_nothing(stream: Stream, seconds: float) -> None:
     touched, *_ = drive(stream, seconds, monitor=False, enough=3)

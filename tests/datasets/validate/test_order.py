@@ -155,6 +155,7 @@ def test_a_dataset_in_order_has_no_finding(tmp_path: Path) -> None:
         assert served(root) == truth(foreign.LENGTHS)
 
 
+@pytest.mark.thorough(but=8)
 @pytest.mark.parametrize("case", CASES)
 def test_another_order_is_found_and_corrected(tmp_path: Path, case: str) -> None:
     damage, check, where, by_fix, by_repair = CASES[case]

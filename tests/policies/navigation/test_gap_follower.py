@@ -280,6 +280,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     assert outside.all()
 
 
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("beams", [36, 180])
 def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
     outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
@@ -287,6 +288,7 @@ def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
     assert all(outcome.details["path_m"] > 4 for outcome in outcomes)
 
 
+@pytest.mark.thorough
 def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
     seeds = [episode_seed(7, episode, "train") for episode in range(5)]
     old, new = (run(brain, seeds, len(seeds), seconds=30) for brain in (AvoidanceBrain(), GapFollowerBrain()))

@@ -156,6 +156,7 @@ def test_a_quarter_of_a_turn_is_all_that_the_yaw_of_a_square_can_be_wrong_by() -
         assert torch.allclose(error, torch.full_like(error, wanted), atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_an_image_without_objects_is_learned_from_and_nothing_is_found_twice(trained: PerceptionPolicy) -> None:
     loss, _ = (
         PerceptionPolicy(config())
@@ -291,6 +292,7 @@ def errors(policy: PerceptionPolicy, samples: dict[str, torch.Tensor]) -> float:
         return policy.forward(samples)[1]["error_mm"]
 
 
+@pytest.mark.thorough
 def test_tables_before_a_moved_camera_bring_back_what_the_move_cost(trained: PerceptionPolicy) -> None:
     policy, values = copy.deepcopy(trained), states(540, max_objects=2)[500:]
     labels = torch.from_numpy(values).float()
