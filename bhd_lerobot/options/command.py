@@ -33,6 +33,8 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
     `interrupted` and gives 130, and the status is that of other programs where nothing reads what is printed, as of
     ``| head -1``.
     """
+    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         try:
             return program() or 0
@@ -94,8 +96,6 @@ def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequen
     from bhd_lerobot.options.parse import CommandLine, parse, read_line
     from bhd_lerobot.options.plugins import load_named, load_plugins
 
-    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     interrupted = "Stopped."
 
     def configured() -> int | None:
