@@ -35,6 +35,8 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=12.5, help="of the animation, in real time")
     parser.add_argument("--colors", type=int, default=96)
     options = parser.parse_args()
+    if not (options.root / "meta/info.json").is_file():
+        parser.error(f"{options.root} is not a LeRobot dataset: record one as above")
     dataset = LeRobotDataset("local/animation", root=options.root, episodes=[options.episode], video_backend="pyav")
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), SIZE)
     pictures = []
