@@ -61,7 +61,7 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
     refuse_overlap(root, remote)
     if select is not None and not remote.has_checksums:
         raise ConfigError(
-            f"{remote.name} is a URL, of which only whole datasets are pulled. Pull it whole, then run bhd-data filter."
+            f"{remote.name} is a URL, of which only whole datasets are pulled. Do that, then run bhd-data filter."
         )
     with write_errors("pull the dataset", root, "The dataset itself was not changed."):
         complete_interrupted(root)
