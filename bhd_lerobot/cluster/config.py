@@ -69,6 +69,11 @@ def check_engine(config: Any) -> None:
         if config.ray != RayConfig():
             raise ConfigError("Options of ray are set, but engine is 'local'; add --engine=ray, or leave them out.")
         return
+    if not hasattr(config.robot, "clock"):
+        raise ConfigError(
+            f"robot.type is {config.robot.type!r}, a robot of its own, and engine is 'ray'; a cluster runs simulated "
+            "robots. Use --engine=local."
+        )
     if config.robot.clock == "realtime":
         raise ConfigError(
             "robot.clock is 'realtime' and engine is 'ray': a robot on the wall clock runs where its real-time process "

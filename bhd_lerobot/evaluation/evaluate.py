@@ -30,7 +30,7 @@ from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.preview import Preview
-from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
+from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_notes, progress_bars
 from bhd_lerobot.rollout.provenance import versions
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
@@ -144,7 +144,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         pool = None if config.engine == "local" else cluster.enter_context(open_pool(config.ray, console))
         runs = [prepare(config, label, robots, pool) for label in config.chosen]
-        print_refusals(robots, console)
+        print_notes(robots, console)
         if (
             pool is None
             and robots.camera_shapes
@@ -175,7 +175,8 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
-        fault = robots.problem if any(brain_run.loop.fault for brain_run in runs) else None
+        faulty = [brain_run.loop for brain_run in runs if brain_run.loop.fault]
+        fault = faulty[0].problem or robots.problem if faulty else None
     results = summarise(
         facts,
         _versions(),

@@ -5,7 +5,9 @@ one with an entry point of the group `ENTRY_POINTS`, or a module that a command 
 ``--….discover_packages_path``. It registers what it has while it is imported.
 """
 
+import contextlib
 import importlib
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -47,6 +49,24 @@ def import_plugins() -> Iterator[tuple[str, str]]:
         except Exception as error:  # whatever a module raises while it is imported
             reason = " ".join(f"{type(error).__name__}: {error}".split())
         yield name, reason
+
+
+def load_lerobot(module: str) -> None:
+    """Import all of LeRobot's robots, teleoperators or cameras, which register themselves.
+
+    One whose driver is not installed is left out: it says what it needs when it is made.
+
+    Args:
+        module: `lerobot.robots`, `lerobot.teleoperators`, `lerobot.cameras`, or a module in one of them; nothing is
+            done for others.
+    """
+    package = ".".join(module.split(".")[:2])
+    if package not in ("lerobot.robots", "lerobot.teleoperators", "lerobot.cameras"):
+        return
+    for found in pkgutil.iter_modules(importlib.import_module(package).__path__, f"{package}."):
+        if found.ispkg:
+            with contextlib.suppress(Exception):  # whatever a driver raises while it is imported
+                importlib.import_module(found.name)
 
 
 def misnamed() -> list[tuple[str, str]]:

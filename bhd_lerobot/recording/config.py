@@ -1,7 +1,7 @@
 """Configuration of `bhd-record`."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from lerobot.robots.config import RobotConfig
 
@@ -11,8 +11,11 @@ from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig
+from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.recording.live_view import check_options
-from bhd_lerobot.registry import check_brain, check_robot_and_task
+from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 
@@ -48,15 +51,23 @@ class DatasetConfig:
     tags: list[str] = field(default_factory=list)
 
 
+_FPS = 30  # frames a second of a robot whose configuration does not say it, as with LeRobot's recorder [Hz]
+
+
 @dataclass
 class RecordConfig:
-    """Record episodes of a simulated robot, driven by a brain, into a LeRobotDataset.
+    """Record episodes of a robot, driven by a brain or a person, into a LeRobotDataset.
 
     Attributes:
         robot: the robot; its `fps` is the dataset's.
         dataset: what is recorded and where.
+        task: what it is to achieve, and where; `free` if nothing.
         brain: what drives the robot.
-        task: what it is to achieve, and where.
+        teleop: the teleoperator with which a person drives the robot or, beside a brain, takes over from it; short for
+            `brain.type=teleop`. Every one of LeRobot and of plug-ins.
+        map: where the robot's actions come from in the teleoperator's, see the brain `teleop`.
+        processor: what stands between teleoperator and robot, see the brain `teleop`.
+        gate: what is let through to a robot of another package.
         timing: how unpunctual frames may be, and what becomes of an episode with too many of them.
         seed: every episode's seed follows from this and its number.
         split: `train`, `validation` or `held_out`: which set of seeds.
@@ -82,8 +93,12 @@ class RecordConfig:
     """
 
     robot: RobotConfig
-    brain: BrainConfig
-    task: TaskConfig
+    task: TaskConfig = field(default_factory=FreeConfig)
+    brain: BrainConfig | None = None
+    teleop: PersonConfig | None = None
+    map: dict[str, Any] = field(default_factory=dict)
+    processor: str = ""
+    gate: GateConfig = field(default_factory=GateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     timing: TimingTolerance = field(default_factory=TimingTolerance)
     seed: int = 0
@@ -110,7 +125,7 @@ class RecordConfig:
                 raise ConfigError("dataset.push_to_hub is true: set --dataset.repo_id=user/name, or leave it out.")
             self.dataset.repo_id = local_name(self.dataset.root)
         check_robot_and_task(self.robot, self.task, "bhd-record")
-        check_brain("brain", self.brain, self.robot.type)
+        self._settle_brain()
         for name, value in (
             ("dataset.num_episodes", self.dataset.num_episodes),
             ("n_envs", self.n_envs),
@@ -126,6 +141,10 @@ class RecordConfig:
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot
+        if not is_ours(robot.type):
+            self.dataset.fps = self.dataset.fps or _FPS
+            self._settle_duration()
+            return
         if self.dataset.fps == 0:
             self.dataset.fps = robot.fps
         if robot.fps not in (self.dataset.fps, type(robot).fps):
@@ -135,6 +154,30 @@ class RecordConfig:
             )
         robot.fps = self.dataset.fps
         _ = robot.rates
+        self._settle_duration()
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the robot runs on the wall clock."""
+        return not is_ours(self.robot.type) or cast(Any, self.robot).clock == "realtime"
+
+    def _settle_brain(self) -> None:
+        """Put the teleoperator into the place of the brain, if there is no other."""
+        person = TeleopConfig(self.teleop, self.map, self.processor) if self.teleop is not None else None
+        if person is None and (self.map or self.processor):
+            raise ConfigError("map and processor belong to a teleoperator; set --teleop.type as well.")
+        if self.brain is None:
+            if person is None:
+                raise ConfigError("Nothing drives the robot; set --brain.type, or --teleop.type for a person.")
+            self.brain, self.teleop, self.map, self.processor = person, None, {}, ""
+        check_brain("brain", self.brain, self.robot.type)
+        if (self.teleop is not None or isinstance(self.brain, TeleopConfig)) and not self.is_live:
+            raise ConfigError(
+                "A person drives on the wall clock, and robot.clock is 'lockstep', on which time advances as fast as "
+                "this machine can simulate. Add --robot.clock=realtime."
+            )
+
+    def _settle_duration(self) -> None:
         if self.dataset.episode_time_s is not None:
             if not 0 < self.dataset.episode_time_s < float("inf"):
                 raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")

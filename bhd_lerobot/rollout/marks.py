@@ -45,6 +45,11 @@ class Marks:
             else:
                 self._driving.discard(simulation)
 
+    def is_driving(self, simulation: int = 0) -> bool:
+        """Return whether an intervention is on in a simulation."""
+        with self._lock:
+            return simulation in self._driving
+
     def on_key(self, keys: bytes) -> None:
         """Take keys of a terminal; see `KEYS`. They mean the first simulation."""
         for key in keys.decode("ascii", "ignore").lower():

@@ -27,6 +27,7 @@ WATCHDOG = "control.watchdog"
 MODE = "control.mode"
 EFFORT = "control.effort"
 WRENCH = "control.wrench"
+IMAGE_AGE = "control.image_age"
 EXPERT_ACTION = "expert.action"
 
 REWARD = "next.reward"

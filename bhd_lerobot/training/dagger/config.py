@@ -8,6 +8,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options import parse as configuration
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.training.arguments import parse_train
@@ -115,7 +116,7 @@ def read_stages(config: AggregationConfig) -> Stages:
     """Return what the configurations say, so that what is wrong in one of them is known before the first round."""
     expert = configuration.parse(RecordConfig, command(config.expert, {}))
     learner = configuration.parse(RecordConfig, command(config.learner, {}))
-    kinds = [one.brain.get_choice_name(type(one.brain)) for one in (expert, learner)]
+    kinds = [BrainConfig.get_choice_name(type(one.brain)) for one in (expert, learner)]
     if not isinstance(learner.brain, DaggerConfig):
         raise ConfigError(
             f"learner.config is {config.learner.config!r}, whose brain is {kinds[1]!r}; it must be 'dagger', in which "
