@@ -76,7 +76,8 @@ def check_engine(config: Any) -> None:
         )
     if getattr(config, "display_data", False):
         raise ConfigError(
-            "display_data is true and engine is 'ray': frames stay where they are made. Leave one of them out."
+            "display_data is true and engine is 'ray': frames stay on the machines of the cluster. Leave one of them "
+            "out."
         )
     if getattr(config, "estop_key", None):
         raise ConfigError(

@@ -184,7 +184,7 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
             raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(sorted(choices))}.")
         if chosen not in choices:
             raise ConfigError(
-                f"{unknown_name(f'{key}.type', chosen, choices)} One that a module of yours registers: "
+                f"{unknown_name(f'{key}.type', chosen, choices)} To use one that your module registers: "
                 f"--{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}
@@ -264,7 +264,7 @@ def _keyed(names: Iterable[Any], kind: Any) -> type:
     """Return a class with a field for each name: what a mapping from these names has to hold."""
     for name in names:
         if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
-            raise ConfigError(f"{name!r} is no name: names are made of letters, digits and underscores.")
+            raise ConfigError(f"{name!r} is not a valid name: names consist of letters, digits and underscores.")
     return dataclasses.make_dataclass("Entries", [(name, kind) for name in names])
 
 

@@ -142,6 +142,7 @@ class RecordConfig:
             if chosen.duration_s not in (type(chosen).duration_s, self.dataset.episode_time_s):
                 raise ConfigError(
                     f"task.duration_s is {chosen.duration_s} and dataset.episode_time_s is "
-                    f"{self.dataset.episode_time_s}. Both say how long an episode may take; set them alike, or one."
+                    f"{self.dataset.episode_time_s}. Both limit an episode's duration; set one of them, or both to the "
+                    "same value."
                 )
             chosen.duration_s = self.dataset.episode_time_s

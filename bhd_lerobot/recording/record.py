@@ -208,8 +208,9 @@ def _episodes(
             console.print(f"Episode {spec.index}, attempt {attempt} of {_ATTEMPTS}, was not saved: {escape(why)}")
         else:
             raise RealtimeError(
-                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Repair the "
-                "cause and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
+                f"Episode {spec.index} exceeded the timing tolerance {_ATTEMPTS} times. Earlier episodes are saved. "
+                "Fix the cause and continue with --resume=true, or also save such episodes, flagged, with "
+                "--timing.reject=false."
             )
 
 
@@ -220,7 +221,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
     pressed.add_signal(number)
     has_key = (is_live if config.estop_key is None else config.estop_key) and pressed.add_key()
     if config.estop_key and not has_key:
-        raise ConfigError("estop_key is true, but standard input is no terminal that this program has to itself.")
+        raise ConfigError("estop_key is true, but standard input is not a terminal for this program alone.")
     if is_live:
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
@@ -276,7 +277,7 @@ def _judged_task(config: RecordConfig, robots: Host, console: Console) -> Task:
     task = judged(task, robots.knows, robots.n, config.dataset.fps)
     if isinstance(task, OperatorTask):
         console.print(
-            f"The robot does not measure what {task.name!r} is judged by: say how each episode ends, with the keys s "
+            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with the keys s "
             "(success) and f (failure); otherwise it ends in a time-out."
         )
     return task
@@ -288,7 +289,7 @@ def _keep_to(root: Path, robot: Any, console: Console) -> None:
     recorded = info.recording.get("robot", {}) if info else {}
     if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
         robot.jerk_limits = False
-        console.print("The dataset was recorded without jerk limits: it goes on with robot.jerk_limits=false.")
+        console.print("The dataset was recorded without jerk limits: it continues with robot.jerk_limits=false.")
 
 
 def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, Any]:
@@ -340,8 +341,8 @@ def _check_expert(brain: Any) -> None:
     if not advice:
         what = "a policy, and no expert" if advice is None else "with an expert that gives goals"
         raise ConfigError(
-            f"dataset.expert_action asks for what an expert would do, and brain.type is {brain.name!r}, {what}. Use a "
-            "rule, or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
+            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, {what}. Use a rule, "
+            "or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
         )
 
 

@@ -124,8 +124,8 @@ def read_stages(config: AggregationConfig) -> Stages:
     for stage, parsed in ((config.expert, expert), (config.learner, learner)):
         if parsed.split != "train":
             raise ConfigError(
-                f"split is {parsed.split!r} in {stage.config!r}: its episodes are not for learning from, but for "
-                "judging what was learned. Leave it out."
+                f"split is {parsed.split!r} in {stage.config!r}: its episodes are reserved for evaluation. Leave it "
+                "out."
             )
     evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
     for other, name in ((learner, "learner"), (evaluation, "evaluation")):
@@ -135,8 +135,8 @@ def read_stages(config: AggregationConfig) -> Stages:
     if not learner.dataset.expert_action and weight in _names(config.policy):
         raise ConfigError(
             f"The option --{weight} of {config.policy.config!r} weighs frames in which {config.learner.config!r} does "
-            "not record what the expert would have done (dataset.expert_action is false): they are not learned from. "
-            "Leave it out of its options."
+            "not record the expert's action (dataset.expert_action is false): they are not used for training. Leave "
+            "it out of its options."
         )
     return Stages(
         expert=str(kinds[0]),

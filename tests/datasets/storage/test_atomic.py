@@ -453,7 +453,7 @@ def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, 
         patch.setattr(Disk, "swap", refuse)
         assert main.main(["delete", str(root), "--episodes=1"]) == 2
     message = capsys.readouterr().err
-    assert "The change is decided, and the next command completes it." in message
+    assert "The change is committed, and the next command completes it." in message
     assert "nothing was changed" not in message
     assert main.main(["info", str(root), "--short"]) == 0
     assert len(content(root)) == 2
