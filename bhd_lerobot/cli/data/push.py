@@ -74,7 +74,7 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
     if places and options.repo_id is None:
         options.repo_id = places.pop(0)
     if places:
-        raise ConfigError(f"{' '.join(places)} are too many places; give the folder and one target.")
+        raise ConfigError(f"Unexpected argument: {' '.join(places)}. Give the folder and one target.")
     target = options.repo_id
     if target is None:
         raise ConfigError(

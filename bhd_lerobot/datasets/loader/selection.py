@@ -119,7 +119,7 @@ class EpisodeFilter:
             counts = Counter(str(outcomes[episode]) for episode in candidates)
             found = f": {', '.join(f'{count} {name}' for name, count in counts.most_common())}"
         return (
-            f"No episode of {meta.root} is left after filtering: {' and '.join(criteria)} was requested, and it has "
+            f"No episode of {meta.root} is left after filtering by {' and '.join(criteria)}; it has "
             f"{len(candidates)} episodes{found}. Relax the filter, or record more."
         )
 

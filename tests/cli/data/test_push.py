@@ -148,7 +148,7 @@ BAD_ARGUMENTS = [
     (["push"], "Give the target"),
     (["push", "ROOT"], "Give the target"),
     (["push", "ROOT", "me"], "neither a name on the Hub"),
-    (["push", "ROOT", "me/a", "me/b"], "too much"),
+    (["push", "ROOT", "me/a", "me/b"], "Unexpected argument: me/b"),
     (["push", "ROOT", "s3://b/d", "--tag=x"], "is a URL"),
     (["push", "ROOT", "me/a", "--storage_options={}"], "is for URLs"),
     (["push", "ROOT", "memory://b/d", "--storage_options=[1]"], "give a JSON object"),

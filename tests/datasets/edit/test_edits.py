@@ -196,7 +196,7 @@ def test_bad_requests(plain: Path, tmp_path: Path) -> None:
         (lambda: keep(root, [1, 1], tmp_path / "x"), ConfigError, "twice"),
         (lambda: keep(root, [], tmp_path / "x"), DatasetError, "No episode is left"),
         (lambda: delete(root, range(6)), DatasetError, "No episode is left"),
-        (lambda: split(root, {"a": [0, 1], "b": [1]}, tmp_path / "x"), ConfigError, "'a' and in 'b'"),
+        (lambda: split(root, {"a": [0, 1], "b": [1]}, tmp_path / "x"), ConfigError, "'a' and to 'b'"),
         (lambda: split(root, {"a": [0], "b": []}, tmp_path / "x"), ConfigError, "would have no episode"),
     ):
         with pytest.raises(error, match=text):

@@ -66,9 +66,9 @@ def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, A
 
 def test_no_episode_left_says_what_there_is(plain: Path) -> None:
     meta = open_metadata(plain)
-    with pytest.raises(DatasetError, match="outcome stuck was requested, and it has 5 episodes: 3 success, 1 coll"):
+    with pytest.raises(DatasetError, match="filtering by outcome stuck; it has 5 episodes: 3 success, 1 coll"):
         EpisodeFilter("stuck").select(meta)
-    with pytest.raises(DatasetError, match=r"a score of at least 0\.9 was asked"):
+    with pytest.raises(DatasetError, match=r"and a score of at least 0\.9; it has 2"):
         EpisodeFilter("success", min_score=0.9).select(meta, [0, 1])
 
 

@@ -390,7 +390,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path, capsys: pyte
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.txt").write_text("mine")
     assert main([f"--config_path={settings(tmp_path)}"]) == 2
-    assert "holds something else" in " ".join(capsys.readouterr().err.split())
+    assert "holds other files" in " ".join(capsys.readouterr().err.split())
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["thesis.txt"]
 
 
