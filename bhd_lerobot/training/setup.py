@@ -155,7 +155,7 @@ def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
     for name, value in given.items():
         if value is _DIFFERS or np.any(np.asarray(value, float)):
             raise DatasetError(
-                f"{meta.root} was recorded with task.{name} = {value}: the object poses in it are falsified, and a "
+                f"{meta.root} was recorded with task.{name} = {value}: its object poses are not the true ones, and a "
                 f"{policy.type!r} would learn them. Record it without this option."
             )
 

@@ -75,7 +75,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
 
 
 def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:
-    """Make copy some episodes of a dataset to a new one; the original is not changed."""
+    """Copy some episodes of a dataset to a new one; the original is not changed."""
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         edit, recording = _kept(state, episodes, "keep")
@@ -83,7 +83,7 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
 
 
 def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | str) -> list[EditReport]:
-    """Make split a dataset into several new ones; the original is not changed."""
+    """Split a dataset into several new ones; the original is not changed."""
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
         for episode in episodes:

@@ -103,7 +103,7 @@ def _check_data(config: AggregationConfig, stages: Stages) -> None:
             )
         if stages.has_advice and EXPERT_ACTION not in found.features:
             raise ConfigError(
-                f"data names {root}, which has no {EXPERT_ACTION}, which is needed for training. Record it with "
+                f"data names {root}, which has no {EXPERT_ACTION} to train on. Record it with "
                 "--dataset.expert_action=true, or leave it out."
             )
 
