@@ -68,15 +68,15 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         if one.perception is not None:
             console.print(escape(f"{label}: {perception_sentence(one.perception)}"), soft_wrap=True)
     if result.estop is not None:
-        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was begun.")
+        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was started.")
     if result.fault is not None:
         console.print(
-            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was begun."
+            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was started."
         )
     if results.is_partial:
         by = f" by {result.stopped_by.name}" if result.stopped_by else ""
-        again = " The same command runs those that are missing." if config.record.repo_id else ""
-        console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.{again}")
+        again = " The same command runs the missing episodes." if config.record.repo_id else ""
+        console.print(f"Stopped{by}: the results are partial, with all finished episodes.{again}")
     for label in result.missed:
         low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
         console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")

@@ -160,9 +160,9 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
             valid = [f"{prefix}{name}" for name in fields] + ([] if prefix else [CONFIG_PATH])
             raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
         kind, default = fields[key]
-        if isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry):
-            value = {"type": default.get_choice_name(type(default)), **value}
-        values[key] = _checked(f"{prefix}{key}", value, kind)
+        of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
+        given = {"type": default.get_choice_name(type(default)), **value} if of_default else value
+        values[key] = _checked(f"{prefix}{key}", given, kind)
     for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not choices_of(kind):
@@ -190,7 +190,7 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
             choices = choices_of(kind, of_lerobot=True)
         if chosen not in choices:
             raise ConfigError(
-                f"{unknown_name(f'{key}.type', chosen, choices)} One that a module of yours registers: "
+                f"{unknown_name(f'{key}.type', chosen, choices)} To use one that your module registers: "
                 f"--{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}
@@ -270,7 +270,7 @@ def _keyed(names: Iterable[Any], kind: Any) -> type:
     """Return a class with a field for each name: what a mapping from these names has to hold."""
     for name in names:
         if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
-            raise ConfigError(f"{name!r} is no name: names are made of letters, digits and underscores.")
+            raise ConfigError(f"{name!r} is not a valid name: names consist of letters, digits and underscores.")
     return dataclasses.make_dataclass("Entries", [(name, kind) for name in names])
 
 

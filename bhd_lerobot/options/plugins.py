@@ -33,7 +33,7 @@ def load_plugins(report: Callable[[str], object] | None = None) -> None:
     """Import every plug-in that is installed, once; report those that fail, on standard error if None."""
     for name, reason in import_plugins():
         if reason:
-            text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
+            text = f"The plug-in {name} cannot be imported, and its robots, tasks and brains are missing: {reason}"
             report(text) if report else print(f"warning: {text}", file=sys.stderr)
 
 
@@ -72,7 +72,7 @@ def load_lerobot(module: str) -> None:
 def misnamed() -> list[tuple[str, str]]:
     """Return the distributions that LeRobot passes over although they look like plug-ins, and why."""
     return [
-        (name, f"LeRobot wants a name with underscores, {name.replace('-', '_')!r}.")
+        (name, f"LeRobot expects a name with underscores, {name.replace('-', '_')!r}.")
         for name in map(_name_of, metadata.distributions())
         if name.replace("-", "_").startswith(PREFIXES) and not name.startswith(PREFIXES)
     ]
@@ -95,7 +95,7 @@ def load_named(arguments: Sequence[str]) -> list[str]:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             here = Path(f"{name}.py").is_file() or Path(name, "__init__.py").is_file()
             remedy = (
-                "Give a module that Python finds: one that is installed, or in a folder of PYTHONPATH."
+                "Give a module that Python can find: an installed one, or one in a folder of PYTHONPATH."
                 if not (isinstance(error, ModuleNotFoundError) and error.name == name and here)
                 else "It is in this folder, where Python does not look: write PYTHONPATH=. before the command."
             )

@@ -24,16 +24,16 @@ class DatasetConfig:
     """What is recorded and where. The names are those of `lerobot-record`.
 
     Attributes:
-        repo_id: name of the dataset on the Hub, `user/name`; `local/` and the folder's name if only `root` is given.
-        root: folder of the dataset; LeRobot's default place if nothing.
+        repo_id: name of the dataset on the Hub, `user/name`; by default `local/` and the folder's name.
+        root: folder of the dataset; by default LeRobot's place for `repo_id`.
         fps: frames a second [Hz]; the robot's own if 0.
-        num_episodes: number of episodes that the dataset holds in the end.
-        episode_time_s: longest duration of an episode [s]; the task's if nothing.
-        language: also write what the brain was doing, and its plan, into LeRobot's column `language_persistent`, for
-            brains with a plan. Off, because PyTorch's own collating and `lerobot-dataset-viz` fail on that column;
-            LeRobot's training knows it.
-        expert_action: also record what the expert would do in every frame, `expert.action`: of the brain `dagger` its
-            expert, if it gives setpoints; of any other rule what it does.
+        num_episodes: total number of episodes in the dataset.
+        episode_time_s: maximum duration of an episode [s]; by default the task's.
+        language: also write the brain's plan and its current step into LeRobot's column `language_persistent`, for
+            brains with a plan. Off by default, because PyTorch's collating and `lerobot-dataset-viz` fail on that
+            column; LeRobot's training supports it.
+        expert_action: also record the expert's action in every frame, `expert.action`: with the brain `dagger`, that
+            of its expert, if it gives setpoints; with another rule, the rule's own action.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.
@@ -60,36 +60,36 @@ class RecordConfig:
 
     Attributes:
         robot: the robot; its `fps` is the dataset's.
-        dataset: what is recorded and where.
-        task: what it is to achieve, and where; `free` if nothing.
-        brain: what drives the robot.
+        dataset: contents and place of the dataset.
+        task: the task, and its scenes; `free` by default.
+        brain: the brain that drives the robot.
         teleop: the teleoperator with which a person drives the robot or, beside a brain, takes over from it; short for
-            `brain.type=teleop`. Every one of LeRobot and of plug-ins.
-        map: where the robot's actions come from in the teleoperator's, see the brain `teleop`.
-        processor: what stands between teleoperator and robot, see the brain `teleop`.
-        gate: what is let through to a robot of another package.
-        timing: how unpunctual frames may be, and what becomes of an episode with too many of them.
-        seed: every episode's seed follows from this and its number.
-        split: `train`, `validation` or `held_out`: which set of seeds.
-        n_envs: simulations that run side by side; changes the speed and nothing else.
-        threads: threads that step the physics; all processors if nothing.
-        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
-        ray: which cluster, and how much of it.
+            `brain.type=teleop`. Any teleoperator of LeRobot and of plug-ins.
+        map: sources of the robot's actions among those of the teleoperator, see the brain `teleop`.
+        processor: function between teleoperator and robot, see the brain `teleop`.
+        gate: limits of what is sent to a robot of another package.
+        timing: tolerance for late frames, and whether an episode with too many of them is rejected.
+        seed: run seed, from which, with its number, each episode's seed is computed.
+        split: set of seeds: `train`, `validation` or `held_out`.
+        n_envs: number of parallel simulations; changes only the speed.
+        threads: threads that step the physics; by default one for each processor.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes only the speed.
+        ray: the cluster, and the share of it that is used.
         resume: continue the dataset at `dataset.root`, or start it if there is none.
-        output_dir: run folder, for the resolved configuration and images; a new one in `outputs/record` if nothing.
-        preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
-        estop_key: space or `e` in the terminal is an emergency stop, `s` ends the episode as a success and `f` as a
-            failure, and with `i` an intervention begins or ends; if nothing, where there is a terminal and the robot
-            runs on the wall clock.
-        estop_signal: this signal is an emergency stop, too: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
-        display_data: show what happens live in Rerun or Foxglove; of robots side by side the first. The names of these
-            options are those of `lerobot-record`.
-        display_mode: where: `rerun` or `foxglove`.
-        display_ip: for `rerun`, where a viewer runs, if not here; for `foxglove`, the interface that it can connect to,
-            127.0.0.1 if nothing.
-        display_port: for `rerun`, the viewer's port, if it does not run here; for `foxglove`, the port that it can
-            connect to, 8765 if nothing.
-        display_compressed_images: send images as JPEG; always so to a viewer that does not run here.
+        output_dir: run folder, for the resolved configuration and images; by default a new one in `outputs/record`.
+        preview_video: make an MP4 of the first episode; by default if images can be rendered.
+        estop_key: space or `e` in the terminal triggers an emergency stop, `s` ends the episode as a success, `f` as a
+            failure, and `i` begins or ends an intervention; by default if there is a terminal and the robot runs on
+            the wall clock.
+        estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
+        display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
+            these options are those of `lerobot-record`.
+        display_mode: viewer: `rerun` or `foxglove`.
+        display_ip: for `rerun`, the address of a viewer on another machine; for `foxglove`, the interface that it can
+            connect to, by default 127.0.0.1.
+        display_port: for `rerun`, the port of a viewer on another machine; for `foxglove`, the port that it can connect
+            to, by default 8765.
+        display_compressed_images: send images as JPEG; always on for a viewer on another machine.
     """
 
     robot: RobotConfig
@@ -185,6 +185,7 @@ class RecordConfig:
             if chosen.duration_s not in (type(chosen).duration_s, self.dataset.episode_time_s):
                 raise ConfigError(
                     f"task.duration_s is {chosen.duration_s} and dataset.episode_time_s is "
-                    f"{self.dataset.episode_time_s}. Both say how long an episode may take; set them alike, or one."
+                    f"{self.dataset.episode_time_s}. Both limit an episode's duration; set one of them, or both to the "
+                    "same value."
                 )
             chosen.duration_s = self.dataset.episode_time_s

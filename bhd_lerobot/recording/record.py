@@ -174,8 +174,9 @@ def _episodes(
             console.print(f"Episode {spec.index}, attempt {attempt} of {_ATTEMPTS}, was not saved: {escape(why)}")
         else:
             raise RealtimeError(
-                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Repair the "
-                "cause and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
+                f"Episode {spec.index} exceeded the timing tolerance {_ATTEMPTS} times. Earlier episodes are saved. "
+                "Fix the cause and continue with --resume=true, or also save such episodes, flagged, with "
+                "--timing.reject=false."
             )
 
 
@@ -186,7 +187,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
     pressed.add_signal(number)
     has_key = (is_live if config.estop_key is None else config.estop_key) and pressed.add_key()
     if config.estop_key and not has_key:
-        raise ConfigError("estop_key is true, but standard input is no terminal that this program has to itself.")
+        raise ConfigError("estop_key is true, but standard input is not a terminal for this program alone.")
     if is_live:
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
@@ -214,7 +215,7 @@ def _judged_task(config: RecordConfig, robots: Robots, console: Console) -> Task
     task = judged(task, robots.knows, robots.n, config.dataset.fps)
     if isinstance(task, OperatorTask):
         console.print(
-            f"The robot does not measure what {task.name!r} is judged by: say how each episode ends, with the keys s "
+            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with the keys s "
             "(success) and f (failure); otherwise it ends in a time-out."
         )
     return task
@@ -226,7 +227,7 @@ def _keep_to(root: Path, robot: Any, console: Console) -> None:
     recorded = info.recording.get("robot", {}) if info else {}
     if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
         robot.jerk_limits = False
-        console.print("The dataset was recorded without jerk limits: it goes on with robot.jerk_limits=false.")
+        console.print("The dataset was recorded without jerk limits: it continues with robot.jerk_limits=false.")
 
 
 def _trajectory(episode: Episode, robots: Robots) -> Trajectory | None:

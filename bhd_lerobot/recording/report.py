@@ -109,17 +109,17 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
     if result.estop is not None:
         console.print(
             f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
-            "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
+            "outcome 'estop', and no other was started. Clear the cause and continue with --resume=true."
         )
     if result.fault is not None:
         console.print(
             f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] The episode that was running is saved "
-            "with the outcome 'fault', and no other was begun. Clear the cause and go on with --resume=true."
+            "with the outcome 'fault', and no other was started. Clear the cause and continue with --resume=true."
         )
     if result.stopped_by:
         console.print(
             f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
-            "Go on with --resume=true: the dropped ones are run again, the same."
+            "Continue with --resume=true: the dropped ones are repeated identically."
         )
 
 
