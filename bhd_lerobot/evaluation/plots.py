@@ -242,6 +242,7 @@ def _bare(axes: Axes) -> None:
 def _svg(draw: Callable[[Figure], None], size: tuple[float, float]) -> str:
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
+        figure.get_layout_engine().set(wspace=0.06)  # the last number of an axis is not read with the next one's first
         draw(figure)
         text = io.BytesIO()
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
