@@ -199,6 +199,7 @@ def _draw_rows(axes: Axes, estimates: Mapping[str, Estimate], title: str, refere
     axes.set_ylim(len(estimates) - 0.5, -0.5)
     axes.set_xlabel(title)
     axes.margins(x=0.08)
+    axes.locator_params(axis="x", nbins=6)
     axes.grid(axis="x", alpha=0.35)
     _bare(axes)
 
