@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, PairedSummary
@@ -242,8 +243,8 @@ def _bare(axes: Axes) -> None:
 
 def _svg(draw: Callable[[Figure], None], size: tuple[float, float]) -> str:
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        figure.get_layout_engine().set(wspace=0.06)  # the last number of an axis is not read with the next one's first
+        # Room between charts, so that the last number of an axis is not read with the first of the next.
+        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(wspace=0.06))
         draw(figure)
         text = io.BytesIO()
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})

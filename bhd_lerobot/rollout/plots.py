@@ -207,7 +207,8 @@ def draw_divergence(
     """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)
-    above, differences = figure.subfigures(1, 2, width_ratios=(1, 1.3))
+    columns = figure.add_gridspec(1, 2, width_ratios=(1, 1.3))
+    above, differences = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
     left, rows = above.subplots(), differences.subplots(len(curves), 1, squeeze=False)[:, 0]
     draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
