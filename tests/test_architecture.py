@@ -89,7 +89,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("rollout", "hub", "cluster"),
     ),
     "evaluation": (
-        *("tasks", "control", "robots.host", "policies", "policies.perception"),
+        *("tasks", "control", "robots.host", "policies", "policies.learned", "policies.perception"),
+        "envs",  # registers our environments with LeRobot, for `--env.type`
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster"),
     ),

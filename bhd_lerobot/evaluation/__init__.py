@@ -2,6 +2,7 @@
 
 __all__ = [
     "config",
+    "environment",
     "evaluate",
     "metrics",
     "perception",

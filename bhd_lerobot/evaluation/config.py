@@ -28,8 +28,59 @@ class EvalDatasetConfig:
     root: str | None = None
 
 
+class Comparison:
+    """What every evaluation has: brains by name, one of them the baseline."""
+
+    brains: dict[str, BrainConfig]
+    brain: BrainConfig | None
+    only: list[str] | None
+    baseline: str | None
+    seed: int
+    record: EvalDatasetConfig
+    fail_below: float | None
+
+    @property
+    def chosen(self) -> dict[str, BrainConfig]:
+        """The brains that are run, in order."""
+        return {label: brain for label, brain in self.brains.items() if self.only is None or label in self.only}
+
+    @property
+    def reference(self) -> str:
+        """The brain that the others are compared with: the baseline, or the first that is run."""
+        return self.baseline if self.baseline in self.chosen else next(iter(self.chosen))
+
+    @property
+    def heading(self) -> str:
+        """Which episodes are run, as text."""
+        raise NotImplementedError
+
+    def again(self, episode: int) -> list[str]:
+        """Return the options that run a single episode again."""
+        raise NotImplementedError
+
+    def _name_brains(self) -> None:
+        """Refuse brains, or names of them, that are missing; `brain` becomes one of `brains`."""
+        if self.brain is not None:
+            name = str(self.brain.get_choice_name(type(self.brain)))
+            if name in self.brains:
+                raise ConfigError(f"There are two brains of the name {name!r}: brain, and one of brains. Rename one.")
+            self.brains[name], self.brain = self.brain, None
+        if not self.brains:
+            raise ConfigError(
+                "There is no brain to evaluate; set --brains.NAME.type, or --brain.path for a checkpoint."
+            )
+        for key, labels in (("only", self.only or []), ("baseline", [self.baseline] if self.baseline else [])):
+            for label in labels:
+                if label not in self.brains:
+                    raise ConfigError(unknown_name(f"brain in {key}", label, self.brains))
+        if self.only is not None and not self.only:
+            raise ConfigError("only is empty; name at least one brain, or leave it out.")
+        if self.fail_below is not None and not 0 <= self.fail_below <= 1:
+            raise ConfigError(f"fail_below is {self.fail_below}; it is a success rate, from 0 to 1.")
+
+
 @dataclass
-class EvalConfig:
+class EvalConfig(Comparison):
     """Compare brains on the same episodes.
 
     Attributes:
@@ -78,40 +129,25 @@ class EvalConfig:
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
         check_robot_and_task(self.robot, self.task, "bhd-eval")
-        if self.brain is not None:
-            name = str(self.brain.get_choice_name(type(self.brain)))
-            if name in self.brains:
-                raise ConfigError(f"There are two brains of the name {name!r}: brain, and one of brains. Rename one.")
-            self.brains[name], self.brain = self.brain, None
-        if not self.brains:
-            raise ConfigError(
-                "There is no brain to evaluate; set --brains.NAME.type, or --brain.path for a checkpoint."
-            )
+        self._name_brains()
         for label, brain in self.brains.items():
             check_brain(f"brains.{label}", brain, self.robot.type)
-        for key, labels in (("only", self.only or []), ("baseline", [self.baseline] if self.baseline else [])):
-            for label in labels:
-                if label not in self.brains:
-                    raise ConfigError(unknown_name(f"brain in {key}", label, self.brains))
-        if self.only is not None and not self.only:
-            raise ConfigError("only is empty; name at least one brain, or leave it out.")
         check_engine(self)
         self._check_numbers()
-
-    @property
-    def chosen(self) -> dict[str, BrainConfig]:
-        """The brains that are run, in order."""
-        return {label: brain for label, brain in self.brains.items() if self.only is None or label in self.only}
-
-    @property
-    def reference(self) -> str:
-        """The brain that the others are compared with: the baseline, or the first that is run."""
-        return self.baseline if self.baseline in self.chosen else next(iter(self.chosen))
 
     @property
     def indices(self) -> list[int]:
         """Numbers of the episodes that are run, in ascending order."""
         return list(range(self.n_episodes)) if self.episodes is None else sorted(self.episodes)
+
+    @property
+    def heading(self) -> str:
+        """Which episodes are run, as text."""
+        return f"{len(self.indices)} {self.split.replace('_', '-')} episodes, seed {self.seed}"
+
+    def again(self, episode: int) -> list[str]:
+        """Return the options that run a single episode again."""
+        return [f"--episodes=[{episode}]"]
 
     def _check_numbers(self) -> None:
         for name, value in (
@@ -132,7 +168,5 @@ class EvalConfig:
             raise ConfigError(f"episodes is {self.episodes}; it must name at least one episode, and none twice.")
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
-        if self.fail_below is not None and not 0 <= self.fail_below <= 1:
-            raise ConfigError(f"fail_below is {self.fail_below}; it is a success rate, from 0 to 1.")
         if self.record.root is not None and self.record.repo_id is None:
             raise ConfigError("record.root is set and record.repo_id is not; datasets need a name, such as me/eval.")

@@ -19,7 +19,7 @@ from rich.table import Table
 from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError, counted
-from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
+from bhd_lerobot.evaluation.config import YARDSTICKS, Comparison, EvalConfig
 from bhd_lerobot.evaluation.metrics import JerkMeasure
 from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults, summarise, write_json, write_table
@@ -36,19 +36,20 @@ from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 
 
-def print_summary(console: Console, config: EvalConfig, result: "EvalResult") -> None:
+def print_summary(console: Console, config: Comparison, result: "EvalResult") -> None:
     """Print the results, and where they are."""
     results = result.results
     baseline = config.reference
     table = Table(
-        title=f"{len(config.indices)} {config.split.replace('_', '-')} episodes, seed {config.seed}",
+        title=config.heading,
         title_justify="left",
         box=SIMPLE_HEAD,
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
     table.add_column("brain", overflow="fold")  # a name that is too wide for the terminal is never cut off
-    for heading in ("success, 95 %", "score, 95 %", *(["success minus\nbaseline's, 95 %"] if results.paired else [])):
+    what, name = ("score", "score") if "score" in results.brains[baseline].means else ("return", "reward")
+    for heading in ("success, 95 %", f"{what}, 95 %", *(["success minus\nbaseline's, 95 %"] if results.paired else [])):
         table.add_column(heading, no_wrap=True)
     failures = {}
     for label, one in results.brains.items():
@@ -57,7 +58,7 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         table.add_row(
             escape(label) + "".join(f"\n({mark})" for mark in _marks(one, baseline, len(results.brains))),
             _lines(f"{one.successes}/{one.episodes} = {percent(one.success)}"),
-            _lines(number(one.means["score"], 3)),
+            _lines(number(one.means[name], 3)),
             *([_lines(percent(pair.success, sign=True)) if pair else ""] if results.paired else []),
         )
     console.print(table)
@@ -137,7 +138,7 @@ class EvalResult:
 def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     """Run every brain on the same episodes, write results and report."""
     console = console or Console(stderr=True)
-    _refuse_results(config)
+    refuse_results(config)
     n = 1 if config.robot.clock == "realtime" else min(config.n_envs, len(config.indices))
     robots = make_robot(config.robot, n, config.threads)
     pressed = EstopInputs(robots.estop)
@@ -179,7 +180,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         fault = faulty[0].problem or robots.problem if faulty else None
     results = summarise(
         facts,
-        _versions(),
+        measured_with(),
         {brain_run.label: brain_run.episodes for brain_run in runs},
         len(config.indices),
         config.reference,
@@ -193,17 +194,25 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
     result.fault = fault
-    result.missed = _missed(config, results)
+    finish(console, config, result, lambda: _report_input(config, result, runs, preview, no_videos))
+    return result
+
+
+def finish(console: Console, config: Comparison, result: EvalResult, make: Callable[[], ReportInput]) -> None:
+    """Write results and report, of what a function returns, and print the summary."""
+    result.missed = _missed(config, result.results)
     try:
-        _write(config, result, runs, preview, no_videos)
+        write_json(result.output_dir / RESULTS_NAME, result.results.plain())
+        write_json(result.output_dir / "timing.json", result.timing)
+        write_table(result.output_dir / "episodes.parquet", result.results.episodes)
+        write_report(make(), result.report)
     except OSError as error:
         print_summary(console, config, result)  # so that the numbers, at least, are not lost
         raise BhdError(
-            f"The results cannot be written to {output_dir}: {error.strerror or error}. What is printed above is "
-            "complete. Make room, or set another --output_dir, and run it again: the numbers will be the same."
+            f"The results cannot be written to {result.output_dir}: {error.strerror or error}. What is printed above "
+            "is complete. Make room, or set another --output_dir, and run it again: the numbers will be the same."
         ) from error
     print_summary(console, config, result)
-    return result
 
 
 def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
@@ -230,41 +239,37 @@ def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict
     }
 
 
-def _versions() -> dict[str, str]:
+def measured_with() -> dict[str, str]:
+    """Return the versions that results depend on."""
     return {**versions(), "torch": metadata.version("torch"), "python": platform.python_version()}
 
 
-def _missed(config: EvalConfig, results: EvalResults) -> list[str]:
+def _missed(config: Comparison, results: EvalResults) -> list[str]:
     if config.fail_below is None:
         return []
     wanted = {label for label, brain in config.chosen.items() if brain.get_choice_name(type(brain)) not in YARDSTICKS}
     return [label for label, one in results.brains.items() if label in wanted and one.success.low < config.fail_below]
 
 
-def _write(
+def _report_input(
     config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_videos: str
-) -> None:
+) -> ReportInput:
+    """Write initial states and videos; return what the report is made of."""
     folder = result.output_dir
-    write_json(folder / RESULTS_NAME, result.results.plain())
-    write_json(folder / "timing.json", result.timing)
-    write_table(folder / "episodes.parquet", result.results.episodes)
     states: dict[str, Any] = {f"state_{brain_run.label}": np.array(brain_run.initial_states) for brain_run in runs}
     states |= {
         f"episode_{brain_run.label}": np.array([m.episode for m in brain_run.episodes], np.int64) for brain_run in runs
     }
     np.savez_compressed(folder / "initial_states.npz", **states)
     videos = _video(config, runs, preview, folder) if preview is not None else []
-    write_report(
-        ReportInput(
-            config=config,
-            results=result.results,
-            timing=result.timing,
-            trajectories={brain_run.label: brain_run.trajectories for brain_run in runs},
-            videos=videos,
-            no_videos=no_videos,
-            folder=folder,
-        ),
-        result.report,
+    return ReportInput(
+        config=config,
+        results=result.results,
+        timing=result.timing,
+        trajectories={brain_run.label: brain_run.trajectories for brain_run in runs},
+        videos=videos,
+        no_videos=no_videos,
+        folder=folder,
     )
 
 
@@ -296,7 +301,7 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
         return None, str(error)
 
 
-def _refuse_results(config: EvalConfig) -> None:
+def refuse_results(config: Any) -> None:
     """Refuse a folder that holds the results of another evaluation, or of this one if it is complete."""
     folder = Path(config.output_dir or "").expanduser()
     if config.output_dir and (folder / RESULTS_NAME).is_file() and not _is_continued(config, folder):
@@ -306,7 +311,7 @@ def _refuse_results(config: EvalConfig) -> None:
         )
 
 
-def _is_continued(config: EvalConfig, folder: Path) -> bool:
+def _is_continued(config: Comparison, folder: Path) -> bool:
     """Return whether a folder holds partial results of the same evaluation, whose episodes were recorded."""
     if config.record.repo_id is None:
         return False

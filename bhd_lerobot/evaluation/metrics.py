@@ -129,6 +129,36 @@ class EpisodeMetrics:
         return {**values, "seed": str(self.seed)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentMetrics(EpisodeMetrics):
+    """One episode of one policy in an environment of LeRobot: only what such an environment returns.
+
+    Attributes:
+        task: its task's group and number in LeRobot's evaluation.
+        max_reward: the largest reward.
+    """
+
+    task: str
+    max_reward: float
+    score: float = math.nan
+    path_m: float = math.nan
+    jerk_mean: float = math.nan
+    jerk_max: float = math.nan
+    limits: dict[str, int] = field(default_factory=dict)
+    watchdogs: dict[str, int] = field(default_factory=dict)
+    estops: int = 0
+    faults: int = 0
+    problem: str = ""
+    details: dict[str, float] = field(default_factory=dict)
+    initial_state: str = ""
+    digest: str = ""
+
+    def plain(self) -> dict[str, Any]:
+        """Return what the environment returned as plain values; the seed as text, as in the base class."""
+        own = ("brain", "episode", "seed", "success", "outcome", "reward", "frames", "length_s", "task", "max_reward")
+        return {name: value for name, value in super().plain().items() if name in own}
+
+
 # What is the same to the last bit when a simulated episode is run again.
 _REPEATED = (keys.ACTION, keys.APPLIED_ACTION, keys.PHYSICS_STATE, keys.REWARD)
 

@@ -17,6 +17,8 @@ from bhd_lerobot.evaluation.statistics import Discordance, Estimate
 
 MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
 """Numbers of an episode whose mean and interval an evaluation reports."""
+ENVIRONMENT_MEANS = ("reward", "max_reward", "length_s")
+"""The same of an episode in an environment of LeRobot; there rewards are compared in place of scores."""
 SCORE_RANGE = (0.0, 1.0)
 """What no episode's score exceeds."""
 
@@ -33,7 +35,8 @@ class BrainSummary:
         success: its success rate with its Wilson interval.
         outcomes: how many ended how, the most frequent first.
         starts: how many different initial states these episodes had; those of the same one are not independent.
-        means: means with their intervals, by name, see `MEANS`; of the episodes in which they are defined.
+        means: means with their intervals, by name, see `MEANS` and `ENVIRONMENT_MEANS`; of the episodes in which they
+            are defined.
         limits: frames in which the safety filter changed the command, by kind of limit, of all episodes.
         watchdogs: frames in which a watchdog noticed something, by kind.
         estops: episodes with an emergency stop.
@@ -71,8 +74,9 @@ class PairedSummary:
         episodes: how many episodes both ran.
         success: difference of the success rates, with Newcombe's paired interval.
         differ: on how many episodes they differed in success, with McNemar's exact test.
-        score: difference of the mean scores, with its interval.
-        ratio: ratio of the mean scores, with its interval.
+        score: difference of the mean scores, with its interval; NaN where there are no scores.
+        ratio: ratio of the mean scores, with its interval, likewise.
+        rewards: differences of `reward` and `max_reward` with their intervals, in an environment of LeRobot.
     """
 
     brain: str
@@ -82,6 +86,7 @@ class PairedSummary:
     differ: Discordance
     score: Estimate
     ratio: Estimate
+    rewards: dict[str, Estimate] = field(default_factory=dict)
 
 
 @dataclass
@@ -130,22 +135,25 @@ def summarise(
     baseline: str,
     *,
     privileged: Collection[str] = (),
+    means: Sequence[str] = MEANS,
 ) -> EvalResults:
-    """Return the summaries of brains after some episodes."""
+    """Return the summaries of brains after some episodes, with the means of these numbers."""
     results = EvalResults(config, versions, requested)
     compared = max(1, len(episodes) - 1)
     for label, ran in episodes.items():
         results.episodes += ran
-        results.brains[label] = _brain(label, ran, label in privileged)
+        results.brains[label] = _brain(label, ran, label in privileged, means)
         if label != baseline:
             results.paired[label] = _pair(ran, episodes[baseline], label, baseline, compared)
+            if "score" not in means:
+                results.paired[label] = _with_rewards(results.paired[label], ran, episodes[baseline], compared)
     return results
 
 
-def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool) -> BrainSummary:
+def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool, names: Sequence[str]) -> BrainSummary:
     successes = sum(episode.success for episode in episodes)
     means = {}
-    for name in MEANS:
+    for name in names:
         values = np.array([getattr(episode, name) for episode in episodes], np.float64)
         within = SCORE_RANGE if name == "score" else (-math.inf, math.inf)
         means[name] = statistics.mean(values[np.isfinite(values)], within=within)
@@ -185,6 +193,22 @@ def _pair(
         score=statistics.mean_difference(*score, confidence, within=SCORE_RANGE),
         ratio=statistics.ratio_of_means(*score, confidence, within=SCORE_RANGE),
     )
+
+
+def _with_rewards(
+    pair: PairedSummary, episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], compared: int
+) -> PairedSummary:
+    """Return a pair with rewards, which may be any numbers, in place of scores."""
+    confidence = 1 - (1 - statistics.CONFIDENCE) / compared
+    by_number = {metrics.episode: metrics for metrics in others}
+    rewards = {}
+    for name in ("reward", "max_reward"):
+        values = [
+            (getattr(one, name), getattr(by_number[one.episode], name)) for one in episodes if one.episode in by_number
+        ]
+        rewards[name] = statistics.mean_difference([a for a, _ in values], [b for _, b in values], confidence)
+    undefined = Estimate(math.nan, math.nan, math.nan)
+    return replace(pair, score=undefined, ratio=undefined, rewards=rewards)
 
 
 def _sum(counts: Any) -> dict[str, int]:

@@ -46,15 +46,16 @@ def sentences(results: EvalResults) -> list[str]:
 
 
 def verdict(pair: PairedSummary) -> str:
-    """Return whether a brain is better than the baseline, as text, by the intervals of success and of score."""
+    """Return whether a brain is better than the baseline, as text, by the intervals of success and score, or return."""
     rate = _direction(pair.success, "more often", "less often", "")
-    score = _direction(pair.score, "a higher score", "a lower score", "")
+    what, estimate = ("return", pair.rewards["reward"]) if pair.rewards else ("score", pair.score)
+    score = _direction(estimate, f"a higher {what}", f"a lower {what}", "")
     times = "" if math.isnan(pair.ratio.value) else f", {pair.ratio.value:.2f} times the mean"
     clauses = [
         f"it succeeds {rate} ({percent(pair.success, sign=True).split(' (')[0]})"
         if rate
         else "no difference in success is certain",
-        f"it has {score}{times}" if score else "none in score" if not rate else "no difference in score is certain",
+        f"it has {score}{times}" if score else f"none in {what}" if not rate else f"no difference in {what} is certain",
     ]
     return " and ".join(clauses)
 
