@@ -322,9 +322,7 @@ def _check_fit(
         if key not in shapes:
             wrong.append(f"it reads {key!r}, which the environment does not return")
         elif len(shapes[key]) == 1 and loaded.width(own) != shapes[key][0]:
-            wrong.append(
-                f"it reads {loaded.width(own)} numbers in {key!r}, and the environment returns {shapes[key][0]}"
-            )
+            wrong.append(f"it reads {loaded.width(own)} numbers in {key!r}; the environment returns {shapes[key][0]}")
     if loaded.cameras and not set(loaded.cameras) & set(shapes):
         wrong.append(f"it reads the images {', '.join(loaded.cameras)}, and the environment returns none of them")
     if len(action) == 1 and loaded.width(ACTION) != action[0]:

@@ -154,19 +154,18 @@ def _summary(given: ReportInput) -> str:
     if "jerk" in facts:
         note += (
             f"Jerk is that of the commanded motion ({facts['jerk']}), from frame to frame; “largest” is the mean over "
-            f"episodes of each one's largest.<br>{_score_note(results.brains)}<br>"
+            f"episodes of each one's largest.<br>{_score_note(results.brains)}"
         )
-    note += (
-        "² Return: the sum of an episode's rewards, which the task defines. Unlike a score it has no bounds, so that "
-        "it, or its interval, can go below 0 or beyond 1."
-    )
+    note += "<br>² Return: the sum of an episode's rewards, which the task defines."
+    if "jerk" in facts:
+        note += " Unlike a score it has no bounds, so that it, or its interval, can go below 0 or beyond 1."
     privileged = {label for label, one in results.brains.items() if one.privileged}
     if privileged:
         note += (
             " Privileged state: the brain acts on what the task reports of the simulator's true state "
             "(<code>observation.environment_state</code>), which no sensor measures."
         )
-    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
+    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and means with intervals")
     return drawn + table(head, rows, results.config["baseline"], privileged) + f'<p class="note">{note}</p>'
 
 
@@ -204,15 +203,16 @@ def _paired(given: ReportInput) -> str:
         ]
         rows.append((label, cells))
     rewards = any(one.rewards for one in results.paired.values())
-    means = (
-        ["return, difference", "largest reward, difference"] if rewards else ["score, difference ¹", "score, ratio ¹"]
-    )
-    head = ["success, difference", "episodes that differ", "McNemar p", *means, "episodes"]
-    of_scores = ", Fieller's for ratios; those of scores also hold what rare episodes would do, see ¹ above"
+    of_means, more = ["return, difference", "largest reward, difference"], ""
+    if not rewards:
+        of_means = ["score, difference ¹", "score, ratio ¹"]
+        more = ", Fieller's for ratios; those of scores also hold what rare episodes would do, see ¹ above"
+    head = ["success, difference", "episodes that differ", "McNemar p", *of_means, "episodes"]
     note = (
         f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
-        f"Student's, corrected for skewness, for differences of means{'' if rewards else of_scores}. p is that of "
-        "McNemar's exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval that excludes the dashed line shows a "
+        f"Student's, corrected for skewness, for differences of means{more}. p is that of "
+        "McNemar's exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval "
+        "that excludes the dashed line shows a "
         "difference beyond chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
     )
