@@ -26,7 +26,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import Comparison, EvalDatasetConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, finish, measured_with, refuse_results
 from bhd_lerobot.evaluation.metrics import EnvironmentMetrics
-from bhd_lerobot.evaluation.report import ReportInput
+from bhd_lerobot.evaluation.report import NO_SUCCESS, ReportInput
 from bhd_lerobot.evaluation.results import ENVIRONMENT_MEANS, summarise
 from bhd_lerobot.options.command import Program
 from bhd_lerobot.options.parse import CommandLine, choices_of, decode, encode
@@ -145,12 +145,17 @@ class _StoppedError(Exception):
 
 
 class _Watched:
-    """A vector environment of LeRobot that notes how its episodes end; everything else is the environment's own."""
+    """A vector environment of LeRobot that notes how its episodes end; everything else is the environment's own.
+
+    Attributes:
+        says_success: whether every episode that ended had an `is_success`.
+    """
 
     def __init__(self, env: Any, stop: StopRequest) -> None:
         self._env, self._stop = env, stop
         self._frames: NDArray[np.int64] = np.zeros(env.num_envs, np.int64)
         self._terminated, self._over = np.zeros((2, env.num_envs), np.bool_)
+        self.says_success = True
 
     def ending(self, i: int) -> tuple[int, bool]:
         """Return the number of steps of an episode, and whether something else than its time ended it."""
@@ -167,7 +172,8 @@ class _Watched:
         if self._stop:
             raise _StoppedError
         stepped = self._env.step(action)
-        _, _, terminated, truncated, _ = stepped
+        _, _, terminated, truncated, info = stepped
+        self.says_success &= "is_success" in info.get("final_info", info) or not (terminated | truncated).any()
         self._frames += ~self._over
         self._terminated |= terminated & ~self._over
         self._over |= terminated | truncated
@@ -183,6 +189,7 @@ class _Policy:
     folder: Path
     facts: dict[str, Any] = field(default_factory=dict)
     is_privileged: bool = False
+    says_success: bool = True
     episodes: list[EnvironmentMetrics] = field(default_factory=list)
     wall_s: float = 0.0
 
@@ -222,7 +229,10 @@ def evaluate_in_environment(config: EnvironmentEvalConfig, console: Console | No
         "seed": config.seed,
         "n_episodes": config.n_episodes,
         "n_envs": config.n_envs,
+        "says_success": all(one.says_success for one in policies),
     }
+    if not facts["says_success"]:
+        console.print(f"[bold]Warning:[/bold] {NO_SUCCESS}", highlight=False)
     results = summarise(
         facts,
         {**measured_with(), "gymnasium": metadata.version("gymnasium")},
@@ -372,6 +382,7 @@ def _run(config: EnvironmentEvalConfig, one: _Policy, stop: StopRequest) -> Iter
                     ) from error
                 for i, outcome in enumerate(rolled["per_episode"]):
                     one.episodes.append(_metrics(config, one, task, outcome, watched.ending(i)))
+                one.says_success &= watched.says_success
                 one.wall_s = time.perf_counter() - started
                 yield
             env.close()

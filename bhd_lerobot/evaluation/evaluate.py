@@ -48,7 +48,8 @@ def print_summary(console: Console, config: Comparison, result: "EvalResult") ->
         padding=(0, 1, 0, 0),
     )
     table.add_column("brain", overflow="fold")  # a name that is too wide for the terminal is never cut off
-    what, name = ("score", "score") if "score" in results.brains[baseline].means else ("return", "reward")
+    has_scores = any("score" in one.means for one in results.brains.values())
+    what, name = ("score", "score") if has_scores else ("return", "reward")
     for heading in ("success, 95 %", f"{what}, 95 %", *(["success minus\nbaseline's, 95 %"] if results.paired else [])):
         table.add_column(heading, no_wrap=True)
     failures = {}

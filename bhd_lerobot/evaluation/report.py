@@ -25,6 +25,11 @@ from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
 VIDEO_BYTES = 12_000_000  # videos in the page; those beyond stay files beside it
+NO_SUCCESS = (
+    "The environment does not report is_success, and LeRobot's evaluation counts such an episode as a success. Only "
+    "the rewards say anything."
+)
+"""What is reported of an environment of LeRobot whose episodes end without a judgement."""
 LISTED = 100  # failed episodes of a brain that are listed
 
 
@@ -110,6 +115,8 @@ def _lead(given: ReportInput) -> str:
             f"episodes of {escape(where)}: the same seeds, {facts['seed']} for the first. Rolled out by LeRobot, "
             f"{facts['n_envs']} at a time.</p>"
         )
+        if not facts["says_success"]:
+            lead += f'<p class="warn">{NO_SUCCESS}</p>'
     else:
         clock = "on the wall clock" if given.timing["clock"] == "realtime" else "in simulated time"
         lead += (
@@ -131,14 +138,14 @@ def _lead(given: ReportInput) -> str:
 def _summary(given: ReportInput) -> str:
     results = given.results
     facts = results.config
-    unit = facts.get("jerk_unit")
+    unit, mark = facts.get("jerk_unit"), "²" if "jerk" in facts else "¹"
     columns: list[tuple[str, str, int | None]] = [
         ("score ¹", "score", 3),
         ("length [s]", "length_s", 1),
         ("path [m]", "path_m", 2),
         (f"mean jerk [{unit}]", "jerk_mean", None),
         (f"largest jerk [{unit}]", "jerk_max", None),
-        ("return ²", "reward", 3),
+        (f"return {mark}", "reward", 3),
         ("largest reward", "max_reward", 3),
     ]
     columns = [column for column in columns if column[1] in results.brains[facts["baseline"]].means]
@@ -156,7 +163,7 @@ def _summary(given: ReportInput) -> str:
             f"Jerk is that of the commanded motion ({facts['jerk']}), from frame to frame; “largest” is the mean over "
             f"episodes of each one's largest.<br>{_score_note(results.brains)}"
         )
-    note += "<br>² Return: the sum of an episode's rewards, which the task defines."
+    note += f"<br>{mark} Return: the sum of an episode's rewards, which the task defines."
     if "jerk" in facts:
         note += " Unlike a score it has no bounds, so that it, or its interval, can go below 0 or beyond 1."
     privileged = {label for label, one in results.brains.items() if one.privileged}

@@ -124,6 +124,7 @@ def test_the_report_has_returns_where_there_are_no_scores(compared: Compared, tm
     written = results(compared.folder)
     assert f"episodes of {written['config']['env']['type']} " in shown
     assert "<th>return, difference</th>" in shown
+    assert "is_success" not in shown
     assert "<th>largest reward</th>" in shown
     assert not re.search("jerk|score|initial_states|nan|None", shown)
     for episode in written["episodes"]:
@@ -149,6 +150,18 @@ def test_a_signal_ends_the_run_with_the_batches_that_are_finished(
     assert written["partial"] is True
     assert len(written["episodes"]) == 2 * BATCH
     assert "Stopped by SIGTERM: the results are partial" in capsys.readouterr().err
+
+
+def test_an_environment_that_reports_no_success_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """LeRobot counts its episodes as successes."""
+    step = LineEnv.step
+    monkeypatch.setattr(LineEnv, "step", lambda self, action: (*step(self, action)[:4], {}))
+    path = save(tmp_path / "policy", 1, 2, [0.0], [1.0])
+    assert main([*LINE, f"--brain.path={path}", "--n_episodes=2", f"--output_dir={tmp_path / 'run'}"]) == 0
+    assert "does not report is_success" in " ".join(capsys.readouterr().err.split())
+    assert "does not report is_success" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
 
 
 def test_an_environment_that_fails_is_named_with_the_brain(
