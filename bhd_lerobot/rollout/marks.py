@@ -1,7 +1,8 @@
 """Marks of a person while an episode is recorded: success, failure, intervention."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,10 @@ from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 Mask = NDArray[np.bool_]
 
-KEYS = "s success, f failure, i intervention begins or ends"
+KEYS = (
+    "s success, f failure, i intervention begins or ends, r discards this take and records it again, "
+    "p pauses before the next episode"
+)
 """What each key of the terminal means."""
 
 _HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
@@ -29,6 +33,8 @@ class Marks:
         self._lock = threading.Lock()
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
+        self._again = self._is_paused = False
+        self._is_waiting, self._go = False, threading.Event()
 
     def outcome(self, name: str, simulation: int = 0) -> None:
         """Mark that the running episode of a simulation ends now, and how: by one of the outcomes."""
@@ -50,15 +56,54 @@ class Marks:
         with self._lock:
             return simulation in self._driving
 
+    def again(self) -> None:
+        """Discard the running take of the first simulation, and record it again."""
+        with self._lock:
+            self._again = True
+
+    def take_again(self) -> bool:
+        """Return whether the running take is to be discarded; then it is forgotten."""
+        with self._lock:
+            again, self._again = self._again, False
+        return again
+
+    def pause(self) -> None:
+        """Wait for a person before the next episode, or no longer."""
+        with self._lock:
+            self._is_paused = not self._is_paused
+
+    @contextmanager
+    def waiting(self) -> Iterator[Callable[[], bool]]:
+        """Let Enter mean that the next episode begins; yield what returns whether it was pressed."""
+        with self._lock:
+            self._go.clear()
+            self._is_waiting = True
+        try:
+            yield self._go.is_set
+        finally:
+            with self._lock:
+                self._is_waiting = self._is_paused = False
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether the next episode waits for a person."""
+        return self._is_paused
+
     def on_key(self, keys: bytes) -> None:
         """Take keys of a terminal; see `KEYS`. They mean the first simulation."""
         for key in keys.decode("ascii", "ignore").lower():
-            if key == "s":
+            if self._is_waiting and key in "\r\n":
+                self._go.set()
+            elif key == "s":
                 self.outcome(Event.SUCCESS.cause)
             elif key == "f":
                 self.outcome(Event.FAILURE.cause)
             elif key == "i":
                 self.intervention()
+            elif key == "r":
+                self.again()
+            elif key == "p":
+                self.pause()
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
         """Forget the marks of episodes before."""
@@ -66,6 +111,7 @@ class Marks:
             for simulation in simulations.tolist():
                 self._outcomes.pop(simulation, None)
                 self._driving.discard(simulation)
+            self._again = False
 
     def frame(self, event: NDArray[np.int64], running: Mask) -> tuple[NDArray[np.int64], Mask]:
         """Return a frame's events with the marks applied, and where interventions are on, both of shape (n,)."""
