@@ -30,7 +30,7 @@ from bhd_lerobot.recording.driver import open_driver
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_summary
 from bhd_lerobot.recording.reset import ResetPhase
-from bhd_lerobot.registry import make_robot, make_simulation, make_task
+from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import KEYS, Marks
@@ -54,7 +54,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    if config.resume and not is_free(root):
+    if config.resume and is_ours(config.robot.type) and not is_free(root):
         _keep_to(root, config.robot, console)
     is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
