@@ -39,7 +39,7 @@ from bhd_lerobot.recording.report import RecordResult, print_refusals, print_sum
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.host import Host, describe
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
-from bhd_lerobot.rollout.marks import KEYS, Marks
+from bhd_lerobot.rollout.marks import KEYS, Marks, key_help
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import episode_metadata
@@ -225,7 +225,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
     if has_key:
-        console.print(f"Keys: {KEYS}")
+        console.print(f"Keys: {key_help(KEYS)}")
 
 
 def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task, brain: Brain) -> DatasetRecorder:

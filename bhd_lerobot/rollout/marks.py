@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,35 @@ from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 Mask = NDArray[np.bool_]
 
-KEYS = "s success, f failure, i intervention begins or ends"
-"""What each key of the terminal means."""
+
+class MarkKey(NamedTuple):
+    """A key of the terminal that marks the running episode.
+
+    Attributes:
+        name: what is printed on the key.
+        sent: what the terminal sends for it, each byte alone.
+        meaning: ``"success"``, ``"failure"`` or ``"intervention"``.
+    """
+
+    name: str
+    sent: bytes
+    meaning: str
+
+
+KEYS = (MarkKey("s", b"sS", "success"), MarkKey("f", b"fF", "failure"), MarkKey("i", b"iI", "intervention"))
+"""The keys of the terminal."""
+TELEOP_KEYS = (
+    MarkKey("Enter", b"\r\n", "success"),
+    MarkKey("Backspace", b"\x7f\b", "failure"),
+    MarkKey("Tab", b"\t", "intervention"),
+)
+"""The keys while a keyboard teleoperator uses the letters."""
+
+
+def key_help(keys: Sequence[MarkKey]) -> str:
+    """Return in one line what the keys mean."""
+    return ", ".join(f"{key.name} {key.meaning}" for key in keys) + " begins or ends"
+
 
 _HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
 
@@ -22,10 +50,15 @@ class Marks:
 
     An outcome ends the episode with the frame in which it is set. A frame of an intervention carries the
     event ``intervention``; what moves the robot meanwhile is not decided here.
+
+    Args:
+        n: number of simulations.
+        outcomes: those that the task can have.
+        keys: the terminal's keys: `KEYS`, or `TELEOP_KEYS` while a keyboard teleoperator uses the letters.
     """
 
-    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES) -> None:
-        self._n, self._valid = n, tuple(outcomes)
+    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES, keys: Sequence[MarkKey] = KEYS) -> None:
+        self._n, self._valid, self._keys = n, tuple(outcomes), tuple(keys)
         self._lock = threading.Lock()
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
@@ -46,14 +79,12 @@ class Marks:
                 self._driving.discard(simulation)
 
     def on_key(self, keys: bytes) -> None:
-        """Take keys of a terminal; see `KEYS`. They mean the first simulation."""
-        for key in keys.decode("ascii", "ignore").lower():
-            if key == "s":
-                self.outcome(Event.SUCCESS.cause)
-            elif key == "f":
-                self.outcome(Event.FAILURE.cause)
-            elif key == "i":
+        """Take keys of a terminal. They mean the first simulation."""
+        for meaning in [one.meaning for key in keys for one in self._keys if key in one.sent]:
+            if meaning == "intervention":
                 self.intervention()
+            else:
+                self.outcome(meaning)
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
         """Forget the marks of episodes before."""

@@ -16,10 +16,11 @@ from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFo
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks, key_help
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event
+from tests.cases import each_case
 from tests.forks import Fork
 from tests.waiting import until
 
@@ -53,16 +54,31 @@ def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
     assert marks.frame(np.array([hard, Event.TIMEOUT]), ALL)[0].tolist() == [hard, Event.SUCCESS]
 
 
-def test_keys() -> None:
-    marks = Marks(2)
-    marks.on_key(b"xI")
-    assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
-    marks.on_key(b"i")
+@each_case(
+    ("keys", "others", "success", "failure", "intervention"),
+    [(KEYS, b"xe \r\t\x7f\xff", b"sS", b"fF", b"iI"), (TELEOP_KEYS, b"sfix e\xff", b"\r\n", b"\x7f\b", b"\t")],
+)
+def test_keys(keys: tuple[MarkKey, ...], others: bytes, success: bytes, failure: bytes, intervention: bytes) -> None:
+    marks = Marks(2, keys=keys)
+    marks.on_key(others)
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
     assert not marks.frame(NOTHING, ALL)[1].any()
-    marks.on_key(b"f\xff")
-    assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.FAILURE, 0]
-    marks.on_key(b"fs")
+    for key in intervention:
+        marks.on_key(others + bytes([key]))
+        assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
+        marks.on_key(bytes([key]))
+        assert not marks.frame(NOTHING, ALL)[1].any()
+    for sent, event in ((success, Event.SUCCESS), (failure, Event.FAILURE)):
+        for key in sent:
+            marks.on_key(bytes([key, others[0]]))
+            assert marks.frame(NOTHING, ALL)[0].tolist() == [event, 0]
+    marks.on_key(failure + success)  # the last one counts
     assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.SUCCESS, 0]
+
+
+def test_the_help_names_every_key() -> None:
+    assert key_help(KEYS) == "s success, f failure, i intervention begins or ends"
+    assert key_help(TELEOP_KEYS) == "Enter success, Backspace failure, Tab intervention begins or ends"
 
 
 def test_wrong_names_are_refused() -> None:
