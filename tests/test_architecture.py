@@ -92,7 +92,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster", "recording"),
     ),
-    "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
+    "teleoperators": (
+        *("bodies", "control", "control.geometry", "control.arm"),
+        *("policies.*", "robots", "registry", "rollout"),
+    ),
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
