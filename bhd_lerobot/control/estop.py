@@ -17,7 +17,7 @@ from bhd_lerobot.errors import ConfigError
 SIGNALS = ("SIGUSR1", "SIGUSR2", "SIGQUIT")
 """Signals that may stand for an emergency stop: those that mean nothing else to a run."""
 KEYS = b" eE"
-"""Keys of the terminal that press: space and e."""
+"""Keys of the terminal that press: space and e, also as a capital."""
 POLL_S = 0.01  # [s] between two calls of a callable, by default
 _ROUND_S = 0.05  # [s] between two rounds of the thread: how often what stays pressed is pressed again
 _SILENCE_S = 1.0  # [s] a callable that has not answered for so long hangs

@@ -1,6 +1,5 @@
 """The tool of an arm, or its joints, moved from a terminal."""
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +12,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import MAX_SPEED, MAX_TURN_SPEED, BhdKeyboardArmConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
-from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator
+from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
 from bhd_lerobot.teleoperators.targets import JOINT_NAMES, POSE_NAMES, JointTarget, Target, ToolTarget
 
 GRIPPER = "gripper.pos"
@@ -86,7 +85,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
             factor = SLOWER if key == "-" else FASTER
             self._speed = min(self._speed * factor, MAX_SPEED)
             self._turn_speed = min(self._turn_speed * factor, MAX_TURN_SPEED)
-            print(self._shown, file=sys.stderr)
+            say(self._shown)
         else:
             return False
         return True
@@ -111,7 +110,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         if GRIPPER not in observation:
             raise ConfigError(f"The observation has {', '.join(observation)}; bhd_keyboard_arm needs {GRIPPER}, too.")
         if self.config.action_space == "tool":
-            self._target = ToolTarget(observation, body, lambda problem: print(problem, file=sys.stderr))
+            self._target = ToolTarget(observation, body, say)
         else:
             self._target = JointTarget(observation)
         self._opening = self._opening_target = float(observation[GRIPPER])

@@ -1,11 +1,10 @@
 """A base driven from a terminal, with the keys of ROS's `teleop_twist_keyboard`."""
 
-import sys
 import time
 from collections.abc import Callable
 
 from bhd_lerobot.teleoperators.config_bhd_keyboard_base import BhdKeyboardBaseConfig
-from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator
+from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
 
 _HELP = """\
 Keys of bhd_keyboard_base, lower case, held down; any other key stops:
@@ -69,7 +68,7 @@ class BhdKeyboardBase(KeyboardTeleoperator):
             for speed, factor, most in zip(self._speeds, _FACTORS[key], self._most, strict=True)
         )
         self._speeds = linear, angular
-        print(self._shown, file=sys.stderr)
+        say(self._shown)
         return True
 
     def get_action(self) -> dict[str, float]:

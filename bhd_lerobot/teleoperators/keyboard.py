@@ -19,6 +19,11 @@ FASTER, SLOWER = 1.1, 0.9
 """Factors of a speed, for each press of a key that changes it."""
 
 
+def say(text: str) -> None:
+    """Print for the person at the keys; LeRobot's commands leave the cursor at the beginning of a line of theirs."""
+    print(f"\x1b[K{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
+
+
 @dataclass(kw_only=True)
 class KeyboardConfig(TeleoperatorConfig):
     """Options of a teleoperator whose keys come from the terminal: the recorder's marks are then not on letters.
@@ -118,7 +123,7 @@ class KeyboardTeleoperator(Teleoperator):
             )
         source.subscribe(self._on_keys)
         self._source = source
-        print(self.help, file=sys.stderr)
+        say(self.help)
 
     def calibrate(self) -> None:
         """Nothing to calibrate."""
