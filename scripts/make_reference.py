@@ -164,9 +164,7 @@ def _options(
             else:
                 listed[classes] = key, f"{page}#{re.sub(r'[^a-z0-9_-]', '', next(iter(groups)))}"
                 inner += [(title, one, f"{key}.") for title, one in groups.items()]
-    summary = summary_of(config_class)
-    if not summary.startswith("Configuration of the"):  # the heading says that
-        yield summary + "\n"
+    yield from _introduction(config_class)
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
     if elsewhere:
@@ -174,6 +172,12 @@ def _options(
     for title, one, inner_prefix in inner:
         yield f"### `{title}`\n"
         yield from _options(one, inner_prefix, page, listed)
+
+
+def _introduction(config_class: type) -> Iterator[str]:
+    summary = summary_of(config_class)
+    if not summary.startswith("Configuration of the"):  # the heading says that
+        yield summary + "\n"
 
 
 def _choices(kind: Any) -> dict[str, type]:
