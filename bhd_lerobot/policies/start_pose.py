@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
+from bhd_lerobot.bodies.body import Body
+
 
 @runtime_checkable
 class StartsFromObservation(Protocol):
@@ -11,8 +13,12 @@ class StartsFromObservation(Protocol):
     Observations are those of LeRobot's `Robot.get_observation`: numbers by feature name, SI units; images are not used.
     """
 
-    def start_from(self, observation: Mapping[str, Any]) -> None:
+    def start_from(self, observation: Mapping[str, Any], body: Body | None = None) -> None:
         """Begin at the robot's present pose: at the start of an episode, and whenever a person takes over.
+
+        Args:
+            observation: the newest.
+            body: the robot's hardware, if it is known.
 
         Raises:
             ConfigError: the observation lacks the pose.

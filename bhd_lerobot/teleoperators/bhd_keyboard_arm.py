@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
+from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import MAX_SPEED, MAX_TURN_SPEED, BhdKeyboardArmConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
@@ -54,7 +54,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
     def __init__(self, config: BhdKeyboardArmConfig, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(config, _TOOL_KEYS if config.action_space == "tool" else _JOINT_KEYS, clock)
         self._speed, self._turn_speed = config.speed, config.turn_speed
-        self._robot: SimulatedRobot | None = None
+        self._robot: BhdRobot | None = None
         self._observation: Mapping[str, Any] | None = None  # that someone has passed
         self._target: Target | None = None
         self._opening, self._opening_target = 0.0, 0.0
@@ -90,27 +90,29 @@ class BhdKeyboardArm(KeyboardTeleoperator):
             return False
         return True
 
-    def start_from(self, observation: Mapping[str, Any]) -> None:
+    def start_from(self, observation: Mapping[str, Any], body: Body | None = None) -> None:
         """Begin where the robot is.
 
         Args:
-            observation: the gripper's opening, and the tool's pose or a UR5's joint positions, by feature name.
+            observation: the gripper's opening, and the tool's pose or a UR5's joint positions, by feature name. The
+                opening of a gripper that holds something is the commanded one, or it would let go.
+            body: the arm; the UR5 if it is not known.
 
         Raises:
             ConfigError: the observation lacks them.
         """
         self._observation = observation
-        self._begin(observation, ur5())
+        self._begin(observation, body)
 
     def observe(self, observation: Mapping[str, Any]) -> None:
         """Take the newest observation: the target stays near to it."""
         self._observation = observation
 
-    def _begin(self, observation: Mapping[str, Any], body: Arm) -> None:
+    def _begin(self, observation: Mapping[str, Any], body: Body | None = None) -> None:
         if GRIPPER not in observation:
             raise ConfigError(f"The observation has {', '.join(observation)}; bhd_keyboard_arm needs {GRIPPER}, too.")
         if self.config.action_space == "tool":
-            self._target = ToolTarget(observation, body, say)
+            self._target = ToolTarget(observation, body if isinstance(body, Arm) else ur5(), say)
         else:
             self._target = JointTarget(observation)
         self._opening = self._opening_target = float(observation[GRIPPER])
@@ -146,7 +148,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         """Return the newest observation; begin with it if it is another robot's than before."""
         if self._observation is not None:
             if self._target is None:
-                self._begin(self._observation, ur5())
+                self._begin(self._observation)
             return self._observation
         robots = connected_robots()
         if len(robots) != 1:
@@ -157,7 +159,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
             )
         (robot,) = robots
         if robot is not self._robot:
-            body = robot.simulation.body
+            body = robot.host.body
             if list(robot.action_names) != list(self.action_features) or not isinstance(body, Arm):
                 raise ConfigError(
                     f"bhd_keyboard_arm gives {', '.join(self.action_features)}; the {robot.name} takes "

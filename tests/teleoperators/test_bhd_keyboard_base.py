@@ -124,18 +124,18 @@ def teleoperate(*arguments: str) -> None:
     """Run LeRobot's command, and print what is sent to the robot whenever that changes."""
     from lerobot.scripts import lerobot_teleoperate
 
-    from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+    from bhd_lerobot.robots.robot import BhdRobot
 
-    send = SimulatedRobot.send_action
+    send = BhdRobot.send_action
     sent: list[object] = []
 
-    def printing(robot: SimulatedRobot, action: dict[str, float]) -> dict[str, float]:
+    def printing(robot: BhdRobot, action: dict[str, float]) -> dict[str, float]:
         if sent[-1:] != [action]:
             sent.append(action)
             print("SENT", json.dumps(action), flush=True)
         return send(robot, action)
 
-    SimulatedRobot.send_action = printing  # type: ignore[method-assign]
+    BhdRobot.send_action = printing  # type: ignore[method-assign]
     sys.argv = ["lerobot-teleoperate", *arguments]
     lerobot_teleoperate.main()
     print("ENDED", flush=True)
