@@ -8,9 +8,9 @@ from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleopera
 
 _HELP = """\
 Keys of bhd_keyboard_base, lower case, held down; any other key stops:
-   u   i   o      forward and left    forward    forward and right
-   j   k   l      turn left           stop       turn right
-   m   ,   .      back, turning right   back     back, turning left
+   u   i   o      forward and left     forward   forward and right
+   j   k   l      turn left            stop      turn right
+   m   ,   .      back, turning right  back      back, turning left
 q/z both speeds 10 % up or down, w/x speed, r/v yaw rate."""
 
 # Signs of the speed and of the yaw rate, positive to the left.
@@ -29,8 +29,8 @@ _FACTORS = {
 class BhdKeyboardBase(KeyboardTeleoperator):
     """A person at the keys of a terminal drives a base.
 
-    The keys are those of `teleop_twist_keyboard`, but for the yaw rate: ``r`` and ``v`` change it, because ``e`` is an
-    emergency stop.
+    The keys are those of `teleop_twist_keyboard`, but for the yaw rate: ``r`` and ``v`` change it, because ``e`` is kept
+    for the emergency stop.
 
     Args:
         config: the configuration.
