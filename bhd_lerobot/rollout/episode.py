@@ -13,6 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import BrainStoppedError
 from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -40,7 +41,8 @@ class EpisodeLoop:
     Attributes:
         observer: receives every frame of every simulation, and every image; None if there is none.
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
-        fault: whether a real robot's fault has.
+        fault: whether a real robot's fault has, or a brain that has stopped.
+        problem: why the brain has stopped, as text; empty if it has not.
         marks: takes the marks of a person for the running episodes.
     """
 
@@ -56,6 +58,7 @@ class EpisodeLoop:
         self.robots, self.task, self.brain = robots, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = self.fault = False
+        self.problem = ""
         self.marks = Marks(robots.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
@@ -75,6 +78,7 @@ class EpisodeLoop:
                 environment,
                 robots.body,
                 robots.camera_shapes,
+                robots.config.type,
             )
         )
 
@@ -115,7 +119,7 @@ class EpisodeLoop:
                     done[episode.spec.index] = episode
                     self.emergency_stop |= event == Event.ESTOP
                     # A person finds out why a real robot stopped before it moves again.
-                    self.fault |= event == Event.FAULT and self.robots.world is None
+                    self.fault |= event == Event.FAULT and (self.robots.world is None or bool(self.problem))
                 if not finished:
                     continue
                 ids = np.array([sim for sim, _ in finished])
@@ -187,7 +191,10 @@ class EpisodeLoop:
             robots.running,
         )
         started = time.perf_counter()
-        command = in_single_precision(brain.act(seen))
+        try:
+            command = in_single_precision(brain.act(seen))
+        except BrainStoppedError as error:
+            command, self.problem = None, str(error)
         # On the lockstep clock time stands still during inference.
         inference_time = np.full(robots.n, time.perf_counter() - started if robots.clock is not None else 0.0)
         report = robots.step(command)
@@ -224,6 +231,8 @@ class EpisodeLoop:
         reward, event = self.task.judge(self._truth, robots.running)
         event = add_faults(event, report.mode, robots.running)
         event, driven = self.marks.frame(event, robots.running)
+        if self.problem:
+            event = np.where(robots.running & (event == Event.NOTHING), int(Event.FAULT), event)
         taken, _ = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
             keys.ACTION: report.requested.astype(np.float32),

@@ -78,6 +78,11 @@ class Marks:
             else:
                 self._driving.discard(simulation)
 
+    def is_driving(self, simulation: int = 0) -> bool:
+        """Return whether an intervention is on in a simulation."""
+        with self._lock:
+            return simulation in self._driving
+
     def on_key(self, keys: bytes) -> None:
         """Take keys of a terminal. They mean the first simulation."""
         for meaning in [one.meaning for key in keys for one in self._keys if key in one.sent]:

@@ -175,6 +175,6 @@ def _check_expert(brain: Any) -> None:
     if not advice:
         what = "a policy, and no expert" if advice is None else "with an expert that gives goals"
         raise ConfigError(
-            f"dataset.expert_action asks for what an expert would do, and brain.type is {brain.name!r}, {what}. Use a "
-            "rule, or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
+            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, {what}. Use a rule, "
+            "or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
         )

@@ -202,7 +202,7 @@ def check_throttling(folder: Path = Path("/proc/sys/kernel")) -> list[Finding]:
     try:
         runtime, period = (int((folder / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
     except (OSError, ValueError) as error:
-        return [fine("RT throttling", f"this kernel does not say ({error})")]
+        return [fine("RT throttling", f"not reported by this kernel ({error})")]
     if runtime < 0:
         return [wrong("throttling.off", "off")]
     share = runtime / period
@@ -217,7 +217,7 @@ def check_clock(folder: Path = Path("/sys/devices/system/clocksource/clocksource
         source = (folder / "current_clocksource").read_text().strip()
         others = (folder / "available_clocksource").read_text().split()
     except OSError as error:
-        return [fine("clock source", f"this kernel does not say ({error})")]
+        return [fine("clock source", f"not reported by this kernel ({error})")]
     found = f"{source} (available: {', '.join(others)})"
     if source in _SLOW_CLOCKS:
         return [wrong("clock", found, source=source)]

@@ -62,7 +62,7 @@ def find(name: str | None) -> LiveBlock:
         what = "No robot runs on the wall clock" if name is None else f"No running robot is called {name!r}"
         raise RealtimeError(f"{what}. Running: none. Start one with --robot.clock=realtime and --robot.id=NAME.")
     if name is None:
-        raise RealtimeError(f"Several robots run: {listed}. Say which: bhd-monitor ID.")
+        raise RealtimeError(f"Several robots run: {listed}. Choose one: bhd-monitor ID.")
     raise RealtimeError(f"No running robot is called {name!r}. Running: {listed}.")
 
 

@@ -72,7 +72,7 @@ class DaggerConfig(BrainConfig):
                 raise ConfigError(f"brain.{name}.type is 'dagger' itself; choose a brain that drives.")
         if getattr(self.learner, "stream", False):
             raise ConfigError(
-                "brain.learner.stream is true, but who drives is decided anew in every frame. Set it to false."
+                "brain.learner.stream is true, but the driver is chosen anew in every frame. Set it to false."
             )
 
 
@@ -95,7 +95,7 @@ class DaggerBrain:
         if self._goals is not None and config.disagreement is not None:
             raise ConfigError(
                 f"brain.disagreement compares setpoints, and the expert {expert.name!r} gives goals. Leave it out; "
-                "brain.collision_s, brain.stall_s and brain.patience_s say when it takes over."
+                "brain.collision_s, brain.stall_s and brain.patience_s define when it takes over."
             )
         self.has_plan = expert.has_plan
         self._advised: Array | None = None

@@ -297,7 +297,7 @@ def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
     words[Word.PHASE] = Phase.ENDED
     for pause, end in ((0, 0), (1, 0), (0, 1)):
         words[Word.PAUSE], words[Word.END] = pause, end
-        assert "its brain's process is gone" in str(sampler.end())
+        assert "its brain's process has ended" in str(sampler.end())
     words[Word.PAUSE] = words[Word.END] = 1
     assert sampler.end() == "ended"
     robot.block.words[Word.PHASE] = Phase.RUNNING
