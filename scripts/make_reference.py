@@ -71,8 +71,9 @@ def pages() -> dict[Path, str]:
     """Return every page, by its file."""
     listed: Listed = {}
     groups = {name: _choices(kind) for name, kind, _ in options_of(RecordConfig)}
+    groups["teleop"] = _choices(TeleoperatorConfig)
     texts = {name: [f"# `{name}`\n"] for name in ("robot", "brain", "task")}
-    for name in texts:
+    for name in (*texts, "teleop"):
         listed[frozenset(groups[name].values())] = name, f"{name}.md"
     for name, text in texts.items():
         for chosen, one in groups[name].items():
@@ -86,7 +87,7 @@ def pages() -> dict[Path, str]:
         *("## `bhd-train` with `algorithm: dagger`\n", *_options(AggregationConfig, "", "train.md", listed)),
     ]
     texts["teleop"] = ["# `teleop`\n", _TELEOPERATORS]
-    for chosen, one in _choices(TeleoperatorConfig).items():
+    for chosen, one in groups["teleop"].items():
         own = [name for name, _, _ in options_of(one) if name not in ("id", "calibration_dir")]
         texts["teleop"] += [
             f"## `teleop.type={chosen}`\n",
@@ -149,7 +150,8 @@ def _options(
         choices = _choices(kind)
         groups = {f"{key}.type={name}": one for name, one in choices.items()}
         if groups:
-            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), "*required*")
+            unset = "`null`" if default is None else "*required*"
+            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), unset)
             rows.append((f"`{key}.type`", ", ".join(f"`{name}`" for name in choices), chosen, meaning))
         elif dataclasses.is_dataclass(kind):
             groups = {key: typing.cast(type, kind)}
@@ -182,7 +184,7 @@ def _introduction(config_class: type) -> Iterator[str]:
 
 def _choices(kind: Any) -> dict[str, type]:
     """Return the classes of ours that are registered under a choice type, or nothing if it is none."""
-    known = choices_of(kind) if isinstance(kind, type) else {}
+    known = choices_of(kind)
     return {name: one for name, one in sorted(known.items()) if one.__module__.startswith("bhd_lerobot.")}
 
 

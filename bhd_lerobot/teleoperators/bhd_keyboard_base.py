@@ -29,8 +29,8 @@ _FACTORS = {
 class BhdKeyboardBase(KeyboardTeleoperator):
     """A person at the keys of a terminal drives a base.
 
-    The keys are those of `teleop_twist_keyboard`, but for the yaw rate: ``r`` and ``v`` change it, because ``e`` is kept
-    for the emergency stop.
+    The keys are those of `teleop_twist_keyboard`, but for the yaw rate: ``r`` and ``v`` change it, because ``e`` is
+    kept for the emergency stop.
 
     Args:
         config: the configuration.
