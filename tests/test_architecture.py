@@ -86,7 +86,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
             *_DATASETS,
             "datasets.writer",
         ),
-        *("rollout", "hub", "cluster"),
+        *("rollout", "teleoperators", "hub", "cluster"),
     ),
     "evaluation": (
         *("tasks", "control", "robots.host", "policies", "policies.perception"),
@@ -95,7 +95,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "teleoperators": (
         *("bodies", "control", "control.geometry", "control.arm"),
-        *("policies.*", "robots", "registry", "rollout"),
+        *("policies.*", "robots", "registry"),
     ),
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (

@@ -17,6 +17,7 @@ from bhd_lerobot.teleoperators.targets import JOINT_NAMES, POSE_NAMES, JointTarg
 
 GRIPPER = "gripper.pos"
 _GRIPPER_SPEED = 0.1  # [m/s] of the opening; an estimate, slow enough for the UR5's gripper to follow
+_GRIP_M = 0.01  # [m] that a gripper is closed further than what it may hold is wide
 _LONGEST_STEP_S = 0.1  # [s] that one action moves the target for: a program that was held up does not catch up
 
 # Which of the six coordinates a key moves, and in which direction.
@@ -94,8 +95,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         """Begin where the robot is.
 
         Args:
-            observation: the gripper's opening, and the tool's pose or a UR5's joint positions, by feature name. The
-                opening of a gripper that holds something is the commanded one, or it would let go.
+            observation: the gripper's opening, and the tool's pose or a UR5's joint positions, by feature name.
             body: the arm; the UR5 if it is not known.
 
         Raises:
@@ -116,6 +116,8 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         else:
             self._target = JointTarget(observation)
         self._opening = self._opening_target = float(observation[GRIPPER])
+        if self._opening < self.config.opening - _GRIP_M:  # it may hold something, and is not to let it go
+            self._opening_target = max(0.0, self._opening - _GRIP_M)
         self._last = self._clock()
         self._held = ""
 
