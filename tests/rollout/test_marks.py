@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from numpy.typing import NDArray
 
 from bhd_lerobot.cli.record import main
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.registry import make_simulation, make_task
@@ -139,24 +142,43 @@ def test_in_the_loop_an_intervention_flags_its_frames() -> None:
     np.testing.assert_array_equal(marked[0].columns[keys.ACTION], plain[0].columns[keys.ACTION])
 
 
-def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
-    """`s` in a terminal ends an episode on the wall clock, minutes before its time is up."""
-    from bhd_lerobot.datasets.format.summary import dataset_info
+def record_at_a_terminal(folder: Path, typed: bytes, *options: str) -> dict[str, NDArray]:
+    """Record an episode of minutes in a terminal in which keys are pressed again and again; return its columns.
 
+    A mark ends it at once. Marks between two episodes are dropped: the keys are repeated until they take effect.
+    """
     ours, theirs = pty.openpty()
-    root, log = Path(__file__).resolve().parents[2], tmp_path / "log"
+    log = folder / "log"
     arguments = [
-        f"--config_path={root}/configs/record/turtlebot3_avoid.yaml", "--robot.clock=realtime", "--robot.beams=36",
-        f"--dataset.root={tmp_path}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
-        f"--output_dir={tmp_path}/o", "--dataset.episode_time_s=600",
+        *options, "--robot.type=turtlebot3", "--robot.clock=realtime", "--robot.beams=36",
+        f"--dataset.root={folder}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
+        f"--output_dir={folder}/o", "--dataset.episode_time_s=600",
     ]  # fmt: skip
     process = Fork(main, arguments, output=log, terminal=theirs)
     os.close(theirs)
-    until(lambda: process.poll() is not None or "s success, f failure" in log.read_text())
+    until(lambda: process.poll() is not None or " success, " in log.read_text())
     while process.poll() is None:
-        os.write(ours, b"s")  # marks between two episodes are dropped, so it is repeated until it takes effect
-        time.sleep(0.2)
+        for key in typed:
+            os.write(ours, bytes([key]))
+            time.sleep(0.2)
     os.close(ours)
     assert process.wait() == 0, log.read_text()
-    (episode,) = dataset_info(tmp_path / "d").episodes
+    (episode,) = dataset_info(folder / "d").episodes
     assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)
+    (data,) = (folder / "d" / "data").rglob("*.parquet")
+    table = pq.read_table(data)
+    return {name: np.array(table[name].to_pylist()) for name in (keys.ACTION, keys.EVENT)}
+
+
+def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[2]
+    record_at_a_terminal(tmp_path, b"s", f"--config_path={root}/configs/record/turtlebot3_avoid.yaml")
+
+
+@pytest.mark.thorough
+def test_by_keys_a_person_drives_and_marks(tmp_path: Path) -> None:
+    """`s`, `f` and `i` belong to the teleoperator; Enter marks."""
+    options = ("--teleop.type=bhd_keyboard_base", "--task.instruction=Drive.", "--task.arena=empty")
+    columns = record_at_a_terminal(tmp_path, b"sfi" * 4 + b"\r", *options)
+    assert [0.22, 0.0] in columns[keys.ACTION].round(6).tolist()
+    assert columns[keys.EVENT].tolist()[:-1] == [Event.NOTHING] * (len(columns[keys.EVENT]) - 1)

@@ -16,8 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
+from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -164,6 +169,40 @@ def test_g_closes_and_opens_the_gripper_at_its_speed(make: Any, clock: Clock, pe
     person.press("g", teleop)  # closed where it starts: it opens
     clock.now += FRAME
     assert teleop.get_action()["gripper.pos"] > 0
+
+
+def test_a_gripper_that_may_hold_something_does_not_let_go(make: Any, clock: Clock) -> None:  # noqa: F811
+    teleop = make()
+    for measured, commanded in ((0.04, 0.03), (0.005, 0.0), (MAX_OPENING - 1e-4, MAX_OPENING - 1e-4)):
+        teleop.start_from({**POSE, "gripper.pos": measured})
+        assert teleop.get_action()["gripper.pos"] == measured
+        for _ in range(5):
+            clock.now += 0.1
+            action = teleop.get_action()
+        assert action["gripper.pos"] == pytest.approx(commanded)
+
+
+def test_as_a_brain_it_starts_where_the_robot_is_at_an_episode_and_at_a_takeover(
+    tmp_path: Path, clock: Clock, person: Person  # noqa: F811
+) -> None:  # fmt: skip
+    brain = TeleopBrain(TeleopConfig(BhdKeyboardArmConfig(calibration_dir=tmp_path)))
+    teleop: BhdKeyboardArm = brain.teleop
+    teleop._clock = clock
+    names = (*JOINT_ACTIONS, *TOOL_NAMES[:-1])
+    body = UR5Config().body()
+    brain.bind(RobotFeatures(names, TOOL_NAMES, 25, body=body, robot_type="ur5"))
+    tool = pose_vectors(ArmKinematics(body.chain, body.limits).tool(np.array(body.home[:6])))
+    observation = Observation(names, np.array([[*body.home, *tool]]))
+    for _ in range(2):
+        brain.reset(np.zeros(1, np.intp), [0], 1)
+        person.press("w", teleop)
+        x = []
+        for _ in range(5):
+            x.append(brain.act(observation)[0, 0])  # type: ignore[index]  it gives setpoints
+            clock.now += FRAME
+        assert np.allclose(x, tool[0] + 0.05 * FRAME * np.arange(5))
+    brain.close()
+    assert not teleop.is_connected
 
 
 def test_plus_and_minus_change_the_speeds_up_to_their_limits(
