@@ -32,6 +32,8 @@ class DatasetConfig:
         root: folder of the dataset; by default LeRobot's place for `repo_id`.
         fps: frames a second [Hz]; the robot's own if 0.
         num_episodes: total number of episodes in the dataset.
+        reset_time_s: time to set up the scene of a real robot between two episodes [s]; Enter ends it, and a
+            teleoperator drives the robot meanwhile.
         episode_time_s: maximum duration of an episode [s]; by default the task's.
         language: also write the brain's plan and its current step into LeRobot's column `language_persistent`, for
             brains with a plan. Off by default, because PyTorch's collating and `lerobot-dataset-viz` fail on that
@@ -48,6 +50,7 @@ class DatasetConfig:
     fps: int = 0
     num_episodes: int = 50
     episode_time_s: float | None = None
+    reset_time_s: float = 0.0
     language: bool = False
     expert_action: bool = False
     push_to_hub: bool = False
@@ -137,6 +140,10 @@ class RecordConfig:
         ):
             if value < 1:
                 raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        if not 0 <= self.dataset.reset_time_s < float("inf"):
+            raise ConfigError(
+                f"dataset.reset_time_s is {self.dataset.reset_time_s}; it must be finite and not negative."
+            )
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)

@@ -58,14 +58,20 @@ def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
 
 
 @each_case(
-    ("keys", "others", "success", "failure", "intervention"),
-    [(KEYS, b"xe \r\t\x7f\xff", b"sS", b"fF", b"iI"), (TELEOP_KEYS, b"sfix e\xff", b"\r\n", b"\x7f\b", b"\t")],
+    ("keys", "others", "typed"),
+    [
+        (KEYS, b"xe \r\t\x7f\xff", (b"sS", b"fF", b"iI", b"rR", b"pP")),
+        (TELEOP_KEYS, b"sfirx e\xff", (b"\r\n", b"\x7f\b", b"\t", b"tT", b"pP")),
+    ],
 )
-def test_keys(keys: tuple[MarkKey, ...], others: bytes, success: bytes, failure: bytes, intervention: bytes) -> None:
+def test_keys(keys: tuple[MarkKey, ...], others: bytes, typed: tuple[bytes, ...]) -> None:
+    success, failure, intervention, again, pause = typed
     marks = Marks(2, keys=keys)
     marks.on_key(others)
     assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
     assert not marks.frame(NOTHING, ALL)[1].any()
+    assert not marks.take_again()
+    assert not marks.is_paused
     for key in intervention:
         marks.on_key(others + bytes([key]))
         assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
@@ -77,11 +83,24 @@ def test_keys(keys: tuple[MarkKey, ...], others: bytes, success: bytes, failure:
             assert marks.frame(NOTHING, ALL)[0].tolist() == [event, 0]
     marks.on_key(failure + success)  # the last one counts
     assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.SUCCESS, 0]
+    for key in again:
+        marks.on_key(bytes([key]))
+        assert marks.take_again()
+        assert not marks.take_again()
+    for key in pause:
+        marks.on_key(bytes([key]))
+        assert marks.is_paused == (key == pause[0])
+    with marks.waiting() as is_pressed:
+        assert not is_pressed()
+        marks.on_key(b"\r")  # begins the next episode, and is no success of it
+        assert is_pressed()
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
 
 
 def test_the_help_names_every_key() -> None:
-    assert key_help(KEYS) == "s success, f failure, i intervention begins or ends"
-    assert key_help(TELEOP_KEYS) == "Enter success, Backspace failure, Tab intervention begins or ends"
+    rest = "discards this take and records it again, p pauses before the next episode"
+    assert key_help(KEYS) == f"s success, f failure, i intervention begins or ends, r {rest}"
+    assert key_help(TELEOP_KEYS) == f"Enter success, Backspace failure, Tab intervention begins or ends, t {rest}"
 
 
 def test_wrong_names_are_refused() -> None:
