@@ -17,6 +17,10 @@ from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
+from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
+    config_bhd_keyboard_arm,
+    config_bhd_keyboard_base,
+)
 
 
 @dataclass
@@ -82,8 +86,8 @@ class RecordConfig:
         output_dir: run folder, for the resolved configuration and images; by default a new one in `outputs/record`.
         preview_video: make an MP4 of the first episode; by default if images can be rendered.
         estop_key: space or `e` in the terminal triggers an emergency stop, `s` ends the episode as a success, `f` as a
-            failure, and `i` begins or ends an intervention; by default if there is a terminal and the robot runs on
-            the wall clock.
+            failure, and `i` begins or ends an intervention (Enter, Backspace and Tab with a keyboard teleoperator of
+            ours); by default if there is a terminal and the robot runs on the wall clock.
         estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
         display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
             these options are those of `lerobot-record`.

@@ -26,14 +26,14 @@ from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.driver import open_driver
+from bhd_lerobot.recording.driver import mark_keys, open_driver
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_summary
 from bhd_lerobot.recording.reset import ResetPhase
 from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
-from bhd_lerobot.rollout.marks import KEYS, Marks
+from bhd_lerobot.rollout.marks import Marks, key_help
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.progress import print_notes, progress_bars
@@ -60,7 +60,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
     robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))))
+    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))), mark_keys(config))
     pressed = EstopInputs(robots.estop, marks.on_key)
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
@@ -200,7 +200,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
     if has_key:
-        console.print(f"Keys: {KEYS}")
+        console.print(f"Keys: {key_help(mark_keys(config))}")
 
 
 def _recording(config: RecordConfig, root: Path) -> Recording:
@@ -223,8 +223,8 @@ def _judged_task(config: RecordConfig, robots: Robots, console: Console) -> Task
     task = judged(task, robots.knows, robots.n, config.dataset.fps)
     if isinstance(task, OperatorTask):
         console.print(
-            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with the keys s "
-            "(success) and f (failure); otherwise it ends in a time-out."
+            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with a key "
+            f"({key_help(mark_keys(config))}); otherwise it ends in a time-out."
         )
     return task
 

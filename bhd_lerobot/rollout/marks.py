@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,50 @@ from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 Mask = NDArray[np.bool_]
 
+
+class MarkKey(NamedTuple):
+    """A key of the terminal that marks the running episode.
+
+    Attributes:
+        name: what is printed on the key.
+        sent: what the terminal sends for it, each byte alone.
+        meaning: ``"success"``, ``"failure"``, ``"intervention"``, ``"again"`` or ``"pause"``.
+    """
+
+    name: str
+    sent: bytes
+    meaning: str
+
+
 KEYS = (
-    "s success, f failure, i intervention begins or ends, r discards this take and records it again, "
-    "p pauses before the next episode"
+    MarkKey("s", b"sS", "success"),
+    MarkKey("f", b"fF", "failure"),
+    MarkKey("i", b"iI", "intervention"),
+    MarkKey("r", b"rR", "again"),
+    MarkKey("p", b"pP", "pause"),
 )
-"""What each key of the terminal means."""
+"""The keys of the terminal."""
+TELEOP_KEYS = (
+    MarkKey("Enter", b"\r\n", "success"),
+    MarkKey("Backspace", b"\x7f\b", "failure"),
+    MarkKey("Tab", b"\t", "intervention"),
+    MarkKey("t", b"tT", "again"),
+    MarkKey("p", b"pP", "pause"),
+)
+"""The keys while a keyboard teleoperator uses the other letters."""
+_MEANINGS = {
+    "success": "success",
+    "failure": "failure",
+    "intervention": "intervention begins or ends",
+    "again": "discards this take and records it again",
+    "pause": "pauses before the next episode",
+}
+
+
+def key_help(keys: Sequence[MarkKey]) -> str:
+    """Return in one line what the keys mean."""
+    return ", ".join(f"{key.name} {_MEANINGS[key.meaning]}" for key in keys)
+
 
 _HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
 
@@ -26,10 +66,15 @@ class Marks:
 
     An outcome ends the episode with the frame in which it is set. A frame of an intervention carries the
     event ``intervention``; what moves the robot meanwhile is not decided here.
+
+    Args:
+        n: number of simulations.
+        outcomes: those that the task can have.
+        keys: the terminal's keys: `KEYS`, or `TELEOP_KEYS` while a keyboard teleoperator uses the letters.
     """
 
-    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES) -> None:
-        self._n, self._valid = n, tuple(outcomes)
+    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES, keys: Sequence[MarkKey] = KEYS) -> None:
+        self._n, self._valid, self._keys = n, tuple(outcomes), tuple(keys)
         self._lock = threading.Lock()
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
@@ -90,20 +135,14 @@ class Marks:
         return self._is_paused
 
     def on_key(self, keys: bytes) -> None:
-        """Take keys of a terminal; see `KEYS`. They mean the first simulation."""
-        for key in keys.decode("ascii", "ignore").lower():
-            if self._is_waiting and key in "\r\n":
+        """Take keys of a terminal. They mean the first simulation."""
+        marks = {"intervention": self.intervention, "again": self.again, "pause": self.pause}
+        for key in keys:
+            if self._is_waiting and key in b"\r\n":
                 self._go.set()
-            elif key == "s":
-                self.outcome(Event.SUCCESS.cause)
-            elif key == "f":
-                self.outcome(Event.FAILURE.cause)
-            elif key == "i":
-                self.intervention()
-            elif key == "r":
-                self.again()
-            elif key == "p":
-                self.pause()
+                continue
+            for meaning in [one.meaning for one in self._keys if key in one.sent]:
+                marks[meaning]() if meaning in marks else self.outcome(meaning)
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
         """Forget the marks of episodes before."""
