@@ -119,7 +119,7 @@ def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_pat
         dataset.add_frame({"action": np.zeros(2, np.float32), "task": "none"})
     dataset.save_episode()
     dataset.finalize()
-    with pytest.raises(DatasetError, match="lerobot-replay"):
+    with pytest.raises(DatasetError, match=r"--robot.type"):
         Replay(tmp_path / "other", 0)
 
 
