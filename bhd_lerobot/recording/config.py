@@ -30,7 +30,7 @@ class DatasetConfig:
             brains with a plan. Off, because PyTorch's own collating and `lerobot-dataset-viz` fail on that column;
             LeRobot's training knows it.
         expert_action: also record what the expert would do in every frame, `expert.action`: of the brain `dagger` its
-            expert, if it gives setpoints; of any other rule what it does.
+            expert; of any other rule what it does.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.

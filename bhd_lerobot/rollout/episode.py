@@ -3,17 +3,17 @@
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures, is_privileged
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.host import FrameReport, Host
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -42,6 +42,7 @@ class EpisodeLoop:
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
         fault: whether a real robot's fault has.
         marks: takes the marks of a person for the running episodes.
+        act_times: how long each call of the brain's `act` took [s].
     """
 
     observer: Observer | None = None
@@ -63,6 +64,8 @@ class EpisodeLoop:
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
+        self.act_times: list[float] = []
+        self._gives_goals = False
         self._drivers = DriverLog(brain, simulation.n, self._frames)
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
@@ -92,7 +95,6 @@ class EpisodeLoop:
             open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
         self._open_images = open_images
-        self._advice: Callable[[], NDArray[np.float64] | None] | None = getattr(self.brain, "advice", None)
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]
@@ -160,19 +162,12 @@ class EpisodeLoop:
         self.marks.begin(ids)
         self._truth = None
 
-    def _looks(self) -> NDArray[np.bool_]:
-        """Return in which simulations the brain is about to use images, shape (n,)."""
-        looks = getattr(self.brain, "looks", None)  # `isinstance` does not see through a `TimedBrain`
-        if self.brain.uses_images and looks is not None:
-            return cast(Looking, self.brain).looks(self._results)
-        return np.full(self.simulation.n, self.brain.uses_images)
-
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
         simulation, task, brain = self.simulation, self.task, self.brain
         frame = simulation.observe()
         state = frame.state.astype(np.float32)
-        images = self._images.order_all(self.observer, self._looks())
+        images = self._images.order_all(self.observer, np.broadcast_to(brain.looks(self._results), simulation.n))
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:
@@ -190,9 +185,11 @@ class EpisodeLoop:
             simulation.running,
         )
         started = time.perf_counter()
-        command = in_single_precision(brain.act(seen))
+        command = brain.act(seen)
+        self.act_times.append(time.perf_counter() - started)
+        command = in_single_precision(command)
         # On the lockstep clock time stands still during inference.
-        inference_time = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
+        inference_time = np.full(simulation.n, self.act_times[-1] if simulation.is_live else 0.0)
         physics = simulation.physics_state
         report = simulation.step(command)
         match command:
@@ -201,8 +198,6 @@ class EpisodeLoop:
             case None | Chunk():
                 # The chunk's setpoint for this frame; after its last, the last.
                 action = simulation.to_action(simulation.cerebellum.requested)
-            case Mixed():
-                action = command.actions
             case _:
                 action = command
         self._log(command, report)
@@ -217,7 +212,7 @@ class EpisodeLoop:
         }
         if physics.shape[1]:
             values[keys.PHYSICS_STATE] = physics
-        if self._advice is not None and (advised := self._advice()) is not None:
+        if (advised := brain.advice()) is not None:
             values[keys.EXPERT_ACTION] = advised.astype(np.float32)
         finished: list[tuple[int, Event]] = []
         for frame_report in (*report.missed, report):
@@ -238,10 +233,11 @@ class EpisodeLoop:
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)
         event, driven = self.marks.frame(event, simulation.running)
-        taken, by_goals = self._drivers.frame(running, self._length, is_missed=is_missed)
+        taken = self._drivers.frame(running, self._length, is_missed=is_missed)
+        if self._gives_goals:
+            # What a policy learns from is where the reference was.
+            values[keys.ACTION] = report.applied.astype(np.float32)
         values |= {
-            # While a goal is followed, what a policy learns from is where the reference was.
-            keys.ACTION: np.where(by_goals[:, None], report.applied.astype(np.float32), values[keys.ACTION]),
             keys.APPLIED_ACTION: report.applied,
             keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
             keys.LIMITS: report.limits,
@@ -291,8 +287,9 @@ class EpisodeLoop:
 
     def _log(self, command: Command, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
-        self._drivers.decided(command)
-        if isinstance(command, Goals | Mixed):
+        self._drivers.decided()
+        self._gives_goals = isinstance(command, Goals)
+        if isinstance(command, Goals):
             for sim, goals in command.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), goal) for goal in goals]
         for sim, results in report.results.items():
@@ -354,12 +351,11 @@ class EpisodeLoop:
             outcome=outcome,
             timing=timing,
             writer=writer,
-            commands=self._commands[sim] if self._drivers.gives_goals else None,
+            commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,
             realtime=self.simulation.grants,
             interventions=self._drivers.interventions(sim, length),
-            goal_frames=self._drivers.goal_frames(sim, length),
         )
 
 
@@ -368,7 +364,7 @@ def in_single_precision(command: Command) -> Command:
     match command:
         case None | Goals():
             return command
-        case Chunk() | Mixed():
+        case Chunk():
             return replace(command, actions=_rounded(command.actions))
         case _:
             return _rounded(command)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
@@ -268,16 +268,12 @@ class Host(ABC):
                 self._send_chunk(actions, receipt)
             case Goals(commands):
                 self._submit(commands, receipt)
-            case Mixed(actions, by_goals, commands):
-                self._submit({sim: goals for sim, goals in commands.items() if by_goals[sim]}, receipt)
-                self._send_setpoint(actions, self.running & ~by_goals, receipt)
             case _:
-                self._send_setpoint(command, self.running, receipt)
+                self._send_setpoint(command, receipt)
         return receipt
 
-    def _send_setpoint(self, action: NDArray[np.float64], mask: NDArray[np.bool_], receipt: Receipt) -> None:
-        if not mask.any():
-            return
+    def _send_setpoint(self, action: NDArray[np.float64], receipt: Receipt) -> None:
+        mask = self.running
         setpoints, refused = self.to_setpoints(action, mask)
         if refused:
             mask = mask.copy()
