@@ -34,7 +34,7 @@ def record(root: Path, episodes: int, frames: int) -> None:
     """Record drives past walls that are somewhere."""
     state = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(360))]
     physics = [f"qpos_{i}" for i in range(9)] + [f"qvel_{i}" for i in range(8)]
-    features = keys.dataset_features(state, ["x.vel", "theta.vel"], {}, physics)
+    features = keys.dataset_features(state, ["x.vel", "theta.vel"], {}, {keys.PHYSICS_STATE: physics})
     recorder = DatasetRecorder.create("bench/bags", FPS, features, robot_type="turtlebot3", root=root)
     rng, index = np.random.default_rng(0), np.arange(frames)
     for _ in range(episodes):

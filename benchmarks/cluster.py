@@ -26,10 +26,10 @@ from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_robot, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.provenance import episode_metadata
+from bhd_lerobot.rollout.recorder import Recording, open_recorder, save_episode
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
@@ -63,7 +63,10 @@ def record(config: RecordConfig, pool: WorkerPool | None, episodes: int) -> floa
         )
     specs = [EpisodeSpec(index, episode_seed(0, index, "train")) for index in range(episodes)]
     with tempfile.TemporaryDirectory() as folder:
-        recorder = open_recorder(config, Path(folder) / "data", simulation, task, brain)
+        recording = Recording(
+            "bench/cluster", Path(folder) / "data", config.dataset.fps, config.task, config.seed, config.split
+        )
+        recorder = open_recorder(recording, simulation, task, brain)
         started = time.perf_counter()
         for episode in loop.run(specs, open_images=recorder.begin_episode):
             save_episode(

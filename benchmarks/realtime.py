@@ -230,7 +230,7 @@ def drive(
         episode = next(loop.run([EpisodeSpec(0, SEED)], open_images=open_images))
     if episode.writer is not None:
         episode.writer.discard()
-    refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in simulation.grants if not grant["granted"])
+    refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in simulation.clock.grants if not grant["granted"])
     if len(states) < 2 or episode.outcome.event.cause not in ("timeout", "success"):
         cause, robot = episode.outcome.event.cause, simulation.config.type
         raise NotMeasuredError(
@@ -299,10 +299,8 @@ class NetworkBrain(RandomBrain):
 
 def make_recorder(simulation: Any, task: Any, config: Any, folder: Path) -> DatasetRecorder:
     """Return a recorder of everything, with video."""
-    images = dict.fromkeys(simulation.camera_names, (config.camera_height, config.camera_width, 3))
-    physics = [f"physics_{index}" for index in range(simulation.physics_state.shape[1])]
     names = simulation.observation_names, simulation.action_names
-    features = dataset_features(*names, images, physics, task.environment_names, effort_names=simulation.effort_names)
+    features = dataset_features(*names, simulation.camera_shapes, simulation.columns, task.environment_names)
     root = Path(tempfile.mkdtemp(dir=folder)) / "data"
     return DatasetRecorder.create("bench/realtime", config.fps, features, robot_type=config.type, root=root)
 

@@ -34,9 +34,9 @@ from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.tasks.task import TASKS, Task, TaskConfig
 
 if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
-    from bhd_lerobot.robots.host.host import Host
+    from bhd_lerobot.robots.host.robots import Robots
     from bhd_lerobot.robots.host.simulation import Simulation
-    from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+    from bhd_lerobot.robots.robot import BhdRobot
 
 
 class _Dagger(DaggerBrain):
@@ -92,7 +92,7 @@ BRAINS: Registry[Any] = Registry("brain", {brain.name: brain for brain in _CLASS
 # --- registering -----------------------------------------------------------------------------------------------------
 
 
-def register_robot[T: "type[SimulatedRobot]"](robot: T) -> T:
+def register_robot[T: "type[BhdRobot]"](robot: T) -> T:
     """Register a simulated robot; a decorator of its class, which names its type, configuration and simulation.
 
     Raises:
@@ -233,7 +233,7 @@ def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> "Sim
     return made
 
 
-def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Host":
+def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Robots":
     """Return n robots on the clock that the configuration asks for; on the wall clock there can be one."""
     if config.clock != "realtime":
         return make_simulation(config, n, threads)

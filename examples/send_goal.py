@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
-    bridge = robot.simulation.bridge
+    bridge = robot.host.bridge
     print(f"goal     {goal.task_id}: tool to {goal.target_pose}")
     refusal = bridge.submit(goal)
     if refusal is not None:
@@ -79,7 +79,7 @@ def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
         feedback = bridge.feedback()
         if feedback is not None and seconds >= shown * FEEDBACK_S:
             shown += 1
-            position = robot.simulation.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
+            position = robot.host.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
             print(
                 f"{seconds:6.2f} s  feedback  {feedback.phase.name.lower()} {100 * feedback.progress:3.0f} %, "
                 f"{feedback.remaining_s:4.2f} s left, tool at {position.round(3).tolist()}"
@@ -91,7 +91,7 @@ def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
 
 
 def _after_stop(robot: UR5, goal: BrainCommand) -> int:
-    bridge = robot.simulation.bridge
+    bridge = robot.host.bridge
     while bridge.state().is_moving[0]:
         bridge.advance_frame()
     print("at rest  sending the next goal")

@@ -223,12 +223,15 @@ def _columns() -> str:
     image = (config.camera_height, config.camera_width, 3)
     # The state of a free body (7 positions, 6 velocities) and of two wheels.
     base = keys.dataset_features(
-        observation_names(config), ("x.vel", "theta.vel"), {"front": image}, [str(i) for i in range(17)]
+        observation_names(config),
+        ("x.vel", "theta.vel"),
+        {"front": image},
+        {keys.PHYSICS_STATE: [str(i) for i in range(17)]},
     )
     arm_config = UR5Config(camera=True)
     image = (arm_config.camera_height, arm_config.camera_width, 3)
     # Six joints and two fingers, and five free bodies.
-    physics = [str(i) for i in range(8 + 5 * 7 + 8 + 5 * 6)]
+    physics = {keys.PHYSICS_STATE: [str(i) for i in range(8 + 5 * 7 + 8 + 5 * 6)]}
     cameras = {"scene": image, "wrist": image}
     arm = keys.dataset_features(OBSERVED, JOINT_ACTIONS, cameras, physics, pick.ENVIRONMENT, subtask=True)
     environment = (

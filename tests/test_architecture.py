@@ -39,7 +39,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "control.arm": ("bodies.body", "control", "control.geometry", "control.motion"),
     "realtime": ("bodies.body", "control.*"),
     "tasks": _TASKS,
-    "robots.host": ("bodies.body", "sim", "control.*", "realtime"),
+    "robots.host": ("bodies.body", "sim", "control.*", "realtime", "datasets.format"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
@@ -69,7 +69,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),
     "rollout": (
         *("__version__", "options", "registry"),
-        *("tasks", "bodies", "sim", "control", "robots.*", "policies.*", "datasets.format"),
+        *("tasks", "bodies", "sim", "control", "robots.*", "policies.*"),
+        *(*_DATASETS, "datasets.writer"),
     ),
     "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
@@ -90,7 +91,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "evaluation": (
         *("tasks", "control", "robots.host", "policies", "policies.perception"),
         *("datasets.format", "datasets.timing", "datasets.writer"),
-        *("options", "registry", "rollout", "cluster", "recording"),
+        *("options", "registry", "rollout", "cluster"),
     ),
     "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),

@@ -1,3 +1,12 @@
 """Numbers about hardware, each with its source; arenas, and what can lie on a table."""
 
-__all__ = ["arenas", "body", "differential_base", "registry", "tabletop", "turtlebot3", "ur5"]
+__all__ = [
+    "arenas",
+    "body",
+    "differential_base",
+    "registry",
+    "tabletop",
+    "truth",
+    "turtlebot3",
+    "ur5",
+]

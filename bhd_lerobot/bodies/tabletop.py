@@ -111,6 +111,10 @@ class TableObject:
         return f"{self.colour} {self.kind}"
 
 
+MAX_LATENCY_S = 0.05
+"""So late at the most do the servos of an arm get their commands [s]."""
+
+
 @dataclass(frozen=True)
 class Variation:
     """How one episode's world differs from the nominal one; the defaults are no difference.

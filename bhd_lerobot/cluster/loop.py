@@ -16,7 +16,7 @@ from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.policies.brain import Brain
-from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task
@@ -37,7 +37,7 @@ class ClusterLoop(EpisodeLoop):
     """Runs episodes on the workers of a cluster and yields the same, in the same order, as an `EpisodeLoop`.
 
     Args:
-        simulation: robots of this machine; they only say what is recorded.
+        robots: robots of this machine; they only say what is recorded.
         task: what is to be achieved.
         brain: what drives the robots; made here too, so that what does not fit fails before a dataset exists.
         tolerance: see `EpisodeLoop`.
@@ -48,7 +48,7 @@ class ClusterLoop(EpisodeLoop):
 
     def __init__(
         self,
-        simulation: Host,
+        robots: Robots,
         task: Task,
         brain: Brain,
         tolerance: TimingTolerance | None = None,
@@ -57,7 +57,7 @@ class ClusterLoop(EpisodeLoop):
         config: Any,
         brain_config: Any,
     ) -> None:
-        super().__init__(simulation, task, brain, tolerance)
+        super().__init__(robots, task, brain, tolerance)
         self._pool, self._config, self._brain_config = pool, config, brain_config
 
     def run(
@@ -82,7 +82,7 @@ class ClusterLoop(EpisodeLoop):
             for first in range(0, len(specs), per_task)
         ]
         video = None
-        if open_images is not None and self.simulation.camera_names:
+        if open_images is not None and self.robots.camera_shapes:
             writer = open_images()
             video = writer.video
             writer.discard()
@@ -120,7 +120,7 @@ class ClusterLoop(EpisodeLoop):
             task=config.task,
             brain=self._brain_config,
             tolerance=self.tolerance,
-            fps=self.simulation.rates.fps,
+            fps=self.robots.rates.fps,
             n=n,
             threads=config.threads or config.ray.cpus_per_worker,
             video=video,
@@ -128,6 +128,6 @@ class ClusterLoop(EpisodeLoop):
         )
 
     def _is_stopped(self) -> bool:
-        if self.simulation.bridge.estop_pressed:
+        if self.robots.estop_pressed:
             raise ClusterError(f"Emergency stop. Episodes that were running on the cluster were dropped. {CONTINUE}")
         return False

@@ -14,8 +14,78 @@ from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
 
 
-class ModeRequests(ABC):
-    """The changes of mode that a bridge can request."""
+class Bridge(ABC):
+    """Sends commands to a cerebellum, and reads its state: in lockstep, or across processes on the wall clock."""
+
+    @property
+    @abstractmethod
+    def now_ns(self) -> int:
+        """Time of the cerebellum [ns]."""
+
+    @abstractmethod
+    def send(
+        self,
+        values: NDArray[np.float64],
+        mask: NDArray[np.bool_] | None = None,
+        due_ns: int | None = None,
+        *,
+        replaces: bool = False,
+    ) -> SendResult:
+        """Send one setpoint.
+
+        Args:
+            values: the commands, shape (n, width).
+            mask: the simulations it is for, shape (n,); all if None.
+            due_ns: when it takes effect [ns]; at the next tick if None.
+            replaces: whether it takes the place of what was sent before and is not due yet.
+        """
+
+    @abstractmethod
+    def send_chunk(
+        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None
+    ) -> list[SendResult]:
+        """Send an action chunk: several setpoints, one for each coming frame, in place of what is left of the last.
+
+        Args:
+            values: the commands, shape (frames, n, width).
+            mask: the simulations it is for, shape (n,); all if None.
+            start_ns: when the first takes effect [ns]; at the next tick if None. Those whose frame has gone by already
+                are left out: a brain that took its time does not make the robot hurry.
+        """
+
+    @abstractmethod
+    def submit(self, command: BrainCommand, sim: int = 0) -> CommandResult | None:
+        """Send a goal to one simulation; None if it was accepted (its one result comes later), otherwise the refusal.
+
+        Raises:
+            ConfigError: there is no such simulation.
+            RealtimeError: the cerebellum does not answer.
+        """
+
+    @abstractmethod
+    def cancel(self, task_id: str, sim: int = 0) -> ResultCode:
+        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
+
+    @abstractmethod
+    def take_results(self, sim: int = 0) -> list[CommandResult]:
+        """Return the results of one simulation's goals that were not taken yet, in the order in which they came."""
+
+    @abstractmethod
+    def feedback(self, sim: int = 0) -> Feedback | None:
+        """Return how far the goal is that one simulation follows, or None."""
+
+    @abstractmethod
+    def state(self) -> CerebellumState:
+        """Return a copy of the newest state."""
+
+    @abstractmethod
+    def estop(self, ids: NDArray[np.intp] | None = None) -> None:
+        """Press the emergency stop; the next tick latches it."""
+
+    @property
+    @abstractmethod
+    def estop_pressed(self) -> bool:
+        """Whether the emergency stop of any simulation is pressed, be it latched already or not."""
 
     @abstractmethod
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
@@ -38,7 +108,7 @@ class ModeRequests(ABC):
         return self.request(Request.RESET, ids)
 
 
-class LockstepBridge(ModeRequests):
+class LockstepBridge(Bridge):
     """Runs the cerebellum on simulated time: a command is sent, then exactly one frame of ticks goes by.
 
     Nothing waits and nothing is late: the same commands give the same states, bit for bit.
@@ -84,27 +154,17 @@ class LockstepBridge(ModeRequests):
         *,
         replaces: bool = False,
     ) -> SendResult:
-        """Send one setpoint.
-
-        Args:
-            values: the commands, shape (n, width).
-            mask: the simulations it is for, shape (n,); all if None.
-            due_ns: when it takes effect [ns]; now if None.
-            replaces: whether it takes the place of what was sent before and is not due yet.
-        """
+        """Send one setpoint, see `Bridge.send`."""
         due = self.now_ns if due_ns is None else due_ns
         if abs(due - self.now_ns) > HORIZON_NS:
             return self.cerebellum.refuse(Reason.BEYOND_HORIZON if due > self.now_ns else Reason.STALE, mask)
         self._sequence += 1
         return self.cerebellum.offer(Setpoint(self._sequence, due, values, replaces), mask)
 
-    def send_chunk(self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> list[SendResult]:
-        """Send an action chunk: several setpoints, one for each coming frame, in place of what is left of the last.
-
-        Args:
-            values: the commands, shape (frames, n, width).
-            mask: the simulations it is for, shape (n,); all if None.
-        """
+    def send_chunk(
+        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None
+    ) -> list[SendResult]:
+        """Send an action chunk, see `Bridge.send_chunk`; it always begins now: nothing is late."""
         frame = self.rates.ticks_per_frame
         return [
             self.send(row, mask, (self._tick + k * frame) * NANOSECONDS // self.rates.control_hz, replaces=k == 0)
@@ -114,18 +174,7 @@ class LockstepBridge(ModeRequests):
     # --- goals -------------------------------------------------------------------------------------------------------
 
     def submit(self, command: BrainCommand, sim: int = 0) -> CommandResult | None:
-        """Send a goal to one simulation.
-
-        Args:
-            command: the goal.
-            sim: the simulation.
-
-        Returns:
-            None if it was accepted: its one result comes later, by `take_results`. Otherwise the refusal.
-
-        Raises:
-            ConfigError: there is no such simulation.
-        """
+        """Send a goal to one simulation, see `Bridge.submit`."""
         if not 0 <= sim < self.cerebellum.n:
             raise ConfigError(f"sim is {sim}; there are {self.cerebellum.n} simulations, from 0 on.")
         return self.cerebellum.submit(sim, command)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.registry import make_simulation, make_task
-from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.sim.camera import Camera
+from bhd_lerobot.tasks.faults import add_faults
 from bhd_lerobot.tasks.task import Event, Outcome
 
 EVENT_NAMES = np.array([event.cause for event in Event], object)
@@ -133,7 +133,7 @@ class Stage:
         """
         simulation = self.simulation
         report = simulation.step(actions)
-        self._truth, self.limits = simulation.truth(report), report.limits.copy()
+        self._truth, self.limits = report.truth(), report.limits.copy()
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)
         truncated = event == Event.TIMEOUT

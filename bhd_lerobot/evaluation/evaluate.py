@@ -26,10 +26,11 @@ from bhd_lerobot.evaluation.results import BrainSummary, EvalResults, summarise,
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent, perception_sentence
 from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
-from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
-from bhd_lerobot.robots.host.host import Host, describe
+from bhd_lerobot.robots.host.host import describe
+from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.preview import Preview
+from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.rollout.provenance import versions
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
@@ -137,28 +138,27 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     """Run every brain on the same episodes, write results and report."""
     console = console or Console(stderr=True)
     _refuse_results(config)
-    is_live = config.robot.clock == "realtime"
-    n = 1 if is_live else min(config.n_envs, len(config.indices))
-    simulation = make_robot(config.robot, n, config.threads)
-    pressed = EstopInputs(simulation.bridge.estop)
-    with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
+    n = 1 if config.robot.clock == "realtime" else min(config.n_envs, len(config.indices))
+    robots = make_robot(config.robot, n, config.threads)
+    pressed = EstopInputs(robots.estop)
+    with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         pool = None if config.engine == "local" else cluster.enter_context(open_pool(config.ray, console))
-        runs = [prepare(config, label, simulation, pool) for label in config.chosen]
-        print_refusals(simulation, console)
+        runs = [prepare(config, label, robots, pool) for label in config.chosen]
+        print_refusals(robots, console)
         if (
             pool is None
-            and simulation.camera_names
+            and robots.camera_shapes
             and (config.record.repo_id or any(brain_run.loop.brain.uses_images for brain_run in runs))
         ):
-            simulation.start_rendering()  # a machine without OpenGL fails here, before the first episode
-        if is_live:
+            robots.start_rendering()  # a machine without OpenGL fails here, before the first episode
+        if robots.clock is not None:
             number = estop_signal("SIGUSR1")
             pressed.add_signal(number)
             key = "space or e, or " if pressed.add_key() else ""
             console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} this process")
         preview, no_videos = _make_preview(config, console)
         with run_folder(config, "eval") as output_dir:
-            facts = _facts(config, simulation, runs)
+            facts = _facts(config, robots, runs)
         with progress_bars(console, "success") as progress:
             bars = [
                 progress.add_task(escape(brain_run.label), total=len(config.indices), success="") for brain_run in runs
@@ -175,7 +175,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
-        fault = simulation.problem if any(brain_run.loop.fault for brain_run in runs) else None
+        fault = robots.problem if any(brain_run.loop.fault for brain_run in runs) else None
     results = summarise(
         facts,
         _versions(),
@@ -213,19 +213,19 @@ def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
     return show
 
 
-def _facts(config: EvalConfig, simulation: Host, runs: Sequence[BrainRun]) -> dict[str, Any]:
+def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict[str, Any]:
     """Return what decides the numbers, as plain values; how many run side by side does not."""
     return {
-        "robot": describe(simulation.config),
+        "robot": describe(robots.config),
         "task": runs[0].loop.task.parameters(),
         "brains": {brain_run.label: brain_run.loop.brain.parameters() for brain_run in runs},
         "baseline": config.reference,
         "seed": config.seed,
         "split": config.split,
         "episodes": config.indices,
-        "fps": simulation.rates.fps,
-        "jerk": JerkMeasure.of(simulation.action_names).what,
-        "jerk_unit": JerkMeasure.of(simulation.action_names).unit,
+        "fps": robots.rates.fps,
+        "jerk": JerkMeasure.of(robots.action_names).what,
+        "jerk_unit": JerkMeasure.of(robots.action_names).unit,
     }
 
 

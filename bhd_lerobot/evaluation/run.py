@@ -23,13 +23,12 @@ from bhd_lerobot.errors import BhdError, DatasetMismatchError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.policies.brain import is_privileged
-from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
-from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_task
-from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.rollout.provenance import episode_metadata, recorded_episode, versions
+from bhd_lerobot.rollout.recorder import Recording, open_recorder, save_episode
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.operator import judged
 from bhd_lerobot.tasks.task import episode_seed
@@ -77,21 +76,21 @@ class BrainRun:
             "wall_s": self.wall_s,
             "episodes_per_s": len(ran) / per,
             "real_time_factor": simulated / per,
-            "act": {"calls": len(calls), "robots_per_call": self.loop.simulation.n, **quantiles},
+            "act": {"calls": len(calls), "robots_per_call": self.loop.robots.n, **quantiles},
             "episodes": {str(episode.episode): episode.wall for episode in self.episodes if episode.wall},
         }
 
 
-def prepare(config: EvalConfig, label: str, simulation: Host, pool: WorkerPool | None = None) -> BrainRun:
+def prepare(config: EvalConfig, label: str, robots: Robots, pool: WorkerPool | None = None) -> BrainRun:
     """Make a brain and what runs it: one that does not fit fails here, before any episode."""
     robot: Any = config.robot
     try:
         brain = make_brain(config.brains[label])
-        task = make_task(config.task, simulation.n, robot.fps, simulation.body)
-        task = judged(task, simulation.knows, simulation.n, robot.fps)
+        task = make_task(config.task, robots.n, robot.fps, robots.body)
+        task = judged(task, robots.knows, robots.n, robot.fps)
         if pool is None:
-            return BrainRun(label, EpisodeLoop(simulation, task, brain))
-        loop = ClusterLoop(simulation, task, brain, pool=pool, config=config, brain_config=config.brains[label])
+            return BrainRun(label, EpisodeLoop(robots, task, brain))
+        loop = ClusterLoop(robots, task, brain, pool=pool, config=config, brain_config=config.brains[label])
         return BrainRun(label, loop)
     except BhdError as error:
         raise type(error)(f"brains.{label}: {error}") from error
@@ -99,8 +98,8 @@ def prepare(config: EvalConfig, label: str, simulation: Host, pool: WorkerPool |
 
 def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], show: Callable[[], None]) -> None:
     """Run a brain's episodes and store what results and report need of them."""
-    simulation, loop = one.loop.simulation, one.loop
-    jerk, fps = JerkMeasure.of(simulation.action_names), simulation.rates.fps
+    robots, loop = one.loop.robots, one.loop
+    jerk, fps = JerkMeasure.of(robots.action_names), robots.rates.fps
     split: Any = config.split
     specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
     with _recorder(config, one.label, loop) as recorder:
@@ -111,7 +110,7 @@ def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], sh
         run = loop.run(missing, stop, recorder.begin_episode if recorder else None)
         known = _recorded_episodes(recorder, rows.values()) if recorder else iter(())
         for episode in heapq.merge(known, run, key=lambda episode: episode.spec.index):
-            track = track_of(simulation, episode.columns)
+            track = track_of(robots, episode.columns)
             metrics = measure(one.label, episode, track, jerk, fps)
             if recorder and metrics.episode not in rows:
                 task, brain = loop.task.parameters(), loop.brain.parameters()
@@ -155,16 +154,9 @@ def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[Dat
         return
     repo_id = f"{config.record.repo_id}_{label}"
     root = Path(config.record.root).expanduser() / label if config.record.root else default_root(repo_id)
-    recording = RecordConfig(
-        robot=config.robot,
-        dataset=DatasetConfig(repo_id, str(root)),
-        brain=config.brains[label],
-        task=config.task,
-        seed=config.seed,
-        split=config.split,
-        resume=True,
-    )
-    with open_recorder(recording, root, loop.simulation, loop.task, loop.brain) as recorder:
+    robot: Any = config.robot
+    recording = Recording(repo_id, root, robot.fps, config.task, config.seed, config.split, resume=True)
+    with open_recorder(recording, loop.robots, loop.task, loop.brain) as recorder:
         yield recorder
         recorder.finalize()
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control.bridge import ModeRequests
+from bhd_lerobot.control.bridge import Bridge
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import (
     HORIZON_NS,
@@ -28,7 +28,7 @@ from bhd_lerobot.realtime.requests import RequestClient
 _NEVER_NS = -(1 << 62)  # before every due time
 
 
-class LiveBridge(ModeRequests):
+class LiveBridge(Bridge):
     """Sends commands to a cerebellum that ticks in another process, and reads what it publishes.
 
     Sending never waits. What the cerebellum finds out later (a command that became stale, a mode that changed) it
@@ -88,14 +88,7 @@ class LiveBridge(ModeRequests):
         *,
         replaces: bool = False,
     ) -> SendResult:
-        """Send one setpoint.
-
-        Args:
-            values: the command, shape (1, width).
-            mask: whether it is sent at all, shape (1,); it is if None.
-            due_ns: when it takes effect [ns]; at the next tick if None.
-            replaces: whether it takes the place of what was sent before and is not due yet.
-        """
+        """Send one setpoint, see `Bridge.send`."""
         if mask is not None and not mask[0]:
             return SendResult(np.zeros(1, np.int8))
         due = self.now_ns if due_ns is None else due_ns
@@ -122,21 +115,17 @@ class LiveBridge(ModeRequests):
             return Reason.OUT_OF_ORDER
         return Reason.ACCEPTED if np.isfinite(values).all() else Reason.NON_FINITE
 
-    def send_chunk(self, values: NDArray[np.float64], start_ns: int | None = None) -> list[SendResult]:
-        """Send an action chunk: several setpoints, one for each coming frame, in place of what is left of the last.
-
-        Args:
-            values: the commands, shape (frames, 1, width).
-            start_ns: when the first takes effect [ns]; at the next tick if None. Those whose frame has gone by already
-                are left out: a brain that took its time does not make the robot hurry.
-        """
+    def send_chunk(
+        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None
+    ) -> list[SendResult]:
+        """Send an action chunk, see `Bridge.send_chunk`."""
         now = self.now_ns
         start = now if start_ns is None else start_ns
         frame = NANOSECONDS // self.rates.fps
         results: list[SendResult] = []
         for k, row in enumerate(values):
             if start + (k + 1) * frame > now:
-                results.append(self.send(row, due_ns=max(now, start + k * frame), replaces=not results))
+                results.append(self.send(row, mask, max(now, start + k * frame), replaces=not results))
         return results
 
     # --- goals -------------------------------------------------------------------------------------------------------

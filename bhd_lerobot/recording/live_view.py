@@ -21,7 +21,7 @@ from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Robots
 
 PACKAGES = {"rerun": ("rerun-sdk", "rerun"), "foxglove": ("foxglove-sdk", "foxglove")}
 """What each `display_mode` needs: the package, and the module in it."""
@@ -88,7 +88,7 @@ class LiveView:
         problem: why nothing is shown any more, or an empty text.
     """
 
-    def __init__(self, options: DisplayOptions, simulation: Host) -> None:
+    def __init__(self, options: DisplayOptions, robots: Robots) -> None:
         check_options(options)
         self.shown = self.left_out = 0
         self.problem = ""
@@ -96,11 +96,11 @@ class LiveView:
         # As lerobot-record does: what goes over a network is compressed.
         remote = options.display_ip is not None and options.display_port is not None
         self._compress = remote or options.display_compressed_images
-        self._actions, self._track = simulation.action_names, simulation.track
-        names = simulation.observation_names
+        self._actions, self._track = robots.action_names, robots.track
+        names = robots.observation_names
         self._scan = np.array([i for i, name in enumerate(names) if name.startswith("scan_")], np.intp)
         self._floats = [(i, name) for i, name in enumerate(names) if not name.startswith("scan_")]
-        self._cameras, body = simulation.camera_names, simulation.body
+        self._cameras, body = tuple(robots.camera_shapes), robots.body
         lidar = body.lidar if isinstance(body, MobileBase) else None
         self._range_max = lidar.range_max if lidar is not None else np.inf
         self._images: dict[str, NDArray[np.uint8]] = {}
@@ -286,12 +286,12 @@ def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
 
 
 @contextmanager
-def live_view(options: DisplayOptions, simulation: Host, console: Console) -> Iterator[LiveView | None]:
+def live_view(options: DisplayOptions, robots: Robots, console: Console) -> Iterator[LiveView | None]:
     """Show a run live if `display_data` is set; at its end print how many frames were left out."""
     if not options.display_data:
         yield None
         return
-    view = LiveView(options, simulation)
+    view = LiveView(options, robots)
     try:
         yield view
     finally:

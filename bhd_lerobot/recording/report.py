@@ -8,17 +8,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from bhd_lerobot.errors import counted
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.rollout.types import Episode
-
-ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
-FAULT_STATUS = 4  # of one that a real robot's fault ended
 
 
 @dataclass
@@ -81,26 +77,6 @@ class RecordResult:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
         self.simulated_s += episode.frames / fps
-
-
-def progress_bars(console: Console, *fields: str) -> Progress:
-    """Return bars that also show some fields of their tasks, by name."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *(TextColumn(f"{{task.fields[{field}]}}") for field in fields),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
-def print_refusals(simulation: Host, console: Console) -> None:
-    """Print what the system refused the real-time process, and the remedy."""
-    for grant in (grant for grant in simulation.grants or () if not grant["granted"]):
-        console.print(
-            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
-        )
 
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:

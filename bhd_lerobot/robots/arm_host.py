@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import without_jerk_limits
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.force_limit import ForceLimit
@@ -20,8 +21,7 @@ from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.host import FrameReport, Host
-from bhd_lerobot.tasks.task import ArmTruth
+from bhd_lerobot.robots.host.host import Host
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -136,7 +136,7 @@ class ArmHost(Host):
             return state
         return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : len(JOINTS)]))], axis=1)
 
-    def truth(self, report: FrameReport | None = None) -> ArmTruth:
+    def truth(self) -> ArmTruth:
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""
         position = self._newest().position
         return ArmTruth(
@@ -149,10 +149,11 @@ class ArmHost(Host):
             fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
         )
 
-    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start episodes."""
-        super().reset(ids, scenes, seeds)
+        initial = super().reset(ids, scenes, seeds)
         self._refused[ids] = False
+        return initial
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the tool in recorded observations, shape (frames, 7)."""

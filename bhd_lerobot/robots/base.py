@@ -5,10 +5,10 @@ from typing import ClassVar
 from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.base_simulation import BaseSimulation
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+from bhd_lerobot.robots.robot import BhdRobot
 
 
-class SimulatedBase(SimulatedRobot):
+class SimulatedBase(BhdRobot):
     """A base with a lidar. A subclass says its name and its configuration, which says its body.
 
     Action: `x.vel` [m/s] forward, `theta.vel` [rad/s] counter-clockwise. Observation: the same two as measured by the

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import MobileBase, without_jerk_limits
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import Plant
-from bhd_lerobot.robots.host.host import FrameReport, Host
-from bhd_lerobot.tasks.task import BaseTruth
+from bhd_lerobot.robots.host.host import Host
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config import MobileBaseConfig
@@ -76,7 +76,7 @@ class BaseHost(Host):
             age = (reading.stamp_ns - reading.sensors_ns) * self.rates.control_hz // NANOSECONDS
         return np.concatenate(parts, axis=1), self.tick - age
 
-    def truth(self, report: FrameReport | None = None) -> BaseTruth:
+    def truth(self) -> BaseTruth:
         """Return where the bases are by their wheels' odometry; nothing is known of touches."""
         turn, odometry = self._start[:, 2], self._controller.odometry()
         pose = self._start + odometry

@@ -7,15 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_host import BaseHost
-from bhd_lerobot.robots.host.host import FrameReport
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
-from bhd_lerobot.tasks.task import BaseTruth
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config import MobileBaseConfig
@@ -60,7 +59,7 @@ class BaseSimulation(BaseHost, Simulation):
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
 
-    def truth(self, report: FrameReport | None = None) -> BaseTruth:
+    def truth(self) -> BaseTruth:
         """Return where the bases are, and whether they touched the scene since the start of the last frame."""
         return BaseTruth(self.world.base_pose, self._touched.copy())
 

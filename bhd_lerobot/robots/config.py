@@ -15,7 +15,7 @@ from bhd_lerobot.sim.lidar import check_beams
 
 
 @dataclass(kw_only=True)
-class SimulatedRobotConfig(RobotConfig):
+class BhdRobotConfig(RobotConfig):
     """Options of every simulated robot.
 
     Attributes:
@@ -90,7 +90,7 @@ class SimulatedRobotConfig(RobotConfig):
 
 
 @dataclass(kw_only=True)
-class MobileBaseConfig(SimulatedRobotConfig):
+class MobileBaseConfig(BhdRobotConfig):
     """Options of every base on two driven wheels with a lidar. A subclass states what it is made of, in `body`.
 
     Attributes:

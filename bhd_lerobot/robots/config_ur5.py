@@ -8,7 +8,7 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.bodies.body import OBSTACLE, Arm, Capsule
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.config import SimulatedRobotConfig
+from bhd_lerobot.robots.config import BhdRobotConfig
 
 CONTROLS = ("servo", "impedance")
 ACTION_SPACES = ("joint", "tool")
@@ -17,7 +17,7 @@ SCENES = ("empty", "reach", "pick")
 
 @RobotConfig.register_subclass("ur5")
 @dataclass(kw_only=True)
-class UR5Config(SimulatedRobotConfig):
+class UR5Config(BhdRobotConfig):
     """Configuration of the robot type ``ur5``.
 
     Attributes:

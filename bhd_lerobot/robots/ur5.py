@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES, observation_names
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 
 
-class UR5(SimulatedRobot):
+class UR5(BhdRobot):
     """UR5 with a parallel gripper.
 
     Action: `shoulder_pan.pos`, `shoulder_lift.pos`, `elbow.pos`, `wrist_1.pos`, `wrist_2.pos`, `wrist_3.pos` [rad] and
@@ -54,7 +54,7 @@ class UR5(SimulatedRobot):
         """Environment state of the scene: target and objects, names and values of shape (k,)."""
         if self._task is None:
             return (), np.zeros(0)
-        return self._task.environment_names, self._task.environment_state(self.simulation.truth())[0]
+        return self._task.environment_names, self._task.environment_state(self.host.truth())[0]
 
     @property
     def instruction(self) -> str:

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, TableScene
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -15,14 +16,11 @@ from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.arm_host import ArmHost
-from bhd_lerobot.robots.host.host import FrameReport
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.latency import LatePlant
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
-from bhd_lerobot.tasks.task import ArmTruth
-from bhd_lerobot.tasks.variation import MAX_LATENCY_S
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -94,7 +92,7 @@ class UR5Simulation(ArmHost, Simulation):
         joints, _ = self.world.joint_slice(JOINTS)
         return pose_vectors(self.kinematics.tool(states[:, joints]))
 
-    def truth(self, report: FrameReport | None = None) -> ArmTruth:
+    def truth(self) -> ArmTruth:
         """Return where tool and objects are, and what the arms touched since the start of the last frame."""
         return ArmTruth(
             tool_pose=self.table.tool_pose,

@@ -14,21 +14,21 @@ from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
-from bhd_lerobot.robots.faults import add_faults
-from bhd_lerobot.robots.host.host import FrameReport, Host
+from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
 from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.faults import add_faults
 from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
 
 
-def track_of(robots: Host, columns: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """Return where a robot was in the frames of an episode, as `Host.track` says it, shape (frames, 7)."""
-    return robots.track(columns[keys.PHYSICS_STATE if robots.is_simulated else keys.OBSERVATION_STATE])
+def track_of(robots: Robots, columns: Mapping[str, NDArray]) -> NDArray[np.float64]:
+    """Return where a robot was in the frames of an episode, see `Robots.track`, shape (frames, 7)."""
+    return robots.track(columns[keys.OBSERVATION_STATE if robots.world is None else keys.PHYSICS_STATE])
 
 
 class EpisodeLoop:
@@ -49,35 +49,35 @@ class EpisodeLoop:
 
     def __init__(
         self,
-        simulation: Host,
+        robots: Robots,
         task: Task,
         brain: Brain,
         tolerance: TimingTolerance | None = None,
     ) -> None:
-        self.simulation, self.task, self.brain = simulation, task, brain
+        self.robots, self.task, self.brain = robots, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = self.fault = False
-        self.marks = Marks(simulation.n, outcomes_of(task.name))
+        self.marks = Marks(robots.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
-        self._frames = max(1, round(task.duration_s * simulation.rates.fps))
+        self._frames = max(1, round(task.duration_s * robots.rates.fps))
         self._columns: dict[str, NDArray] = {}
-        self._length = np.zeros(simulation.n, np.int64)
+        self._length = np.zeros(robots.n, np.int64)
         self.frames = 0
         self.act_times: list[float] = []
         self._gives_goals = False
-        self._drivers = DriverLog(brain, simulation.n, self._frames)
+        self._drivers = DriverLog(brain, robots.n, self._frames)
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
         brain.bind(
             RobotFeatures(
-                simulation.observation_names,
-                simulation.action_names,
-                simulation.rates.fps,
+                robots.observation_names,
+                robots.action_names,
+                robots.rates.fps,
                 environment,
-                simulation.body,
-                simulation.camera_shapes,
+                robots.body,
+                robots.camera_shapes,
             )
         )
 
@@ -98,17 +98,17 @@ class EpisodeLoop:
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]
-        n = self.simulation.n
+        n = self.robots.n
         self._specs: list[EpisodeSpec | None] = [None] * n
         self._scenes: list[Any] = [None] * n
         self._commands: list[list[tuple[int, BrainCommand]]] = [[] for _ in range(n)]
         self._ends: list[list[tuple[int, CommandResult]]] = [[] for _ in range(n)]
         self._initial: list[NDArray[np.float64] | None] = [None] * n
-        self._images = EpisodeImages(self.simulation)
-        self.simulation.stop(np.arange(n))
+        self._images = EpisodeImages(self.robots)
+        self.robots.stop(np.arange(n))
         self._start(np.arange(n), waiting)
         try:
-            while self.simulation.running.any():
+            while self.robots.running.any():
                 if stop():
                     return
                 finished = self._frame()
@@ -117,11 +117,11 @@ class EpisodeLoop:
                     done[episode.spec.index] = episode
                     self.emergency_stop |= event == Event.ESTOP
                     # A person finds out why a real robot stopped before it moves again.
-                    self.fault |= event == Event.FAULT and not self.simulation.is_simulated
+                    self.fault |= event == Event.FAULT and self.robots.world is None
                 if not finished:
                     continue
                 ids = np.array([sim for sim, _ in finished])
-                self.simulation.stop(ids)
+                self.robots.stop(ids)
                 # Before others start: on the wall clock they would begin while these are still being saved.
                 while order and order[0] in done:
                     yield done.pop(order.pop(0))
@@ -138,25 +138,22 @@ class EpisodeLoop:
         if not len(ids):
             return
         # A person decides when the robot moves again; the stop may also have come between two episodes.
-        self.emergency_stop |= self.simulation.bridge.estop_pressed
+        self.emergency_stop |= self.robots.estop_pressed
         if self.emergency_stop or self.fault:
             waiting.clear()
             return
         specs = [waiting.pop() for _ in ids]
         scenes = [self.task.sample(spec.seed) for spec in specs]
-        self.simulation.reset(ids, scenes, [spec.seed for spec in specs])
+        states = self.robots.reset(ids, scenes, [spec.seed for spec in specs])
         self.task.begin(ids, scenes)
         brain_seeds = [int(np.random.SeedSequence([_BRAIN_STREAM, spec.seed]).generate_state(1)[0]) for spec in specs]
         instructions = [self.task.instruction(scene) for scene in scenes]
-        self.brain.reset(ids, brain_seeds, self.simulation.n, instructions)
-        states = self.simulation.initial_state(ids)
+        self.brain.reset(ids, brain_seeds, self.robots.n, instructions)
         self._results = {sim: results for sim, results in self._results.items() if sim not in ids}
         for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
             self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
             self._commands[sim], self._ends[sim] = [], []
-            self._images.sinks[sim] = (
-                self._open_images() if self._open_images and self.simulation.camera_names else None
-            )
+            self._images.sinks[sim] = self._open_images() if self._open_images and self.robots.camera_shapes else None
         self._length[ids] = 0
         self._drivers.start(ids)
         self.marks.begin(ids)
@@ -164,60 +161,50 @@ class EpisodeLoop:
 
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
-        simulation, task, brain = self.simulation, self.task, self.brain
-        frame = simulation.observe()
+        robots, task, brain = self.robots, self.task, self.brain
+        frame = robots.observe()
         state = frame.state.astype(np.float32)
-        images = self._images.order_all(self.observer, np.broadcast_to(brain.looks(self._results), simulation.n))
+        images = self._images.order_all(self.observer, np.broadcast_to(brain.looks(self._results), robots.n))
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:
             # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
-            truth = simulation.truth() if self._truth is None else self._truth
+            truth = robots.truth() if self._truth is None else self._truth
             values[keys.ENVIRONMENT_STATE] = task.environment_state(truth).astype(np.float32)
             if is_privileged(brain, task.environment_names):
                 environment = values[keys.ENVIRONMENT_STATE].astype(np.float64)
         seen = Observation(
-            simulation.observation_names,
+            robots.observation_names,
             state.astype(np.float64),
             images,
             environment,
             self._results,
-            simulation.running,
+            robots.running,
         )
         started = time.perf_counter()
         command = brain.act(seen)
         self.act_times.append(time.perf_counter() - started)
-        command = in_single_precision(command)
         # On the lockstep clock time stands still during inference.
-        inference_time = np.full(simulation.n, self.act_times[-1] if simulation.is_live else 0.0)
-        physics = simulation.physics_state
-        report = simulation.step(command)
-        match command:
-            case Goals():
-                action = report.applied
-            case None | Chunk():
-                # The chunk's setpoint for this frame; after its last, the last.
-                action = simulation.to_action(simulation.cerebellum.requested)
-            case _:
-                action = command
+        inference_time = np.full(robots.n, 0.0 if robots.clock is None else self.act_times[-1])
+        command = in_single_precision(command)
+        report = robots.step(command)
         self._log(command, report)
         if brain.has_plan:
             values[keys.SUBTASK] = np.array(brain.subtasks(), object)
         values |= {
             keys.OBSERVATION_STATE: state,
-            keys.ACTION: action.astype(np.float32),
+            keys.ACTION: report.requested.astype(np.float32),
             keys.TIME: frame.time_ns / NANOSECONDS,
             keys.AGE: frame.age_ns / NANOSECONDS,
             keys.INFERENCE_TIME: inference_time,
+            **frame.columns,
         }
-        if physics.shape[1]:
-            values[keys.PHYSICS_STATE] = physics
         if (advised := brain.advice()) is not None:
             values[keys.EXPERT_ACTION] = advised.astype(np.float32)
         finished: list[tuple[int, Event]] = []
-        for frame_report in (*report.missed, report):
-            if frame_report.live is not None:
-                values |= self._live_values(frame_report, is_first=frame_report is (report.missed or [report])[0])
+        for number, frame_report in enumerate((*report.missed, report)):
+            if number:  # of the first the brain saw the beginning; the others went by during inference
+                values |= self._seen_values(frame_report)
             finished = self._end_frame(frame_report, values, is_missed=frame_report is not report)
             if finished:
                 break  # what a robot did after its episode's end is not part of it
@@ -227,28 +214,24 @@ class EpisodeLoop:
         self, report: FrameReport, values: dict[str, NDArray], *, is_missed: bool
     ) -> list[tuple[int, Event]]:
         """Judge and store a frame; return the episodes that ended with it."""
-        simulation = self.simulation
-        running = np.flatnonzero(simulation.running)
-        self._truth = simulation.truth(report)
-        reward, event = self.task.judge(self._truth, simulation.running)
-        event = add_faults(event, report.mode, simulation.running)
-        event, driven = self.marks.frame(event, simulation.running)
+        robots = self.robots
+        running = np.flatnonzero(robots.running)
+        self._last_frame = report.number
+        self._truth = report.truth()
+        reward, event = self.task.judge(self._truth, robots.running)
+        event = add_faults(event, report.mode, robots.running)
+        event, driven = self.marks.frame(event, robots.running)
         taken = self._drivers.frame(running, self._length, is_missed=is_missed)
-        if self._gives_goals:
-            # What a policy learns from is where the reference was.
-            values[keys.ACTION] = report.applied.astype(np.float32)
         values |= {
+            keys.ACTION: report.requested.astype(np.float32),
             keys.APPLIED_ACTION: report.applied,
-            keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
             keys.LIMITS: report.limits,
             keys.WATCHDOG: report.watchdog,
             keys.MODE: report.mode,
-            keys.EFFORT: report.effort,
+            **report.columns,
             keys.REWARD: reward,
             keys.EVENT: flagged(event, taken | driven),
         }
-        if simulation.wrench_names:
-            values[keys.WRENCH] = report.wrench
         self._store(running, values)
         if self.observer is not None:
             for sim in running.tolist():
@@ -257,32 +240,21 @@ class EpisodeLoop:
         self.frames += len(running)
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
 
-    def _live_values(self, report: FrameReport, *, is_first: bool) -> dict[str, NDArray]:
-        """Return what was measured of a frame on the wall clock.
-
-        The first is the one that the brain saw the beginning of; later ones went by during inference.
-        """
-        live = report.live
-        self._last_frame = live.number
+    def _seen_values(self, report: FrameReport) -> dict[str, NDArray]:
+        """Return what was observed at the start of a frame that went by during inference."""
+        seen = report.seen
+        if seen is None:
+            raise AssertionError("Frames go by during inference on the wall clock only, where each is observed.")
         values: dict[str, NDArray] = {
-            keys.ACTION: live.requested.astype(np.float32),
-            keys.LATENESS: np.array([live.lateness_ns / NANOSECONDS]),
-            keys.OVERRUNS: np.array([live.overruns]),
-            keys.SKIPPED: np.array([live.skipped]),
+            keys.OBSERVATION_STATE: seen.state.astype(np.float32),
+            keys.TIME: seen.time_ns / NANOSECONDS,
+            keys.AGE: seen.age_ns / NANOSECONDS,
+            **seen.columns,
         }
-        if is_first:
-            return values
-        values |= {
-            keys.OBSERVATION_STATE: live.seen.state.astype(np.float32),
-            keys.TIME: live.seen.time_ns / NANOSECONDS,
-            keys.AGE: live.seen.age_ns / NANOSECONDS,
-        }
-        if live.physics.shape[1]:
-            values[keys.PHYSICS_STATE] = live.physics
         if self.task.environment_names:
             values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
         # What is shown is the end of the frame before: its beginning. The brain was not asked, so it does not look.
-        self._images.order_all(self.observer, np.zeros(self.simulation.n, np.bool_))
+        self._images.order_all(self.observer, np.zeros(self.robots.n, np.bool_))
         return values
 
     def _log(self, command: Command, report: FrameReport) -> None:
@@ -303,30 +275,31 @@ class EpisodeLoop:
             for key, value in values.items():
                 dtype = keys.SCALARS[key][0] if key in keys.SCALARS else "float32"
                 dtype = {keys.PHYSICS_STATE: "float64", keys.SUBTASK: "object"}.get(key, dtype)
-                self._columns[key] = np.zeros((self.simulation.n, self._frames, *value.shape[1:]), dtype)
+                self._columns[key] = np.zeros((self.robots.n, self._frames, *value.shape[1:]), dtype)
         rows = self._length[running]
         for key, value in values.items():
             self._columns[key][running, rows] = value[running]
 
     def _timing(self, sim: int, columns: dict[str, NDArray]) -> TimingSummary:
         """Return how punctual an episode was, and add the columns that follow from that."""
-        simulation, length = self.simulation, len(columns[keys.ACTION])
-        rates = simulation.rates
-        if not simulation.is_live:
+        robots, length = self.robots, len(columns[keys.ACTION])
+        rates = robots.rates
+        clock = robots.clock
+        if clock is None:
             columns |= {key: np.zeros(length, keys.SCALARS[key][0]) for key in keys.PUNCTUALITY}
             timing = TimingStatistics(NANOSECONDS // rates.control_hz)
             timing.add_punctual(length * rates.ticks_per_frame)
             return timing.summary(age=columns[keys.AGE], late=columns[keys.LATE])
-        simulation.stop(np.array([sim]))
+        robots.stop(np.array([sim]))
         measured = FrameTiming(*(columns[key] for key in (keys.TIME, keys.AGE, keys.LATENESS, keys.SKIPPED)))
-        columns[keys.LATE] = late_frames(measured, self.tolerance, rates, simulation.sensor_period_s)
-        return simulation.statistics().summary(
+        columns[keys.LATE] = late_frames(measured, self.tolerance, rates, clock.sensor_period_s)
+        return clock.statistics().summary(
             clock="realtime",
             age=columns[keys.AGE],
             inference_time=columns[keys.INFERENCE_TIME],
             late=columns[keys.LATE],
             drops=self._last_frame + 1 - length,
-            tolerated=self.tolerance.limits(rates, simulation.sensor_period_s),
+            tolerated=self.tolerance.limits(rates, clock.sensor_period_s),
         )
 
     def _finish(self, sim: int, event: Event) -> Episode:
@@ -354,7 +327,7 @@ class EpisodeLoop:
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,
-            realtime=self.simulation.grants,
+            realtime=None if self.robots.clock is None else self.robots.clock.grants,
             interventions=self._drivers.interventions(sim, length),
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Robots
 
 Image = NDArray[np.uint8]
 Observer = Callable[[int, Mapping[str, Any]], None]
@@ -20,10 +20,10 @@ and copy what it keeps; images come on another thread."""
 class EpisodeImages:
     """Orders images of n simulations, and hands each to what takes those of its episode, or to nothing."""
 
-    def __init__(self, simulation: Host) -> None:
-        self._simulation = simulation
-        self.sinks: list[Any] = [None] * simulation.n
-        self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(simulation.n)]
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
+        self.sinks: list[Any] = [None] * robots.n
+        self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(robots.n)]
 
     def order_all(self, observer: Observer | None, wanted: NDArray[np.bool_]) -> dict[str, Image]:
         """Order the images of the running simulations that anybody looks at; return those that are wanted.
@@ -34,15 +34,15 @@ class EpisodeImages:
             observer: is shown them, too.
             wanted: of which simulations to wait for them, shape (n,); the images of others are black.
         """
-        simulation, cameras = self._simulation, self._simulation.camera_names
+        robots, shapes = self._robots, self._robots.camera_shapes
+        cameras = list(shapes)
         images: dict[str, Image] = {}
-        running = np.flatnonzero(simulation.running).tolist() if cameras else []
+        running = np.flatnonzero(robots.running).tolist() if cameras else []
         for sim in running:
             if wanted[sim] or observer is not None or self.sinks[sim] is not None:
                 self._order(sim, observer)
         if wanted.any():
-            shapes = simulation.camera_shapes
-            images = {camera: np.zeros((simulation.n, *shapes[camera]), np.uint8) for camera in cameras}
+            images = {camera: np.zeros((robots.n, *shape), np.uint8) for camera, shape in shapes.items()}
             for sim in running:
                 if wanted[sim]:
                     for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
@@ -56,10 +56,10 @@ class EpisodeImages:
     def _order(self, sim: int, observer: Observer | None) -> None:
         """Order the images of what one simulation shows now."""
         sink = self.sinks[sim]
-        for camera in self._simulation.camera_names:
+        for camera in self._robots.camera_shapes:
             key = f"{keys.OBSERVATION_IMAGES}.{camera}"
             deliver = None if sink is None else partial(sink.add_image, key)
-            image = self._simulation.render_later(sim, camera, deliver)
+            image = self._robots.render_later(sim, camera, deliver)
             self._pending[sim].append(image)
             if observer is not None:
                 image.add_done_callback(partial(_show, observer, sim, key))

@@ -11,6 +11,7 @@ from bhd_lerobot.sim.camera import Camera, Pose
 from bhd_lerobot.sim.world import World
 
 Deliver = Callable[[NDArray[np.uint8]], None]
+"""Takes an image, shape (height, width, 3)."""
 
 
 class RenderThread:

@@ -1,3 +1,14 @@
 """What is to be achieved, judged on the truth of the simulator."""
 
-__all__ = ["avoid", "geodesic", "navigate", "operator", "pick", "reach", "report", "task", "variation"]
+__all__ = [
+    "avoid",
+    "faults",
+    "geodesic",
+    "navigate",
+    "operator",
+    "pick",
+    "reach",
+    "report",
+    "task",
+    "variation",
+]

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.report import ReportConfig, Reports
-from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
+from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
 _DISTANCES_M = np.arange(1, 9) * 0.25

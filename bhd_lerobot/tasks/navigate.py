@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
 from bhd_lerobot.tasks.report import ReportConfig, Reports
-from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
+from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.report import ReportConfig, Reports
-from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.

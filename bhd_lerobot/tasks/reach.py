@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.tasks.report import ReportConfig, Reports
-from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
 # Where targets are, in the base frame [m]: before the arm, over the table.

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.tabletop import Variation, check_camera_error
+from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, Variation, check_camera_error
 from bhd_lerobot.errors import ConfigError
 
 _FIXED = ("camera_error_m", "camera_shift_m", "camera_turn_rad")  # the same in every episode
-MAX_LATENCY_S = 0.05  # [s] what a `LatePlant` can delay by, at the control rate
 
 
 @dataclass

@@ -15,7 +15,7 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
+from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 
@@ -91,7 +91,7 @@ class BhdBrain(Teleoperator):
         self.config = config
         self._is_connected = False
         self._brain: Brain | None = None
-        self._robot: SimulatedRobot | None = None
+        self._robot: BhdRobot | None = None
         self._streamer: GoalStreamer | None = None
         self._chunk: list[NDArray[np.float64]] = []
         self._results: list[CommandResult] = []
@@ -155,7 +155,7 @@ class BhdBrain(Teleoperator):
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             if not is_for(robot_of_brain(self.config.brain), robot.name):
-                is_arm = isinstance(robot.simulation.body, Arm)
+                is_arm = isinstance(robot.host.body, Arm)
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
@@ -164,7 +164,7 @@ class BhdBrain(Teleoperator):
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment
             fps = self.config.fps or robot.config.fps
-            body, cameras = robot.simulation.body, robot.camera_shapes
+            body, cameras = robot.host.body, robot.camera_shapes
             self._brain.bind(RobotFeatures(robot.observation_names, robot.action_names, fps, names, body, cameras))
             self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
             self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
@@ -189,18 +189,18 @@ class BhdBrain(Teleoperator):
             raise ConfigError(f"The brain {self._brain_name!r} gave neither an action nor a chunk of them.")
         return self._chunk.pop(0) if len(self._chunk) > 1 else self._chunk[0]
 
-    def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
+    def _stream(self, robot: BhdRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
         """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
-        body, rates = robot.simulation.body, robot.simulation.rates
+        body, rates = robot.host.body, robot.host.rates
         if not isinstance(body, Arm) or body.actuation != "position":
             raise ConfigError(
                 f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5 with robot.control = servo."
             )
         if self._streamer is None:
-            self._streamer = GoalStreamer(body, rates, robot.simulation.cerebellum.command[0])
-        reading = robot.simulation.bridge.state()
+            self._streamer = GoalStreamer(body, rates, robot.host.bridge.state().command[0])
+        reading = robot.host.bridge.state()
         reference, results = self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
-        return robot.simulation.to_action(reference[None])[0], results
+        return robot.host.to_action(reference[None])[0], results
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing: a brain feels no feedback."""
@@ -214,7 +214,7 @@ class BhdBrain(Teleoperator):
     def _brain_name(self) -> str:
         return self.config.brain.get_choice_name(type(self.config.brain))
 
-    def _find_robot(self) -> SimulatedRobot:
+    def _find_robot(self) -> BhdRobot:
         robots = connected_robots()
         if self.config.robot_id is not None:
             robots = [robot for robot in robots if robot.id == self.config.robot_id]

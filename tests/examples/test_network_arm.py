@@ -57,7 +57,7 @@ for line in sys.stdin:  # drives for as long as it is asked to
             robot.activate()
         except CommandRefusedError as error:
             refused = str(error)
-    mode = Mode(int(robot.simulation.modes[0])).name
+    mode = Mode(int(robot.host.modes[0])).name
     print(json.dumps({"mode": mode, "refused": refused, "at": start["wrist_3.pos"]}), flush=True)
 robot.disconnect()
 try:

@@ -207,7 +207,7 @@ def test_a_late_brain_neither_jumps_nor_makes_the_robot_hurry(rig: Rig) -> None:
     bridge.send(drive(0.10))
     rig.tick(2 * F + 5)  # it took more than two frames
     rows = [0.22, 0.22, 0.08, 0.12]
-    sent = bridge.send_chunk(np.array([drive(row) for row in rows]), began)
+    sent = bridge.send_chunk(np.array([drive(row) for row in rows]), start_ns=began)
     assert len(sent) == 2  # the first two were for frames that have gone by
     commands = []
     for _ in range(2 * F):

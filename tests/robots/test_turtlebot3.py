@@ -33,8 +33,8 @@ def robot(tmp_path):
 
 
 def test_bad_actions_are_refused_and_nothing_happens(robot):
-    before = robot.simulation.physics_state
-    now = robot.simulation.bridge.now_ns
+    before = robot.host.physics_state
+    now = robot.host.bridge.now_ns
     for action, message in (
         ({"x.vel": 0.1}, "lacks 'theta.vel'"),
         ({"x.velo": 0.1, "theta.vel": 0.0}, "Did you mean 'x.vel'"),
@@ -48,8 +48,8 @@ def test_bad_actions_are_refused_and_nothing_happens(robot):
     ):
         with pytest.raises(ActionError, match=message):
             robot.send_action(action)
-    assert np.array_equal(robot.simulation.physics_state, before)
-    assert robot.simulation.bridge.now_ns == now
+    assert np.array_equal(robot.host.physics_state, before)
+    assert robot.host.bridge.now_ns == now
 
 
 def test_keys_are_names_so_their_order_does_not_matter(tmp_path):
@@ -81,7 +81,7 @@ def test_the_returned_action_is_what_the_base_was_commanded(robot):
     assert applied["theta.vel"] == pytest.approx(0.1176, abs=1e-4)
     applied = robot.send_action({"x.vel": 0.1, "theta.vel": 1.0})
     assert applied["x.vel"] == 0.1
-    assert applied == dict(zip(robot.action_names, robot.simulation.cerebellum.command[0], strict=True))
+    assert applied == dict(zip(robot.action_names, robot.host.cerebellum.command[0], strict=True))
 
 
 def test_true_speeds_stay_within_five_per_cent_of_the_limits():
@@ -194,7 +194,7 @@ def test_odometry_follows_the_truth_and_drifts(tmp_path):
         for k in range(60):
             robot.send_action({"x.vel": 0.15, "theta.vel": 0.8 if k % 20 < 10 else -0.5})
         seen = robot.get_observation()
-        truth = robot.simulation.world.base_pose[0]
+        truth = robot.host.world.base_pose[0]
     error = math.hypot(seen["x.pos"] - truth[0], seen["y.pos"] - truth[1])
     assert 0 < error < 0.05
     assert seen["theta.pos"] == pytest.approx(truth[2], abs=0.15)

@@ -31,11 +31,7 @@ def robot(tmp_path):
 
 def stay(robot) -> dict[str, float]:
     """Return the action that leaves the robot where it is commanded to be."""
-    return dict(
-        zip(
-            robot.action_names, robot.simulation.to_action(robot.simulation.cerebellum.command)[0].tolist(), strict=True
-        )
-    )
+    return dict(zip(robot.action_names, robot.host.to_action(robot.host.cerebellum.command)[0].tolist(), strict=True))
 
 
 @pytest.mark.parametrize(("space", "scene"), [("joint", "empty"), ("tool", "pick")])
@@ -79,7 +75,7 @@ def test_out_of_range_is_clipped_to_the_range_and_no_faster_than_the_limits(robo
 
 
 def test_an_emergency_stop_ends_a_goal_and_refuses_everything_until_reset_and_activate(robot):
-    bridge, home = robot.simulation.bridge, robot.simulation.body.home
+    bridge, home = robot.host.bridge, robot.host.body.home
     assert bridge.submit(BrainCommand("a", joint_target=(home[0] - 1.0, *home[1:6]))) is None
     for _ in range(10):
         bridge.advance_frame()
@@ -114,10 +110,10 @@ def test_an_emergency_stop_ends_a_goal_and_refuses_everything_until_reset_and_ac
 )
 def test_a_tool_pose_that_cannot_be_taken_is_refused_with_the_reason(tmp_path, change, message):
     with make(tmp_path, action_space="tool") as robot:
-        before = robot.simulation.cerebellum.command.copy()
+        before = robot.host.cerebellum.command.copy()
         with pytest.raises(CommandRefusedError, match=message):
             robot.send_action({**stay(robot), **change})
-        assert np.array_equal(robot.simulation.cerebellum.command, before)
+        assert np.array_equal(robot.host.cerebellum.command, before)
 
 
 def test_noise_and_latency_belong_to_the_episode(tmp_path):
@@ -196,9 +192,9 @@ def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
         for _ in range(50):
             applied = robot.send_action(action)
         assert applied == pytest.approx(action, abs=1e-6)
-        tool = robot.simulation.truth().tool_pose[0]
+        tool = robot.host.truth().tool_pose[0]
         assert tool[:3] == pytest.approx([action[f"tool_{axis}.pos"] for axis in "xyz"], abs=2e-3)
-        refusal = robot.simulation.bridge.submit(BrainCommand("a", gripper=0.0))
+        refusal = robot.host.bridge.submit(BrainCommand("a", gripper=0.0))
         assert refusal is not None
         assert not refusal.success
         with pytest.raises(CommandRefusedError, match="length"):
@@ -216,4 +212,4 @@ def test_an_impedance_with_too_much_latency_is_refused():
 def test_a_goal_for_an_unknown_arm_is_refused(robot):
     for sim in (-1, 1):
         with pytest.raises(ConfigError, match=f"sim is {sim}"):
-            robot.simulation.bridge.submit(BrainCommand("a", gripper=0.05), sim)
+            robot.host.bridge.submit(BrainCommand("a", gripper=0.05), sim)

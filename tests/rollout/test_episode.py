@@ -178,4 +178,4 @@ def test_no_image_is_made_of_frames_that_went_by_unless_somebody_looks() -> None
             (episode,) = loop.run([EpisodeSpec(0, 0)])
         frames = len(episode.columns["action"])
         assert brain.frame < frames
-        assert len(made) == len(robot.camera_names) * (frames if is_watched else brain.frame)
+        assert len(made) == len(robot.camera_shapes) * (frames if is_watched else brain.frame)

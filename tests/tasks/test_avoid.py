@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.arenas import make_arena, random_arena
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.tasks.avoid import TRAIL, AvoidConfig, AvoidTask
-from bhd_lerobot.tasks.task import BaseTruth, Event
+from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
 from tests.tasks.support import Judged
 

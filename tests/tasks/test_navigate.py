@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.arenas import BURGER_RADIUS, CLEARANCE, Arena, make_arena, random_arena
 from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
 from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
-from bhd_lerobot.tasks.task import BaseTruth, Event
+from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
 from tests.tasks.support import Judged
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.parse import parse as parse_configuration
@@ -25,7 +26,7 @@ from bhd_lerobot.tasks.pick import (
     PickConfig,
     PickTask,
 )
-from bhd_lerobot.tasks.task import ArmTruth, Event
+from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.tasks.support import Judged

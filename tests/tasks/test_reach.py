@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene, Variation
+from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.task import ArmTruth, Event
+from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.tasks.support import Judged

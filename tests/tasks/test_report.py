@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
@@ -16,7 +17,6 @@ from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.report import ReportConfig
-from bhd_lerobot.tasks.task import ArmTruth, BaseTruth
 from tests.cases import each_case
 
 FPS = 10

@@ -8,13 +8,14 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.registry import make_task
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.navigate import NavigateConfig
 from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig
-from bhd_lerobot.tasks.task import SPLITS, ArmTruth, BaseTruth, Event, TaskConfig, episode_seed
+from bhd_lerobot.tasks.task import SPLITS, Event, TaskConfig, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.tasks.support import Judged

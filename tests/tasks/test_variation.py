@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, Variation
+from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, MAX_OBJECTS, Variation
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.parse import parse
@@ -28,7 +28,7 @@ from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation
+from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 from tests.cases import each_case
 
 ON = RandomisationConfig(enabled=True)

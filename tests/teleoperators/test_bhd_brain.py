@@ -45,7 +45,7 @@ def test_it_drives_the_robot_that_is_connected(robot, teleop):
 
 def test_it_sees_the_last_observation_and_asks_for_none_of_its_own(robot, teleop, monkeypatch):
     robot.get_observation()
-    monkeypatch.setattr(robot.simulation, "observe", lambda: pytest.fail("observed again"))
+    monkeypatch.setattr(robot.host, "observe", lambda: pytest.fail("observed again"))
     teleop.get_action()
 
 

@@ -28,7 +28,7 @@ def drive(tmp_path, brain, frames=125, **options):
             requested = teleop.get_action()
             applied = robot.send_action(requested)
             assert applied == pytest.approx(requested, abs=1e-2)  # goals never ask for more than the limits
-        return robot.simulation.truth(), robot._scene, teleop._brain
+        return robot.host.truth(), robot._scene, teleop._brain
 
 
 @pytest.mark.thorough(but=1)

@@ -82,11 +82,9 @@ def dataset_features(
     observation_names: Sequence[str],
     action_names: Sequence[str],
     images: Mapping[str, tuple[int, int, int]],
-    physics_names: Sequence[str],
+    columns: Mapping[str, Sequence[str]],
     environment_names: Sequence[str] = (),
     *,
-    effort_names: Sequence[str] = (),
-    wrench_names: Sequence[str] = (),
     expert: bool = False,
     subtask: bool = False,
     language: bool = False,
@@ -97,10 +95,9 @@ def dataset_features(
         observation_names: the robot's floats, in order.
         action_names: the action's floats, in order.
         images: image shapes (height, width, 3) by camera name.
-        physics_names: the simulator's generalised positions and velocities, in order; none without one.
+        columns: what the robots report beside observation and action: names of the values by key, in order; those of
+            `SCALARS` are always there.
         environment_names: the values of the environment state, in order; no such column if there are none.
-        effort_names: the joints' efforts, in order; likewise.
-        wrench_names: forces and moments on the tool, in order; likewise.
         expert: whether it is recorded what an expert would do, with the action's floats.
         subtask: whether the brain reports its subtask.
         language: whether the subtask is stored in LeRobot's language column, too.
@@ -122,14 +119,14 @@ def dataset_features(
         features[SUBTASK] = {"dtype": "string", "shape": (1,), "names": None}
     if language:
         features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
-    if effort_names:
-        features[EFFORT] = _vector("float32", effort_names)
-    if expert:
-        features[EXPERT_ACTION] = _vector("float32", action_names)
-    if wrench_names:
-        features[WRENCH] = _vector("float32", wrench_names)
-    if physics_names:
-        features[PHYSICS_STATE] = _vector("float64", physics_names)
+    # The place of a column in a file does not depend on the robot that has it.
+    vectors = {key: names for key, names in columns.items() if key not in SCALARS}
+    for key in (EFFORT, EXPERT_ACTION, WRENCH, *sorted({*vectors} - {EFFORT, WRENCH, PHYSICS_STATE}), PHYSICS_STATE):
+        if key == EXPERT_ACTION:
+            if expert:
+                features[key] = _vector("float32", action_names)
+        elif vectors.get(key):
+            features[key] = _vector("float64" if key == PHYSICS_STATE else "float32", vectors[key])
     return features
 
 

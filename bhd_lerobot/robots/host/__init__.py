@@ -11,6 +11,8 @@ __all__ = [
     "process",
     "realtime",
     "remote_plant",
+    "robots",
+    "sender",
     "simulation",
     "state",
 ]

@@ -1,9 +1,9 @@
 """n robots under one cerebellum: what a LeRobot `Robot`, the batched runs and a real robot are all made of."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,81 +13,12 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
-from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
-from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.sim.render_thread import Deliver
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The observation at the start of a frame, of n robots.
-
-    Attributes:
-        state: the observation's floats, shape (n, features).
-        time_ns: when it was measured, since the episode's start [ns], shape (n,).
-        age_ns: age of the oldest reading in it [ns], shape (n,).
-    """
-
-    state: NDArray[np.float64]
-    time_ns: NDArray[np.int64]
-    age_ns: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """Report of a frame, of n robots.
-
-    Attributes:
-        applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
-        sent: the outcome of the setpoints that the frame began with.
-        limits: `Limit` flags, shape (n,).
-        watchdog: `Watchdog` flags, shape (n,).
-        command_age_ns: age of the command in force at the end of the frame [ns], shape (n,).
-        mode: `Mode` at the end of the frame, shape (n,).
-        results: how goals ended, or were refused, during the frame, by simulation.
-        refusals: as text why setpoints were refused, by simulation, where a `Reason` does not say it all.
-        effort: torques of the joints at the end of the frame [N m], force of a gripper [N], shape (n, joints).
-        wrench: what the surroundings put on the tools, likewise, see `Controller.contact_wrench`.
-        live: the `LiveFrame` of a robot on the wall clock.
-        missed: the frames before this one that went by on the wall clock during inference.
-    """
-
-    applied: NDArray[np.float64]
-    sent: SendResult
-    limits: NDArray[np.int64]
-    watchdog: NDArray[np.int64]
-    command_age_ns: NDArray[np.int64]
-    mode: NDArray[np.int8]
-    effort: NDArray[np.float64]
-    wrench: NDArray[np.float64]
-    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
-    refusals: Mapping[int, str] = field(default_factory=dict)
-    live: Any = None
-    missed: list["FrameReport"] = field(default_factory=list)
-
-
-@dataclass
-class Receipt:
-    """What was accepted of a command, of n robots.
-
-    Attributes:
-        refusals: why setpoints were refused, as text, by simulation, where a `Reason` does not say it all.
-    """
-
-    sent: SendResult
-    refusals: dict[int, str] = field(default_factory=dict)
-    results: dict[int, list[CommandResult]] = field(default_factory=dict)
-
-    def refuse(self, refused: Mapping[int, tuple[Reason, str]]) -> None:
-        """Add setpoints that were refused, by simulation: reason and words."""
-        for sim, (reason, message) in refused.items():
-            self.sent.reasons[sim], self.refusals[sim] = reason, message
-
-    def all_results(self, sim: int, ended: list[CommandResult]) -> list[CommandResult]:
-        """Return the goals of a robot that ended, with its refused ones: a refusal is a result, too, but only once."""
-        return [result for result in self.results.get(sim, ()) if result not in ended] + ended
+from bhd_lerobot.robots.host.robots import Acted, Clock, Deliver, Frame, FrameReport, Receipt
+from bhd_lerobot.robots.host.sender import CommandSender
 
 
 class Host(ABC):
@@ -117,21 +48,19 @@ class Host(ABC):
         camera_names: the cameras that are observed.
         running: which robots are in an episode, shape (n,).
         tick: control ticks that have gone by.
-        is_live: whether it runs on the wall clock, in processes of its own.
-        is_simulated: whether there is a world, which can be placed, stored and rendered.
+        world: the simulated world, which can be placed, stored and rendered; None of a real robot.
+        clock: None: time advances with `step`.
         knows: the fields of a task's truth that the robots measure themselves; None if there is a world, of which all
             is known.
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
-        grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
 
     robot_kind: ClassVar[str]
     action_names: tuple[str, ...]
-    is_live = False
-    is_simulated = False
+    world: Any = None
+    clock: Clock | None = None
     knows: frozenset[str] | None = frozenset()
     sensor_period_s = 0.0
-    grants: list[dict[str, Any]] | None = None
 
     def __init__(
         self,
@@ -152,6 +81,7 @@ class Host(ABC):
         self.running = np.ones(n, np.bool_)
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
+        self._sender = CommandSender(self.bridge, self.to_setpoints)
         self._no_physics = np.zeros((n, 0)), np.zeros((n, 0))
 
     @property
@@ -166,12 +96,8 @@ class Host(ABC):
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
 
     @abstractmethod
-    def truth(self, report: FrameReport | None = None) -> Any:
-        """Return what a task judges by, as far as it is known; touches since the start of the last frame.
-
-        Args:
-            report: the frame at the end of which it is true; only on the wall clock it need not be the last.
-        """
+    def truth(self) -> Any:
+        """Return what a task judges by, as far as it is known; touches since the start of the last frame."""
 
     @abstractmethod
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -223,19 +149,23 @@ class Host(ABC):
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
-    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start episodes.
 
         Args:
             ids: the robots.
             scenes: where each of them is.
             seeds: a seed for each of them.
+
+        Returns:
+            The state of the world that they begin with, shape (len(ids), k); of no width without a world.
         """
         ids = np.asarray(ids, np.intp)
         self.place(ids, scenes)
         self.bridge.restart(ids)
         self._start_tick[ids] = self.tick
         self.running[ids] = True
+        return np.zeros((len(ids), 0))
 
     def stop(self, ids: NDArray[np.intp]) -> None:
         """Leave robots alone from now on: their episodes are over."""
@@ -248,7 +178,8 @@ class Host(ABC):
         state, oldest = self.sense()
         now = (self.tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
         measured = (oldest - self._start_tick) * NANOSECONDS // self.rates.control_hz
-        return Frame(state, now, now - measured)
+        physics = {keys.PHYSICS_STATE: self.physics_state} if self.world is not None else {}
+        return Frame(state, now, now - measured, physics)
 
     def step(self, command: Command) -> FrameReport:
         """Send a command to the running robots and let one frame go by.
@@ -256,87 +187,78 @@ class Host(ABC):
         Args:
             command: what they are to do; None continues with the last chunk or goal.
         """
-        return self._frame(self.send(command))
+        return self._frame(self.send(command), command)
+
+    def act(self, command: Command) -> Acted:
+        """Do what LeRobot's `send_action` does: here, let a frame go by."""
+        report = self.step(command)
+        return Acted(report.sent, report.refusals, report.mode, report.applied, report.results)
+
+    def begin(self) -> None:
+        """Let the time of an episode begin, if it does not begin with the first observation."""
+        return
+
+    def latest(self) -> Frame:
+        """Return the newest observation, whatever frame it is in."""
+        return self.observe()
 
     def send(self, command: Command) -> Receipt:
         """Send a command to the running robots; no time goes by. Return what was accepted of it."""
-        receipt = Receipt(SendResult(np.zeros(self.n, np.int8)))
-        match command:
-            case None:
-                pass
-            case Chunk(actions):
-                self._send_chunk(actions, receipt)
-            case Goals(commands):
-                self._submit(commands, receipt)
-            case _:
-                self._send_setpoint(command, receipt)
-        return receipt
+        return self._sender.send(command, self.running)
 
-    def _send_setpoint(self, action: NDArray[np.float64], receipt: Receipt) -> None:
-        mask = self.running
-        setpoints, refused = self.to_setpoints(action, mask)
-        if refused:
-            mask = mask.copy()
-            mask[list(refused)] = False
-        receipt.sent = self.bridge.send(setpoints, mask)
-        receipt.refuse(refused)
-
-    def _send_chunk(self, actions: NDArray[np.float64], receipt: Receipt) -> None:
-        rows: list[NDArray[np.float64]] = []
-        for action in actions:
-            setpoints, refused = self.to_setpoints(action, self.running, rows[-1] if rows else None)
-            receipt.refuse(refused)
-            if refused:
-                break  # the actions before it are sent
-            rows.append(setpoints)
-        results = self._send_rows(np.array(rows)) if rows else []
-        if results:
-            # Of each robot, the first reason that is a refusal.
-            reasons = np.array([result.reasons for result in results])
-            first = reasons[(reasons != 0).argmax(axis=0), np.arange(self.n)]
-            sent = receipt.sent.reasons
-            sent[sent == Reason.ACCEPTED] = first[sent == Reason.ACCEPTED]
-
-    def _send_rows(self, rows: NDArray[np.float64]) -> list[SendResult]:
-        """Send the setpoints of a chunk, shape (frames, n, width)."""
-        return self.bridge.send_chunk(rows, self.running)
-
-    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]], receipt: Receipt) -> None:
-        for sim, goals in commands.items():
-            refusals = [refusal for goal in goals if (refusal := self.bridge.submit(goal, sim)) is not None]
-            if refusals:
-                receipt.results[sim] = refusals
-
-    def _frame(self, receipt: Receipt) -> FrameReport:
+    def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
         """Let one frame go by, and report what happened in it and to the command that it began with."""
         for flags in self.touches:
             flags[:] = False
         self.bridge.advance_frame()
-        limits, watchdog = self.cerebellum.take_flags()
+        cerebellum = self.cerebellum
+        limits, watchdog = cerebellum.take_flags()
         limits[list(receipt.refusals)] |= int(Limit.POSTURE)
         running = np.flatnonzero(self.running).tolist()
         results = {sim: receipt.all_results(sim, self.bridge.take_results(sim)) for sim in running}
+        applied = self.to_action(cerebellum.command)
+        columns = {
+            keys.COMMAND_AGE: cerebellum.command_age_ns(self.bridge.now_ns) / NANOSECONDS,
+            keys.EFFORT: cerebellum.efforts(),
+        }
+        if self.config_wrench:
+            columns[keys.WRENCH] = cerebellum.controller.contact_wrench.copy()
         return FrameReport(
-            applied=self.to_action(self.cerebellum.command),
+            applied=applied,
+            requested=self._requested(command, applied),
             sent=receipt.sent,
             limits=limits,
             watchdog=watchdog,
-            command_age_ns=self.cerebellum.command_age_ns(self.bridge.now_ns),
-            mode=self.cerebellum.mode.copy(),
-            effort=self.cerebellum.efforts(),
-            wrench=self.cerebellum.controller.contact_wrench.copy(),
+            mode=cerebellum.mode.copy(),
+            truth=self.truth,
+            columns=columns,
             results={sim: ended for sim, ended in results.items() if ended},
             refusals=receipt.refusals,
         )
+
+    def _requested(self, command: Command, applied: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the action that was requested for a frame, shape (n, actions)."""
+        match command:
+            case Goals():
+                return applied
+            case None | Chunk():
+                return self.to_action(self.cerebellum.requested)  # of a chunk its row for this frame, or its last
+            case _:
+                return command
 
     @property
     def problem(self) -> str:
         """Why robots were last stopped by a fault, as text; empty if that is not known."""
         return self.cerebellum.readings.problem
 
-    def statistics(self) -> TimingStatistics:
-        """Return how punctual the ticks of the present episode are: on time, by construction, on the lockstep clock."""
-        return self.bridge.timing
+    @property
+    def estop_pressed(self) -> bool:
+        """Whether the emergency stop of any robot is pressed, be it latched already or not."""
+        return self.bridge.estop_pressed
+
+    def estop(self) -> None:
+        """Press the emergency stop of all robots."""
+        self.bridge.estop()
 
     @property
     def modes(self) -> NDArray[np.int8]:
@@ -344,17 +266,25 @@ class Host(ABC):
         return self.cerebellum.mode
 
     @property
-    def effort_names(self) -> tuple[str, ...]:
-        """Names of the joints' efforts, in order."""
-        body = self.body
-        joints = body.drive.joints if isinstance(body, MobileBase) else body.limits.names
-        return tuple(f"{joint.removesuffix('.pos')}.effort" for joint in joints)
+    def config_wrench(self) -> bool:
+        """Whether the contact wrench is recorded."""
+        return bool(getattr(self.config, "wrench", False))
 
     @property
-    def wrench_names(self) -> tuple[str, ...]:
-        """Names of what the surroundings put on a tool, in order; none if nobody asked for it."""
-        asked = getattr(self.config, "wrench", False)
-        return tuple(f"tool_{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz") if asked else ()
+    def columns(self) -> dict[str, tuple[str, ...]]:
+        """What frames and reports hold beside observation and action: names of the values by key, none for a number."""
+        body = self.body
+        joints = body.drive.joints if isinstance(body, MobileBase) else body.limits.names
+        columns: dict[str, tuple[str, ...]] = {
+            keys.COMMAND_AGE: (),
+            keys.EFFORT: tuple(f"{joint.removesuffix('.pos')}.effort" for joint in joints),
+        }
+        if self.config_wrench:
+            columns[keys.WRENCH] = tuple(f"tool_{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")
+        if self.world is not None:
+            nq, nv = (part.shape[1] for part in self.physics)
+            columns[keys.PHYSICS_STATE] = (*(f"qpos_{i}" for i in range(nq)), *(f"qvel_{i}" for i in range(nv)))
+        return columns
 
     @property
     def physics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -365,10 +295,6 @@ class Host(ABC):
     def physics_state(self) -> NDArray[np.float64]:
         """Generalised positions and velocities, shape (n, nq + nv), a copy."""
         return np.concatenate(self.physics, axis=1)
-
-    def initial_state(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the state of the world that episodes begin with, shape (len(ids), k); of no width without one."""
-        return np.zeros((len(ids), 0))
 
     # --- images: a host without cameras has none ---------------------------------------------------------------------
 

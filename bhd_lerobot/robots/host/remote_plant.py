@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.realtime.plant_link import PlantLink, PlantShape, RemotePlant
-from bhd_lerobot.robots.host.host import FrameReport
 from bhd_lerobot.robots.host.simulation import Simulation
 
 _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
@@ -56,23 +55,24 @@ class RemoteSimulation(Simulation):
         """Put the own world into a scene; the plant's process does that with its own."""
         self._own.place(ids, scenes)
 
-    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode; the plant's process has put its world into the scene already."""
         state = self.remote.refresh()
         self.remote.recover()  # stops of another episode
-        self._own.reset(ids, scenes, seeds)
+        initial = self._own.reset(ids, scenes, seeds)
         self._touches[:] = state["touches"]
         for flag in self.touches:
             flag[:] = False
+        return initial
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where the robot was in recorded states, shape (frames, 7)."""
         return self._own.track(states)
 
-    def truth(self, report: FrameReport | None = None) -> Any:
+    def truth(self) -> Any:
         """Return what is true in the newest state; object poses are those that the world was last put into."""
         self.advance()
-        return self._own.truth(report)
+        return self._own.truth()
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:

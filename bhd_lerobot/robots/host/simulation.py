@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.robots.host.host import FrameReport, Host, Receipt
+from bhd_lerobot.control.commands import Command
+from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Deliver, FrameReport, Receipt
 from bhd_lerobot.sim.camera import Camera
-from bhd_lerobot.sim.render_thread import Deliver, RenderThread
+from bhd_lerobot.sim.render_thread import RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
 
 # Streams of random numbers of one episode: what one draws more of must not shift the others.
@@ -40,8 +42,8 @@ class Simulation(Host):
     host_class: ClassVar[type[Host]]
     view = "overview"
     video_speed = 1
-    is_simulated = True
     knows = None
+    world: World
 
     def __init__(self, config: Any, cerebellum: Cerebellum, *, world: World, **options: Any) -> None:
         self.world = world
@@ -75,27 +77,31 @@ class Simulation(Host):
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
-    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start episodes: put the robots into their scenes, at rest at the start, and take first readings.
 
         Args:
             ids: the simulations.
             scenes: where each of them is.
             seeds: a seed for each of them; their sensors' noise follows from it.
+
+        Returns:
+            The complete states of the world, shape (len(ids), k).
         """
         for sim, seed in zip(ids, seeds, strict=True):
             self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
         super().reset(ids, scenes, seeds)
         self._active = None if self.running.all() else np.flatnonzero(self.running)
         self._started(np.asarray(ids, np.intp), seeds)
+        return self.snapshot(ids).state
 
     def stop(self, ids: NDArray[np.intp]) -> None:
         """Leave simulations alone from now on: they are neither stepped nor sensed before their next `reset`."""
         super().stop(ids)
         self._active = np.flatnonzero(self.running)
 
-    def _frame(self, receipt: Receipt) -> FrameReport:
-        report = super()._frame(receipt)
+    def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
+        report = super()._frame(receipt, command)
         self.world.check()
         return report
 
@@ -166,10 +172,6 @@ class Simulation(Host):
             age_s: how old the oldest reading was then [s].
         """
         return
-
-    def initial_state(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the state of the world that episodes begin with, shape (len(ids), k)."""
-        return self.snapshot(ids).state
 
     def snapshot(self, ids: NDArray[np.intp] | None = None) -> Snapshot:
         """Return the physics of simulations: to continue from there with the same commands, bit-exactly."""

@@ -152,7 +152,7 @@ class _Recording:
             options = self._options
             images = {camera.name: camera.shape() for camera in cameras}
             features = keys.dataset_features(
-                options.observation_names, options.action_names, images, (), options.environment_names
+                options.observation_names, options.action_names, images, {}, options.environment_names
             )  # the state of a real robot's physics is not known
             self._recorder = DatasetRecorder.create(
                 self._repo_id,

@@ -141,7 +141,7 @@ def test_a_recording_comes_back_and_is_valid(request, tmp_path, robot, layout):
 @pytest.mark.parametrize("layout", [[], ["--one_bag"]])
 def test_episodes_that_turn_round_come_back_whatever_the_one_before_did(tmp_path, layout):
     features = dataset_features(
-        ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"], ["x.vel", "theta.vel"], {}, ["q"]
+        ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"], ["x.vel", "theta.vel"], {}, {"simulation.state": ["q"]}
     )
     root, frames = tmp_path / "d", 50
     with DatasetRecorder.create("t/t", 10, features, robot_type="turtlebot3", root=root) as recorder:
@@ -340,7 +340,7 @@ def lookup(links, parent, child):
 
 def write_arm(root, names, values):
     """Record frames of an arm that is anywhere."""
-    features = dataset_features(names, ["gripper.pos"], {}, ["q"])
+    features = dataset_features(names, ["gripper.pos"], {}, {"simulation.state": ["q"]})
     with DatasetRecorder.create("t/t", 10, features, robot_type="ur5", root=root) as recorder:
         writer, n = recorder.begin_episode(), len(values)
         columns = {key: np.zeros((n, *one["shape"]) if one["shape"] != (1,) else n, one["dtype"])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.cli import evaluate
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.policies.learned.brain import LearnedBrain
-from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+from bhd_lerobot.robots.robot import BhdRobot
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _PROGRAMS: dict[str, Callable[[], None]] = {
@@ -107,23 +107,23 @@ def trace_lerobot_eval(folder: Path, options: list[str]) -> Trace:
 def trace_lerobot_rollout(frames: int, options: list[str]) -> Trace:
     """Run lerobot-rollout, press Ctrl-C after some frames, and return what the policy saw and did."""
     seen, done = [], []
-    get, send = SimulatedRobot.get_observation, SimulatedRobot.send_action
+    get, send = BhdRobot.get_observation, BhdRobot.send_action
 
-    def spy_get(self: SimulatedRobot) -> Any:
+    def spy_get(self: BhdRobot) -> Any:
         observation = get(self)
         images = {name: observation[name] for name in self.camera_shapes}
         seen.append(_flat([observation[name] for name in self.observation_names], images))
         return observation
 
-    def spy_send(self: SimulatedRobot, action: Any) -> Any:
+    def spy_send(self: BhdRobot, action: Any) -> Any:
         if len(done) == frames:
             raise KeyboardInterrupt
         done.append([action[name] for name in self.action_names])
         return send(self, action)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SimulatedRobot, "get_observation", spy_get)
-        patch.setattr(SimulatedRobot, "send_action", spy_send)
+        patch.setattr(BhdRobot, "get_observation", spy_get)
+        patch.setattr(BhdRobot, "send_action", spy_send)
         # fps only says how long to wait between frames: a lockstep robot has its own.
         run_stock("lerobot-rollout", [*options, *arguments(fps=1000, return_to_initial_position="false")])
     return _trace(seen[1:], done)  # LeRobot looks once more, before it begins

@@ -18,7 +18,7 @@ import bhd_lerobot
 from bhd_lerobot.cli import train
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
-from bhd_lerobot.robots.simulated_robot import connected_robots
+from bhd_lerobot.robots.robot import connected_robots
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from tests.policies.learned.rig import save_policy

@@ -61,7 +61,7 @@ def is_gone(name: str) -> bool:
 
 
 def mode(robot: Any) -> Mode:
-    return Mode(int(robot.simulation.modes[0]))
+    return Mode(int(robot.host.modes[0]))
 
 
 def drive(robot: TurtleBot3, speed: float = 0.2) -> None:
@@ -103,7 +103,7 @@ def drive_on(name: str, options: dict[str, Any]) -> None:
     robot = turtlebot(name, **options)
     robot.connect()
     drive(robot)
-    print(json.dumps({"pids": robot.simulation.link.pids}), flush=True)
+    print(json.dumps({"pids": robot.host.link.pids}), flush=True)
     while True:
         robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})
         time.sleep(0.05)

@@ -46,7 +46,7 @@ def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
     ):
         with robot:
             drive(robot)
-            pids = robot.simulation.link.pids
+            pids = robot.host.link.pids
             states = States(name)
             os.kill(pids[victim], signal.SIGKILL)
             until(lambda wanted=message: wanted in complaint(robot.get_observation), "the robot says what happened")
@@ -113,7 +113,7 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
     name = unique("stopped")
     with turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5) as robot:
         drive(robot)
-        recorder = robot.simulation.link.pids["recorder"]
+        recorder = robot.host.link.pids["recorder"]
         states = States(name)
         words, block = states.block.words, states.block
         log = FrameLog(block.state_dtype, block.about["frames"], block.section("frames")).reader()
@@ -140,7 +140,7 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
         until(lambda: words[Word.RECORDER_DROPS] > ring, "drops are counted")
         drive(robot)
         # In the log of frames there is a gap, and it is as long as the count says, but for what a frame lasts.
-        robot.simulation.link.pause()
+        robot.host.link.pause()
         until(lambda: read_log()[-1]["drops"] == words[Word.RECORDER_DROPS], "the recorder has taken all there is")
         frame, gaps = block.about["control_hz"] // block.about["fps"], 0
         for before, after in itertools.pairwise(entries):
@@ -181,9 +181,9 @@ def test_a_cerebellum_that_is_stopped_is_reported_and_ended(monkeypatch):
     name = unique("frozen")
     with turtlebot(name) as robot:
         drive(robot)
-        pids = robot.simulation.link.pids
+        pids = robot.host.link.pids
         os.kill(pids["cerebellum"], signal.SIGSTOP)
-        newest = robot.simulation.live_bridge
+        newest = robot.host.bridge
         until(lambda: time.monotonic_ns() - int(newest.latest["sensed_ns"]) > 2.1e9, "it has been silent for 2 s")
         for call in (robot.get_observation, lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})):
             with pytest.raises(RealtimeError, match=r"published nothing for .* stopped"):
@@ -214,12 +214,12 @@ def test_without_sched_fifo_it_runs_and_reports_the_refusal(unprivileged):
     robot = turtlebot(name)
     try:
         unprivileged.submit(robot.connect).result()
-        grants = {grant["name"]: grant for grant in robot.simulation.grants}
+        grants = {grant["name"]: grant for grant in robot.host.clock.grants}
         assert not grants["scheduler"]["granted"]
         assert "SCHED_OTHER" in grants["scheduler"]["detail"]
         assert "setcap" in grants["scheduler"]["remedy"]
         assert grants["timer slack"]["granted"]
-        assert os.sched_getscheduler(robot.simulation.link.pids["cerebellum"]) == os.SCHED_OTHER
+        assert os.sched_getscheduler(robot.host.link.pids["cerebellum"]) == os.SCHED_OTHER
         drive(robot)
     finally:
         robot.disconnect()

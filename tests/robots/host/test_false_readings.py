@@ -49,8 +49,8 @@ def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie
         end = time.monotonic() + most
         while time.monotonic() < end and mode(robot) not in (Mode.FAULT, until_mode):
             action["shoulder_pan.pos"] -= 0.4 / 25
-            robot.simulation.send(np.array([list(action.values())]))
-            robot.simulation.step(None)
+            robot.host.send(np.array([list(action.values())]))
+            robot.host.step(None)
 
     turned(most=1.0)
     assert mode(robot) == Mode.TRACKING
@@ -58,13 +58,13 @@ def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie
     turned(Mode.FAULT)
     assert mode(robot) == Mode.FAULT
     time.sleep(1.0)
-    robot.simulation.link.pause()
+    robot.host.link.pause()
     end = int(shared["count"])
     modes, written = shared["mode"][start:end], shared["written"][start:end]
     first = int((modes == Mode.FAULT).argmax())
     assert np.abs(written[first:, :6] - written[first, :6]).max() < (BLOCKED if lie == "frozen" else BRAKES)
     assert np.abs(np.diff(written[:, :6], axis=0)).max() < np.pi / 125 * 1.5
-    assert WORDS[lie] in robot.simulation.problem
+    assert WORDS[lie] in robot.host.problem
     shared["lie"] = 0
-    robot.simulation.reset(np.zeros(1, np.intp), [None], [0])
-    robot.simulation.begin()
+    robot.host.reset(np.zeros(1, np.intp), [None], [0])
+    robot.host.begin()

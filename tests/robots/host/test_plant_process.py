@@ -417,10 +417,10 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
     robot.connect()
     block = None
     try:
-        block = LiveBlock.attach(robot.simulation.link.block.name)
+        block = LiveBlock.attach(robot.host.link.block.name)
         link = PlantLink.of(block)
         assert link is not None
-        names, command = robot.action_names, robot.simulation.live_bridge.latest["command"][0].tolist()
+        names, command = robot.action_names, robot.host.bridge.latest["command"][0].tolist()
         target = {"x.vel": 0.2, "theta.vel": 0.0} if kind == "turtlebot3" else dict(zip(names, command, strict=True))
         while True:
             if kind == "ur5":
@@ -441,8 +441,8 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
 def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
     with moving(kind) as (robot, link):
-        live_link = robot.simulation.link
-        timeout, period = round(LONG * NANOSECONDS), NANOSECONDS // robot.simulation.rates.control_hz
+        live_link = robot.host.link
+        timeout, period = round(LONG * NANOSECONDS), NANOSECONDS // robot.host.rates.control_hz
         os.kill(live_link.pids["cerebellum"], signal.SIGKILL)
         last: Any = None
         stopped: Any = None
@@ -480,25 +480,25 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
 
 def test_a_stopped_cerebellum_goes_on_after_a_reset_and_a_stopped_or_killed_plant_is_a_fault_and_an_error() -> None:
     with moving("turtlebot3") as (robot, link):
-        pid = robot.simulation.link.pids["cerebellum"]
+        pid = robot.host.link.pids["cerebellum"]
         os.kill(pid, signal.SIGSTOP)
         until(lambda: link.states.latest()["phase"] == PlantPhase.STOPPED)  # type: ignore[index]
         until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
         os.kill(pid, signal.SIGCONT)
-        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        until(lambda: robot.host.modes[0] == Mode.FAULT)
         assert link.states.latest()["phase"] == PlantPhase.STOPPED  # type: ignore[index]
-        bridge = robot.simulation.live_bridge
+        bridge = robot.host.bridge
         until(lambda: bool(bridge.reset().accepted.all()))
         until(lambda: link.states.latest()["phase"] == PlantPhase.DRIVEN)  # type: ignore[index]
         robot.activate()
         robot.send_action({"x.vel": 0.1, "theta.vel": 0.0})
         assert link.states.latest()["stops"] == 1  # type: ignore[index]
 
-        live_link, seen = robot.simulation.link, WATCHDOGS.index(Watchdog.PLANT)
-        until(lambda: robot.simulation.modes[0] == Mode.TRACKING)
+        live_link, seen = robot.host.link, WATCHDOGS.index(Watchdog.PLANT)
+        until(lambda: robot.host.modes[0] == Mode.TRACKING)
         before = int(bridge.latest["watchdogs"][seen])
         os.kill(live_link.pids["plant"], signal.SIGSTOP)
-        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        until(lambda: robot.host.modes[0] == Mode.FAULT)
         until(lambda: bridge.latest["watchdogs"][seen] > before)
         with pytest.raises(RealtimeError, match=r"plant's process \(\d+\) has shown no sign of life for 2\.\d s"):
             until(live_link.check)  # it says nothing until then
@@ -523,7 +523,7 @@ def test_a_base_on_the_wall_clock_stops_before_a_wall_that_its_plant_sees() -> N
 
     with TurtleBot3(config) as robot:
         until(stands, "it stands before a wall")
-        simulation: Any = robot.simulation
+        simulation: Any = robot.host
         assert not simulation.truth().touched.any()
         assert int(simulation.modes[0]) == Mode.TRACKING
         assert robot.get_observation()["scan_180.pos"] < 0.25

@@ -41,7 +41,7 @@ def recover(robot: TurtleBot3) -> None:
 
     def is_reset() -> bool:
         # A press that came after the last tick before the reset is latched by the next one.
-        return bool(robot.simulation.bridge.reset().accepted[0]) and mode(robot) == Mode.INACTIVE
+        return bool(robot.host.bridge.reset().accepted[0]) and mode(robot) == Mode.INACTIVE
 
     until(is_reset, "the robot is at rest")
     with pytest.raises(CommandRefusedError, match="not active"):
@@ -61,7 +61,7 @@ def expect_stop(robot: TurtleBot3) -> None:
 
 
 def test_the_real_time_process_has_imported_neither_torch_nor_lerobot(robot):
-    link = robot.simulation.link
+    link = robot.host.link
     assert link.about["heavy"] == []
     assert link.about["pid"] == link.pids["cerebellum"] != os.getpid()
     assert {grant["name"] for grant in link.grants} >= {"scheduler", "memory lock", "collector", "timer slack"}
@@ -69,9 +69,9 @@ def test_the_real_time_process_has_imported_neither_torch_nor_lerobot(robot):
 
 def test_observations_flow_and_actions_move_it(driving):
     before = driving.get_observation()
-    tick = int(driving.simulation.live_bridge.latest["tick"])
+    tick = int(driving.host.bridge.latest["tick"])
     until(lambda: driving.get_observation()["x.pos"] > before["x.pos"] + 0.02, "the base gets somewhere")
-    assert int(driving.simulation.live_bridge.latest["tick"]) > tick
+    assert int(driving.host.bridge.latest["tick"]) > tick
     applied = driving.send_action({"x.vel": 0.1, "theta.vel": 0.0})
     assert set(applied) == {"x.vel", "theta.vel"}
     driving.estop()
@@ -123,7 +123,7 @@ def test_estop_from_another_process(driving):
 
 
 def test_deactivation_ends_in_safe_off(driving):
-    assert driving.simulation.bridge.deactivate().accepted.all()
+    assert driving.host.bridge.deactivate().accepted.all()
     until(lambda: mode(driving) == Mode.SAFE_OFF, "the base is at rest")
     with pytest.raises(CommandRefusedError, match="not active"):
         driving.send_action({"x.vel": 0.2, "theta.vel": 0.0})
@@ -144,8 +144,8 @@ def test_two_robots_at_once(robot):
     name = unique("second")
     with turtlebot(name) as second:
         assert {NAME, name} <= set(names())
-        pids = second.simulation.link.pids
-        assert not set(pids.values()) & set(robot.simulation.link.pids.values())
+        pids = second.host.link.pids
+        assert not set(pids.values()) & set(robot.host.link.pids.values())
         drive(second)
         assert mode(robot) in (Mode.HOLD, Mode.TRACKING)
     assert is_gone(name)

@@ -39,7 +39,7 @@ def result(arm: UR5) -> CommandResult:
     found: list[CommandResult] = []
 
     def take() -> bool:
-        found.extend(arm.simulation.bridge.take_results())
+        found.extend(arm.host.bridge.take_results())
         return bool(found)
 
     until(take, "the goal ends")
@@ -49,7 +49,7 @@ def result(arm: UR5) -> CommandResult:
 
 def start(arm: UR5, command: BrainCommand) -> Any:
     """Send a goal and wait until it is followed; return the first feedback."""
-    bridge = arm.simulation.bridge
+    bridge = arm.host.bridge
     assert bridge.submit(command) is None
     return until(
         lambda: (one := bridge.feedback()) is not None and one.task_id == command.task_id and one, "it is followed"
@@ -59,7 +59,7 @@ def start(arm: UR5, command: BrainCommand) -> Any:
 def test_a_goal_is_accepted_gives_feedback_and_succeeds(arm):
     command = goal("there", 0)
     feedback = [start(arm, command)]
-    bridge = arm.simulation.bridge
+    bridge = arm.host.bridge
     found: list[CommandResult] = []
 
     def follow() -> bool:
@@ -75,25 +75,25 @@ def test_a_goal_is_accepted_gives_feedback_and_succeeds(arm):
     progress = [one.progress for one in feedback]
     assert progress == sorted(progress)
     assert 0 <= progress[0] < progress[-1] <= 1
-    position = arm.simulation.mirror.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
+    position = arm.host.mirror.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
     assert np.linalg.norm(position - TARGETS[0]) < 0.01
     until(lambda: mode(arm) == Mode.HOLD, "it holds")
 
 
 def test_a_goal_is_refused_with_a_reason(arm):
-    refusal = arm.simulation.bridge.submit(BrainCommand("far", target_pose=Pose((2.0, 0.0, 0.3), (0.0, 1.0, 0.0, 0.0))))
+    refusal = arm.host.bridge.submit(BrainCommand("far", target_pose=Pose((2.0, 0.0, 0.3), (0.0, 1.0, 0.0, 0.0))))
     # It is planned in another process; where that finds out, the refusal comes as the result.
     ended = refusal or result(arm)
-    arm.simulation.bridge.take_results()
+    arm.host.bridge.take_results()
     assert (ended.task_id, ended.success, ended.code) == ("far", False, ResultCode.UNREACHABLE)
 
 
 def test_a_cancelled_goal_ends_as_such_and_the_arm_holds(arm):
     start(arm, goal("cancelled", 1, speed=0.2))
-    assert arm.simulation.bridge.cancel("cancelled") == ResultCode.SUCCEEDED
+    assert arm.host.bridge.cancel("cancelled") == ResultCode.SUCCEEDED
     assert result(arm).code == ResultCode.CANCELLED
     until(lambda: mode(arm) == Mode.HOLD, "it holds")
-    assert arm.simulation.bridge.cancel("cancelled") == ResultCode.UNKNOWN_ID
+    assert arm.host.bridge.cancel("cancelled") == ResultCode.UNKNOWN_ID
 
 
 def test_an_emergency_stop_ends_the_goal_and_refuses_the_next(arm):
@@ -101,7 +101,7 @@ def test_an_emergency_stop_ends_the_goal_and_refuses_the_next(arm):
     arm.estop()
     assert result(arm).code == ResultCode.ESTOP
     assert mode(arm) == Mode.ESTOP
-    bridge = arm.simulation.bridge
+    bridge = arm.host.bridge
     refusal = bridge.submit(goal("next", 1))
     assert refusal is not None
     assert refusal.code == ResultCode.ESTOP

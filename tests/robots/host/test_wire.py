@@ -44,21 +44,21 @@ def arm(connected: tuple[UR5, States]) -> tuple[UR5, States]:
     if mode(robot) in (Mode.FAULT, Mode.ESTOP):
         lead_out(robot)
     until(lambda: mode(robot) == Mode.HOLD, "the arm holds")
-    robot.simulation.bridge.take_results()
+    robot.host.bridge.take_results()
     states.read().all.clear()
     return robot, states
 
 
 def lead_out(robot: UR5) -> None:
     def active() -> bool:
-        reset = robot.simulation.bridge.reset()
-        return bool(reset.accepted.all()) and bool(robot.simulation.bridge.activate().accepted.all())
+        reset = robot.host.bridge.reset()
+        return bool(reset.accepted.all()) and bool(robot.host.bridge.activate().accepted.all())
 
     until(active, "it is active")
 
 
 def turn(robot: UR5, name: str, by: float) -> None:
-    bridge = robot.simulation.bridge
+    bridge = robot.host.bridge
     target = np.asarray(bridge.state().command)[0, :6] + np.array([by, 0, 0, 0, 0, 0])
     assert bridge.submit(BrainCommand(name, joint_target=tuple(target.tolist()), timeout_s=60.0)) is None
     until(lambda: (one := bridge.feedback()) is not None and one.phase == GoalPhase.EXECUTING, "it is followed")
@@ -69,7 +69,7 @@ def expect_no_jump(states: States, robot: UR5) -> None:
     ticks = np.diff([int(state["tick"]) for state in states.read().all])
     positions = np.array([state["joint_positions"][0] for state in states.all])
     assert np.isfinite(positions).all()
-    limits = robot.simulation.body.limits  # type: ignore[union-attr]
+    limits = robot.host.body.limits  # type: ignore[union-attr]
     most = 1.1 * np.array(limits.velocity[:6]) / HZ * ticks[:, None]
     assert (np.abs(np.diff(positions[:, :6], axis=0)) <= most).all()
 
@@ -84,22 +84,22 @@ def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, Sta
     rows[...] = np.nan if what == "not a number" else rows + 1.0
     until(lambda: states.has(Mode.FAULT), "it is a fault")
     until(lambda: watchdog_count(states.read().all[-1], Watchdog.GUARD), "the guard is named")
-    until(lambda: not robot.simulation.bridge.state().is_moving.any(), "the arm rests")
+    until(lambda: not robot.host.bridge.state().is_moving.any(), "the arm rests")
     expect_no_jump(states, robot)
 
 
 def test_a_cerebellum_that_was_away_does_not_catch_up_at_the_wire(arm: tuple[UR5, States]) -> None:
     robot, states = arm
     turn(robot, "away", 0.8)
-    pid = robot.simulation.link.pids["cerebellum"]
+    pid = robot.host.link.pids["cerebellum"]
     os.kill(pid, signal.SIGSTOP)
     time.sleep(AWAY_S)
     os.kill(pid, signal.SIGCONT)
-    until(robot.simulation.bridge.take_results, "the goal ends")
+    until(robot.host.bridge.take_results, "the goal ends")
     commands = np.array([state["command"][0] for state in states.read().all])
     skipped = np.diff([int(state["skipped"]) for state in states.all])
     assert skipped.max() > AWAY_S * HZ / 2  # it was away
-    limits = robot.simulation.body.limits  # type: ignore[union-attr]
+    limits = robot.host.body.limits  # type: ignore[union-attr]
     assert (np.abs(np.diff(commands, axis=0)) <= 1.001 * np.array(limits.velocity) / HZ).all()
 
 
@@ -108,12 +108,12 @@ def test_what_a_silent_brain_left_in_the_queue_moves_nothing_later(arm: tuple[UR
     action = robot.get_observation()
     robot.send_action({name: action[name] for name in robot.action_features})
     until(lambda: states.has(Mode.TRACKING), "it is commanded")
-    where = np.asarray(robot.simulation.bridge.state().command).copy()
-    late = robot.simulation.bridge.now_ns + round(0.5e9)
+    where = np.asarray(robot.host.bridge.state().command).copy()
+    late = robot.host.bridge.now_ns + round(0.5e9)
     assert states.block.fifo.push(10**6, late, where + 0.3, np.ones(1, np.bool_))
     until(lambda: states.read().all[-1]["mode"][0] == Mode.HOLD, "it holds")
-    until(lambda: robot.simulation.bridge.now_ns > late + 10**8, "it would have been due")
-    assert np.abs(robot.simulation.bridge.state().command - where).max() < 1e-3
+    until(lambda: robot.host.bridge.now_ns > late + 10**8, "it would have been due")
+    assert np.abs(robot.host.bridge.state().command - where).max() < 1e-3
     assert mode(robot) == Mode.HOLD
 
 
@@ -135,7 +135,7 @@ def test_no_press_around_a_reset_is_lost(arm: tuple[UR5, States], tmp_path: Path
     child = Fork(press_often, NAME, 100, output=tmp_path / "presses")
     resets = 0
     while child.poll() is None:
-        resets += bool(robot.simulation.bridge.reset().accepted.all())
+        resets += bool(robot.host.bridge.reset().accepted.all())
     assert resets > 3
     presses = json.loads((tmp_path / "presses").read_text())
     until(lambda: states.read().all[-1]["start_ns"] > presses[-1][1], "a tick after the last press")
@@ -158,7 +158,7 @@ def pressing() -> Iterator[tuple[UR5, Callable[[], float]]]:
     robot = UR5(config)
     robot.connect()
     states = States(name)
-    body = robot.simulation.body
+    body = robot.host.body
     dynamics, forward = ArmDynamics(body), ForwardKinematics(body.chain)  # type: ignore[arg-type, attr-defined]
 
     def force() -> float:
@@ -171,7 +171,7 @@ def pressing() -> Iterator[tuple[UR5, Callable[[], float]]]:
     def go(height: float, number: int) -> None:
         pose = Pose((x, y, height), DOWN)
         goal = BrainCommand(f"go {number}", target_pose=pose, gripper=0.0, max_velocity=0.5, timeout_s=600.0)
-        assert robot.simulation.bridge.submit(goal) is None
+        assert robot.host.bridge.submit(goal) is None
         until(robot.take_results, "the goal has ended")
 
     names, values = robot.environment

@@ -1,4 +1,4 @@
-"""The lifecycle that all simulated robots share: LeRobot's `Robot` over a simulation of one."""
+"""LeRobot's `Robot` over a host of one: simulated, or real behind a plant."""
 
 import math
 import weakref
@@ -22,16 +22,16 @@ from bhd_lerobot.robots.host.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator: a brain
 # finds its robot here. Weak, so that a forgotten robot is freed.
-_connected: "weakref.WeakSet[SimulatedRobot]" = weakref.WeakSet()
+_connected: "weakref.WeakSet[BhdRobot]" = weakref.WeakSet()
 
 
-def connected_robots() -> list["SimulatedRobot"]:
-    """Return the simulated robots that are connected in this process."""
+def connected_robots() -> list["BhdRobot"]:
+    """Return the robots of this package that are connected in this process."""
     return [robot for robot in _connected if robot.is_connected]
 
 
-class SimulatedRobot(Robot):
-    """A simulated robot.
+class BhdRobot(Robot):
+    """A robot under a cerebellum.
 
     On the lockstep clock `send_action` applies an action and advances time by one frame. Two things differ from a robot
     on a table. Time stands still between two calls of `send_action`, so that a slow brain is not a late one. And
@@ -47,7 +47,7 @@ class SimulatedRobot(Robot):
     def __init__(self, config: Any) -> None:
         super().__init__(config)
         self.config = config
-        self._simulation: Host | None = None
+        self._host: Host | LiveHost | None = None
         self._last_observation: dict[str, Any] | None = None
         self._results: list[CommandResult] = []
         self._estop_sources: list[tuple[Source, str, float]] = []
@@ -95,16 +95,16 @@ class SimulatedRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether the simulation runs."""
-        return self._simulation is not None
+        """Whether it runs."""
+        return self._host is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """A simulated robot needs no calibration."""
+        """There is nothing to calibrate."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:
-        """Start the simulation, at the start of the configured scene.
+        """Start the robot, a simulated one at the start of the configured scene.
 
         Raises:
             DeviceAlreadyConnectedError: it runs already.
@@ -112,11 +112,11 @@ class SimulatedRobot(Robot):
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         is_live = self.config.clock == "realtime"
-        self._simulation = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
+        self._host = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
         try:
             self.restart()
             for name in self.camera_shapes:
-                self._simulation.render(0, name)
+                self._host.render(0, name)
             for source in self._estop_sources:
                 self._listen(*source)
         except BaseException:
@@ -126,18 +126,17 @@ class SimulatedRobot(Robot):
 
     def restart(self) -> None:
         """Put a simulated robot back to the start of its scene, at rest; a real one starts from where it is."""
-        simulation = self.simulation
+        host = self.host
         scene = self.make_scene()
-        simulation.reset(np.zeros(1, np.intp), [scene if simulation.is_simulated else None], [self.config.seed])
-        if isinstance(simulation, LiveHost):
-            simulation.begin()
+        host.reset(np.zeros(1, np.intp), [None if host.world is None else scene], [self.config.seed])
+        host.begin()
 
     def disconnect(self) -> None:
-        """Stop the simulation. May be called at any time, also twice."""
+        """Stop the robot. May be called at any time, also twice."""
         self._stop_listening()
-        if self._simulation is not None:
-            self._simulation.close()
-            self._simulation = None
+        if self._host is not None:
+            self._host.close()
+            self._host = None
         self._last_observation = None
         self._results = []
         _connected.discard(self)
@@ -149,15 +148,15 @@ class SimulatedRobot(Robot):
         """Nothing to configure beyond the configuration."""
 
     @property
-    def simulation(self) -> Host:
-        """The simulation behind the robot.
+    def host(self) -> Host | LiveHost:
+        """What moves the robot: a simulation in this process, or processes on the wall clock.
 
         Raises:
             DeviceNotConnectedError: it does not run.
         """
-        if self._simulation is None:
+        if self._host is None:
             raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
-        return self._simulation
+        return self._host
 
     def get_observation(self) -> dict[str, Any]:
         """Return what the robot sees now: floats in SI units, images as (height, width, 3) uint8 RGB.
@@ -165,11 +164,11 @@ class SimulatedRobot(Robot):
         Raises:
             DeviceNotConnectedError: the robot is not connected.
         """
-        simulation = self.simulation
-        frame = simulation.latest() if isinstance(simulation, LiveHost) else simulation.observe()
+        host = self.host
+        frame = host.latest()
         observation: dict[str, Any] = dict(zip(self.observation_names, frame.state[0].tolist(), strict=True))
         for name in self.camera_shapes:
-            observation[name] = simulation.render(0, name)
+            observation[name] = host.render(0, name)
         self._last_observation = {
             name: value.copy() if isinstance(value, np.ndarray) else value for name, value in observation.items()
         }
@@ -202,22 +201,16 @@ class SimulatedRobot(Robot):
             CommandRefusedError: the robot does not take commands in its present mode, after an emergency stop for
                 example. Time went on by a frame all the same: a robot that is stopping continues stopping.
         """
-        simulation = self.simulation
         values = self.action_array(action)
-        refusals: Mapping[int, str]
-        if isinstance(simulation, LiveHost):
-            receipt = simulation.send(values)
-            sent, refusals, mode = receipt.sent, receipt.refusals, simulation.modes
-            applied = simulation.to_action(simulation.live_bridge.latest["command"])
-        else:
-            report = simulation.step(values)
-            sent, refusals, mode, applied = report.sent, report.refusals, report.mode, report.applied
-            self._results += report.results.get(0, ())
-        reason = Reason(int(sent.reasons[0]))
+        done = self.host.act(values)
+        self._results += done.results.get(0, ())
+        reason = Reason(int(done.sent.reasons[0]))
         if reason != Reason.ACCEPTED:
-            words = refusals.get(0, reason.explanation)
-            raise CommandRefusedError(f"The {self.name} refused the action: {words} (mode {Mode(int(mode[0])).name}).")
-        return dict(zip(self.action_names, applied[0].tolist(), strict=True))
+            words = done.refusals.get(0, reason.explanation)
+            raise CommandRefusedError(
+                f"The {self.name} refused the action: {words} (mode {Mode(int(done.mode[0])).name})."
+            )
+        return dict(zip(self.action_names, done.applied[0].tolist(), strict=True))
 
     def action_array(self, action: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return an action as an array of shape (1, actions), checked.
@@ -261,12 +254,12 @@ class SimulatedRobot(Robot):
         return ""
 
     def take_results(self) -> list[CommandResult]:
-        """Return the results of goals, sent by `simulation.bridge`, that were not taken yet, in their order.
+        """Return the results of goals, sent by `host.bridge`, that were not taken yet, in their order.
 
         Raises:
             DeviceNotConnectedError: the robot is not connected.
         """
-        results = self._results + self.simulation.bridge.take_results()
+        results = self._results + self.host.bridge.take_results()
         self._results = []
         return results
 
@@ -275,7 +268,7 @@ class SimulatedRobot(Robot):
 
         This is a software stop, not a certified safety function.
         """
-        self.simulation.bridge.estop()
+        self.host.bridge.estop()
 
     def add_estop_input(self, source: Source, name: str = "", period_s: float = POLL_S) -> None:
         """Let a physical button press the emergency stop while the robot is connected, now and at later times.
@@ -307,7 +300,7 @@ class SimulatedRobot(Robot):
 
     def _listen(self, source: Source, name: str, period_s: float) -> None:
         if self._estop_inputs is None:
-            self._estop_inputs = EstopInputs(self.simulation.bridge.estop)
+            self._estop_inputs = EstopInputs(self.host.bridge.estop)
         self._estop_inputs.add(source, name, period_s)
 
     def reset(self) -> None:
@@ -316,7 +309,7 @@ class SimulatedRobot(Robot):
         Raises:
             CommandRefusedError: there is nothing to clear.
         """
-        self._request(self.simulation.bridge.reset().reasons[0])
+        self._request(self.host.bridge.reset().reasons[0])
 
     def activate(self) -> None:
         """Accept actions again after `reset`.
@@ -324,9 +317,9 @@ class SimulatedRobot(Robot):
         Raises:
             CommandRefusedError: the robot is active already, or a stop is still latched.
         """
-        self._request(self.simulation.bridge.activate().reasons[0])
+        self._request(self.host.bridge.activate().reasons[0])
 
     def _request(self, reason: int) -> None:
         if reason != Reason.ACCEPTED:
-            mode = Mode(int(self.simulation.modes[0])).name
+            mode = Mode(int(self.host.modes[0])).name
             raise CommandRefusedError(f"{Reason(int(reason)).explanation} (mode {mode})")

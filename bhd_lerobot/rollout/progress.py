@@ -1,0 +1,31 @@
+"""What every run of episodes shows in the terminal, and its exit status."""
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bhd_lerobot.robots.host.robots import Robots
+
+ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
+FAULT_STATUS = 4  # of one that a real robot's fault ended
+
+
+def progress_bars(console: Console, *fields: str) -> Progress:
+    """Return bars that also show some fields of their tasks, by name."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        *(TextColumn(f"{{task.fields[{field}]}}") for field in fields),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def print_refusals(robots: Robots, console: Console) -> None:
+    """Print what the system refused the real-time process, and the remedy."""
+    grants = robots.clock.grants if robots.clock is not None else None
+    for grant in (grant for grant in grants or () if not grant["granted"]):
+        console.print(
+            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
+        )

@@ -1,0 +1,176 @@
+"""The dataset of a run: opened or continued, and filled with episodes."""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format.features import ACTION, EFFORT, EXPERT_ACTION, dataset_features
+from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
+from bhd_lerobot.datasets.storage.atomic import is_free
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.host.host import describe
+from bhd_lerobot.robots.host.robots import Robots
+from bhd_lerobot.rollout.types import Episode
+from bhd_lerobot.tasks.task import Task, TaskConfig
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A dataset that is opened, or continued.
+
+    Attributes:
+        repo_id: its name, `user/name`.
+        root: its folder.
+        fps: frames a second [Hz].
+        task: the task's configuration.
+        seed: what every episode's seed follows from.
+        split: which set of seeds.
+        resume: whether one that exists is continued.
+        language: whether the plan is recorded in LeRobot's language column, too, if there is one.
+        expert_action: whether it is recorded what an expert would do.
+    """
+
+    repo_id: str
+    root: Path
+    fps: int
+    task: TaskConfig
+    seed: int
+    split: str
+    resume: bool = False
+    language: bool = False
+    expert_action: bool = False
+
+
+def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain) -> DatasetRecorder:
+    """Open the dataset of a recording, or continue with it."""
+    root = recording.root
+    features = dataset_features(
+        robots.observation_names,
+        robots.action_names,
+        robots.camera_shapes,
+        robots.columns,
+        task.environment_names,
+        expert=recording.expert_action,
+        subtask=brain.has_plan,
+        language=brain.has_plan and recording.language,
+    )
+    if recording.expert_action:
+        _check_expert(brain)
+    # What decides the episodes. How many there are, and how many run side by side, does not.
+    about: dict[str, Any] = {
+        "robot": describe(robots.config),
+        "task": task.parameters(),
+        "brain": brain.parameters(),
+        "seed": recording.seed,
+        "split": recording.split,
+    }
+    is_continued = recording.resume and not is_free(root)
+    if is_continued and (info := info_of(root)) is not None:
+        if EFFORT not in info.features:
+            features.pop(EFFORT, None)  # the dataset is older than this column
+        about["task"] = _without_new(about["task"], info.recording.get("task"), type(recording.task))
+        about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
+    make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
+    return make(recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about)
+
+
+_BY_OPTION = (EFFORT, EXPERT_ACTION)
+"""Columns that a dataset may do without: it is older, or did not ask for them."""
+
+
+def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
+    """Save an episode; when this returns, it survives a kill."""
+    writer = episode.writer or recorder.begin_episode()
+    try:
+        known = recorder.features
+        columns = {key: column for key, column in episode.columns.items() if key not in _BY_OPTION or key in known}
+        if EXPERT_ACTION in known:
+            columns.setdefault(EXPERT_ACTION, columns[ACTION])  # of a rule, which is the expert
+        writer.set_columns(columns)
+        recorder.save(writer, task=episode.instruction, metadata=metadata)
+    except BaseException:
+        writer.discard()
+        raise
+
+
+def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
+    """Return LeRobot's column `language_persistent`: the plan, and every subtask from its first frame on.
+
+    Every frame of an episode holds the same rows.
+
+    Args:
+        plan: the plan; its `steps` are pairs of a skill and a text.
+        subtasks: what the brain was doing in each frame, shape (frames,).
+        fps: frames a second [Hz].
+    """
+    rows: list[dict[str, Any]] = []
+
+    def say(style: str, content: str, frame: int) -> None:
+        when = {"timestamp": frame / fps, "camera": None, "tool_calls": None}
+        rows.append({"role": "assistant", "content": content, "style": style, **when})
+
+    if plan.get("steps"):
+        say("plan", "\n".join(f"{number}. {text}" for number, (_, text) in enumerate(plan["steps"], 1)), 0)
+    for frame, text in enumerate(subtasks):
+        if frame == 0 or text != subtasks[frame - 1]:
+            say("subtask", str(text), frame)
+    column = np.empty(len(subtasks), dtype=object)
+    column[:] = [rows] * len(subtasks)
+    return column
+
+
+def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, Any]:
+    """Return options without those that a dataset is older than, if they are as they are by default.
+
+    By default an option of a task leaves it as it was before there was that option.
+    """
+    if not isinstance(recorded, Mapping):
+        return asked
+    kept = dict(asked)
+    for field in fields(kind):
+        name = field.name
+        made = field.default if field.default_factory is MISSING else field.default_factory()
+        default = asdict(made) if is_dataclass(made) and not isinstance(made, type) else made
+        if name not in kept:
+            continue
+        if name not in recorded and kept[name] == default:
+            del kept[name]
+        elif name in recorded and is_dataclass(made):
+            kept[name] = _without_new(kept[name], recorded[name], type(made))
+    return kept
+
+
+def _as_named_then(asked: Any, recorded: Any) -> Any:
+    """Return the parameters of a brain with each policy named as in the dataset, if its weights are those.
+
+    A policy is what its weights are: it may have been moved, and older datasets name it as the user did.
+    """
+    if not (isinstance(asked, Mapping) and isinstance(recorded, Mapping)):
+        return asked
+    named = {name: _as_named_then(value, recorded.get(name)) for name, value in asked.items()}
+    if "path" in recorded and "weights" in asked and asked["weights"] == recorded.get("weights"):
+        named["path"] = recorded["path"]
+    return named
+
+
+def info_of(root: Path) -> DatasetSummary | None:
+    """Return what a dataset is; None if it cannot be read."""
+    try:
+        return dataset_info(root)
+    except BhdError:  # what is wrong with it is said when it is resumed
+        return None
+
+
+def _check_expert(brain: Any) -> None:
+    """Raise if nobody states what an expert would do."""
+    if brain.name == "learned":  # a rule is its own expert
+        raise ConfigError(
+            f"dataset.expert_action asks for what an expert would do, and brain.type is {brain.name!r}, a policy, and "
+            "no expert. Use a rule, or brain.type=dagger with a rule as its expert, such as gap_follower."
+        )
