@@ -47,6 +47,10 @@ class SimulationError(BhdError):
     """The physics diverged, or a simulation was used in a way that it cannot serve."""
 
 
+class BrainStoppedError(BhdError):
+    """A brain has no action any more, and never will: the episode ends with a fault."""
+
+
 class RealtimeError(BhdError):
     """The real-time process cannot be started as asked, has ended, or does not answer."""
 

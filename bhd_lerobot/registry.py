@@ -12,6 +12,7 @@ from lerobot.robots.config import RobotConfig
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
 import bhd_lerobot.tasks.avoid
+import bhd_lerobot.tasks.free
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
@@ -31,6 +32,8 @@ from bhd_lerobot.policies.manipulation.servo import PickServoBrain, ReachServoBr
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
+from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.tasks.task import TASKS, Task, TaskConfig
 
 if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
@@ -83,7 +86,7 @@ ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
 
 _CLASSES: tuple[Any, ...] = (
     *(AvoidanceBrain, _Blanked, _Dagger, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain, NoopBrain),
-    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain),
+    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain),
 )
 BRAINS: Registry[Any] = Registry("brain", {brain.name: brain for brain in _CLASSES}, BrainConfig)
 """The classes of the brains, by name."""
@@ -161,18 +164,27 @@ def robots_of(wanted: str) -> list[str]:
 
 def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
     """Refuse a robot that cannot be simulated, one whose rates do not divide each other, and another robot's task."""
-    if robot.type not in ROBOTS:
-        raise ConfigError(
-            f"robot.type is {robot.type!r}; {program} drives simulated robots: {', '.join(sorted(ROBOTS))}. "
-            "Use lerobot-record or lerobot-rollout with another robot."
-        )
-    if robot.type not in (valid := robots_of(robot_of_task(task))):
+    kind = robot_of_task(task)
+    if not is_ours(robot.type):
+        if kind:
+            raise ConfigError(
+                f"robot.type is {robot.type!r} and task.type is {task.get_choice_name(type(task))!r}, which {program} "
+                f"simulates with {', '.join(robots_of(kind))} only. With another robot use --task.type=free: a person "
+                "says how an episode ends."
+            )
+        return
+    if robot.type not in (valid := robots_of(kind)):
         fitting = " or ".join(map(repr, valid))
         raise ConfigError(
             f"task.type is {task.get_choice_name(type(task))!r}, which is for robot.type = {fitting}; robot.type is "
             f"{robot.type!r}."
         )
     _ = robot.rates
+
+
+def is_ours(robot_type: str) -> bool:
+    """Return whether a robot has a cerebellum of this package; others are driven by their own interface."""
+    return robot_type in ROBOTS
 
 
 def check_brain(key: str, brain: BrainConfig, robot_type: str) -> None:
@@ -233,8 +245,22 @@ def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> "Sim
     return made
 
 
-def make_robot(config: Any, n: int = 1, threads: int | None = None) -> "Robots":
-    """Return n robots on the clock that the configuration asks for; on the wall clock there can be one."""
+def make_robot(
+    config: Any, n: int = 1, threads: int | None = None, *, fps: int = 0, gate: GateConfig | None = None
+) -> "Robots":
+    """Return n robots on the clock that the configuration asks for; on the wall clock there can be one.
+
+    Args:
+        config: the robot's.
+        n: how many.
+        threads: threads that step the physics; all processors if None.
+        fps: frames a second [Hz], of a robot of another package.
+        gate: what is let through to one, likewise.
+    """
+    if not is_ours(config.type):
+        from bhd_lerobot.robots.external.make import make_external
+
+        return make_external(config, fps, gate or GateConfig())
     if config.clock != "realtime":
         return make_simulation(config, n, threads)
     if n != 1:

@@ -75,7 +75,7 @@ class StoppedError(BhdError):
     """A signal ended a step; `status` says which."""
 
     def __init__(self, status: int) -> None:
-        super().__init__("Stopped. What was finished is complete; the log says how to go on with the rest.")
+        super().__init__("Stopped. What was finished is complete; the log describes how to continue.")
         self.status = status
 
 

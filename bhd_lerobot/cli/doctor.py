@@ -12,7 +12,7 @@ from bhd_lerobot.options.command import Parser, exit_status
 def _parser() -> Parser:
     parser = Parser(
         prog="bhd-doctor",
-        description="Check this machine; print symptom, cause and remedy of what is wrong. Exit status 1: a problem.",
+        description="Check this machine; print symptom, cause and remedy of each problem. Exit status 1: a problem.",
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")

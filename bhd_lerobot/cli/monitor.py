@@ -10,14 +10,14 @@ from bhd_lerobot.options.command import Parser, exit_status
 def _parser() -> Parser:
     parser = Parser(
         prog="bhd-monitor",
-        description="Watch a robot that runs on the wall clock (--robot.clock=realtime). Keys: e or space is an "
-        "emergency stop, at once and without a question; q quits. Exit status: 0, 1 if the robot was killed or lost "
-        "its brain meanwhile, 2 if there is no such robot.",
+        description="Watch a robot that runs on the wall clock (--robot.clock=realtime). Keys: e or space triggers an "
+        "emergency stop, immediately and without confirmation; q quits. Exit status: 0, 1 if the robot was killed or "
+        "lost its brain meanwhile, 2 if there is no such robot.",
     )
     parser.add_argument("id", nargs="?", metavar="ID", help="robot.id of the robot; the only one that runs if left out")
-    parser.add_argument("--once", action="store_true", help="print one snapshot and leave")
+    parser.add_argument("--once", action="store_true", help="print one snapshot and exit")
     parser.add_argument("--json", action="store_true", help="as JSON: one snapshot, or one a second with --seconds")
-    parser.add_argument("--seconds", type=float, help="leave after so long [s]")
+    parser.add_argument("--seconds", type=float, help="exit after this time [s]")
     return parser
 
 

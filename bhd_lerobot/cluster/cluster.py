@@ -137,7 +137,7 @@ def _knock(address: str) -> None:
         what = "does not answer" if isinstance(error, TimeoutError) else f"cannot be reached: {error.strerror or error}"
         raise ClusterError(f"The Ray cluster at {address!r} {what}. {_REMEDY}") from error
     if answer[3:4] != b"\x04":
-        raise ClusterError(f"What answers at {address!r} is no Ray cluster. {_REMEDY}")
+        raise ClusterError(f"The server at {address!r} is not a Ray cluster. {_REMEDY}")
 
 
 @contextmanager

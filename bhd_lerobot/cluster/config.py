@@ -12,17 +12,18 @@ ENGINES = ("local", "ray")
 
 @dataclass
 class RayConfig:
-    """Which cluster, and how much of it. The names are those of Ray.
+    """The cluster, and the share of it that is used. The names are those of Ray.
 
     Attributes:
-        address: `local` starts a cluster of one machine, this one, for the time of the run; `auto` is the cluster that
-            this machine is part of; or `host:port` of its head. If nothing, what `RAY_ADDRESS` says, otherwise `local`.
-        num_workers: processes that run episodes; as many as the cluster's machines have room for if nothing.
-        cpus_per_worker: processors of each, and the threads that step its physics, unless `threads` says otherwise.
-        gpus_per_worker: GPUs of each; a share such as 0.25 if several use one.
-        episodes_per_task: episodes that a worker gets at a time, and that are lost with it; if nothing, one, or twice
-            `n_envs` if more than one runs side by side.
-        timeout_s: how long the cluster may take to answer, and to start a first worker [s].
+        address: `local` starts a cluster of this machine only, for the duration of the run; `auto` is the cluster that
+            this machine is part of; or `host:port` of its head. By default the value of `RAY_ADDRESS`, otherwise
+            `local`.
+        num_workers: processes that run episodes; by default as many as the cluster has room for.
+        cpus_per_worker: processors of each worker, and the threads that step its physics, unless `threads` is set.
+        gpus_per_worker: GPUs of each worker; a share such as 0.25 if several workers use one.
+        episodes_per_task: episodes that a worker receives at a time, and that are lost with it; by default one, or
+            twice `n_envs` if more than one runs in parallel.
+        timeout_s: time for the cluster to answer, and to start a first worker [s].
         include_dashboard: start Ray's dashboard with a cluster of this machine; it needs Ray's extra `default`.
     """
 
@@ -69,6 +70,11 @@ def check_engine(config: Any) -> None:
         if config.ray != RayConfig():
             raise ConfigError("Options of ray are set, but engine is 'local'; add --engine=ray, or leave them out.")
         return
+    if not hasattr(config.robot, "clock"):
+        raise ConfigError(
+            f"robot.type is {config.robot.type!r}, a robot of its own, and engine is 'ray'; a cluster runs simulated "
+            "robots. Use --engine=local."
+        )
     if config.robot.clock == "realtime":
         raise ConfigError(
             "robot.clock is 'realtime' and engine is 'ray': a robot on the wall clock runs where its real-time process "
@@ -76,7 +82,8 @@ def check_engine(config: Any) -> None:
         )
     if getattr(config, "display_data", False):
         raise ConfigError(
-            "display_data is true and engine is 'ray': frames stay where they are made. Leave one of them out."
+            "display_data is true and engine is 'ray': frames stay on the machines of the cluster. Leave one of them "
+            "out."
         )
     if getattr(config, "estop_key", None):
         raise ConfigError(

@@ -198,7 +198,7 @@ class WorkerPool:
         self._print(worker, answer["printed"])
         if call.kind == "prepare":
             if "error" in answer:
-                raise error_of(answer, f"A worker on {worker.host} could not get ready.")
+                raise error_of(answer, f"A worker on {worker.host} could not start.")
             self._check_fingerprint(worker, answer["value"])
             worker.job, self._lost_early = self._job, 0
             return
@@ -282,5 +282,5 @@ class WorkerPool:
         for line in lines:
             self._printed[line] += 1
             if self._printed[line] == 1 and len(self._printed) <= _PRINTED:
-                more = " (no more of this)" if len(self._printed) == _PRINTED else ""
+                more = " (further lines of this kind are left out)" if len(self._printed) == _PRINTED else ""
                 self._console.print(f"[dim]{escape(f'[{worker.host}]')}[/dim] {escape(line)}{more}", highlight=False)

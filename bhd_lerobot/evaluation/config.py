@@ -19,9 +19,9 @@ class EvalDatasetConfig:
     """Where the runs of an evaluation are recorded: a LeRobotDataset for each brain, named after it.
 
     Attributes:
-        repo_id: name of the datasets on the Hub, `user/name`; `_` and the brain's name are added. Nothing is recorded
-            if nothing.
-        root: folder that gets a folder for each brain; LeRobot's default place if nothing.
+        repo_id: name of the datasets on the Hub, `user/name`; `_` and the brain's name are added. By default
+            nothing is recorded.
+        root: folder for the brains' folders; by default LeRobot's place.
     """
 
     repo_id: str | None = None
@@ -34,26 +34,26 @@ class EvalConfig:
 
     Attributes:
         robot: the robot, in simulation; with `robot.clock=realtime` on the wall clock.
-        task: what it is to achieve, and where.
-        brains: what is compared, by a name of your choice: `--brains.NAME.type=…`. On a command line,
-            `--brains.NAME=null` removes one that a file names.
+        task: the task, and its scenes.
+        brains: the brains to compare, each under a name of your choice: `--brains.NAME.type=…`. On a command line,
+            `--brains.NAME=null` removes one of the file.
         brain: short for one more brain, named after its type: `--brain.type=…`; `--brain.path=…` alone is a checkpoint.
         only: run only these of the brains.
         n_episodes: number of episodes of each brain.
-        episodes: run only these, by number, for example `[17]`: each is what it is in the whole run.
-        seed: every episode's seed follows from this and its number.
-        split: `held_out`, `validation` or `train`: which set of seeds.
-        baseline: name of the brain that the others are compared with; the first one if nothing.
-        n_envs: simulations that run side by side; changes the speed and nothing else.
-        threads: threads that step the physics; all processors if nothing.
-        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
-        ray: which cluster, and how much of it.
-        videos: how many failures of each brain get a video, the first ones; of a brain without failures its first
-            episode. If nothing, 2 where images can be rendered, and none elsewhere.
-        record: where the runs are recorded, if they are.
+        episodes: run only these, by number, for example `[17]`: each is the same as in the whole run.
+        seed: run seed, from which, with its number, each episode's seed is computed.
+        split: set of seeds: `held_out`, `validation` or `train`.
+        baseline: name of the brain with which the others are compared; by default the first.
+        n_envs: number of parallel simulations; changes only the speed.
+        threads: threads that step the physics; by default one for each processor.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes only the speed.
+        ray: the cluster, and the share of it that is used.
+        videos: number of failures of each brain with a video, earliest first; a brain without failures gets one of its
+            first episode. By default 2 if images can be rendered, otherwise none.
+        record: datasets in which the runs are recorded, if any.
         fail_below: end with exit status 1 if the lower end of a brain's 95 % interval of success is below this. It does
             not apply to `noop` and `random`.
-        output_dir: folder for results and report; a new one in `outputs/eval` if nothing.
+        output_dir: folder for results and report; by default a new one in `outputs/eval`.
     """
 
     robot: RobotConfig

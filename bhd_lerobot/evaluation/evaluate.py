@@ -30,7 +30,7 @@ from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.preview import Preview
-from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
+from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_notes, progress_bars
 from bhd_lerobot.rollout.provenance import versions
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
@@ -68,15 +68,15 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         if one.perception is not None:
             console.print(escape(f"{label}: {perception_sentence(one.perception)}"), soft_wrap=True)
     if result.estop is not None:
-        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was begun.")
+        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was started.")
     if result.fault is not None:
         console.print(
-            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was begun."
+            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was started."
         )
     if results.is_partial:
         by = f" by {result.stopped_by.name}" if result.stopped_by else ""
-        again = " The same command runs those that are missing." if config.record.repo_id else ""
-        console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.{again}")
+        again = " The same command runs the missing episodes." if config.record.repo_id else ""
+        console.print(f"Stopped{by}: the results are partial, with all finished episodes.{again}")
     for label in result.missed:
         low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
         console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
@@ -144,7 +144,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         pool = None if config.engine == "local" else cluster.enter_context(open_pool(config.ray, console))
         runs = [prepare(config, label, robots, pool) for label in config.chosen]
-        print_refusals(robots, console)
+        print_notes(robots, console)
         if (
             pool is None
             and robots.camera_shapes
@@ -175,7 +175,8 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
-        fault = robots.problem if any(brain_run.loop.fault for brain_run in runs) else None
+        faulty = [brain_run.loop for brain_run in runs if brain_run.loop.fault]
+        fault = faulty[0].problem or robots.problem if faulty else None
     results = summarise(
         facts,
         _versions(),

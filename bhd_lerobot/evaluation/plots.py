@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, PairedSummary
@@ -199,6 +200,7 @@ def _draw_rows(axes: Axes, estimates: Mapping[str, Estimate], title: str, refere
     axes.set_ylim(len(estimates) - 0.5, -0.5)
     axes.set_xlabel(title)
     axes.margins(x=0.08)
+    axes.locator_params(axis="x", nbins=6)
     axes.grid(axis="x", alpha=0.35)
     _bare(axes)
 
@@ -241,7 +243,8 @@ def _bare(axes: Axes) -> None:
 
 def _svg(draw: Callable[[Figure], None], size: tuple[float, float]) -> str:
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=size, layout="constrained")
+        # Room between charts, so that the last number of an axis is not read with the first of the next.
+        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(wspace=0.06))
         draw(figure)
         text = io.BytesIO()
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})

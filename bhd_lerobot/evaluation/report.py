@@ -146,8 +146,8 @@ def _summary(given: ReportInput) -> str:
     privileged = {label for label, one in results.brains.items() if one.privileged}
     if privileged:
         note += (
-            " Privileged state: the brain acts on what the task reports of the simulator's truth "
-            "(<code>observation.environment_state</code>), which no sensor tells."
+            " Privileged state: the brain acts on what the task reports of the simulator's true state "
+            "(<code>observation.environment_state</code>), which no sensor measures."
         )
     drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
     return drawn + table(head, rows, results.config["baseline"], privileged) + f'<p class="note">{note}</p>'
@@ -196,10 +196,10 @@ def _paired(given: ReportInput) -> str:
     ]
     note = (
         f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
-        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also hold "
-        "what rare episodes would do, see ¹ above. p is that of McNemar's "
-        "exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval that "
-        "leaves out the dashed line says that the difference is more than chance"
+        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also "
+        "hold what rare episodes would do, see ¹ above. p is that of McNemar's exact test, two-sided; where it finds "
+        "no difference, the interval of the rates holds 0. An interval that excludes the dashed line shows a "
+        "difference beyond chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
     )
     drawn = chart(plots.paired_forest(results.paired), f"Differences from {baseline} with intervals")
@@ -233,9 +233,9 @@ def _perception(given: ReportInput) -> str:
     head = ["chose an object", "the wrong one", "median error [mm]", "within its 50 % radius", "within its 90 % radius"]
     head += ["objects seen", "kind and colour right", "objects that are none"]
     note = (
-        "Of brains that see for themselves: what they said at the episode's start beside what was true then, in x and "
-        "y. A brain that knows how much it errs is within the radius that it states for 50 % in half of the episodes. "
-        "In brackets Wilson's 95 % intervals."
+        "For brains with perception: their estimates at the episode's start, compared with the true poses, in x and "
+        "y. If a brain's stated errors are calibrated, it is within the radius that it states for 50 % in half of the "
+        "episodes. In brackets Wilson's 95 % intervals."
     )
     return table(head, rows) + f'<p class="note">{note}</p>'
 
@@ -261,8 +261,8 @@ def _safety(given: ReportInput) -> str:
         rows.append((label, [*cells, str(one.estops), str(one.faults), str(one.frames)]))
     head = [f"{name} limited" for name in limits] + [f"watchdog: {name.replace('_', ' ')}" for name in watchdogs]
     note = (
-        "Share of the frames in which the safety filter changed the command, by kind of limit, and in which a watchdog "
-        "noticed something; kinds that never occurred are left out. Emergency stops and faults count episodes."
+        "Share of the frames in which the safety filter changed the command, by kind of limit, and in which a "
+        "watchdog was triggered; kinds that never occurred are left out. Emergency stops and faults count episodes."
     )
     return table([*head, "emergency stops", "faults", "frames"], rows) + f'<p class="note">{note}</p>'
 

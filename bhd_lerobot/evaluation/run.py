@@ -131,8 +131,8 @@ def _rows_of(recorder: DatasetRecorder, specs: Sequence[EpisodeSpec]) -> dict[in
         then, now = json.loads(row.metadata["versions"]), versions()
         if changed := [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]:
             raise DatasetMismatchError(
-                f"The episodes in {recorder.root} were recorded with {'; '.join(changed)}: with those that are missing "
-                "they would be no evaluation. Set another --record.root, or use the versions of the recording."
+                f"The episodes in {recorder.root} were recorded with {'; '.join(changed)}: the missing episodes would "
+                "not be comparable. Set another --record.root, or use the versions of the recording."
             )
     return wanted
 

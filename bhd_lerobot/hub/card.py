@@ -154,7 +154,7 @@ def _origin(identity: Mapping[str, Any]) -> str:
     text = json.dumps(identity, indent=1, ensure_ascii=False)
     fence = "`" * max(3, 1 + max((len(run) for run in re.findall("`+", text)), default=0))
     return (
-        "## What made it\n\nRobot, task and brain with all their parameters, seed and video settings, from "
+        "## How it was recorded\n\nRobot, task and brain with all their parameters, seed and video settings, from "
         f"`meta/bhd.json`:\n\n<details>\n<summary>configuration</summary>\n\n{fence}json\n{text}\n{fence}\n\n</details>"
     )
 

@@ -103,7 +103,7 @@ def _curves(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] |
     axes.set_xlabel("time [s]")
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue(), f"Episode {index}: what was observed, and the actions"
+    return buffer.getvalue(), f"Episode {index}: observations and actions"
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

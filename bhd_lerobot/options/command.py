@@ -135,7 +135,8 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             command: argparse.ArgumentParser = getattr(options, "command_parser", self)
             if not unknown[0].startswith("-"):
-                command.error(f"there is an argument too many: {' '.join(unknown)}")
+                remedy = command.get_default("too_many")
+                command.error(f"unexpected argument: {' '.join(unknown)}{f'. {remedy}' if remedy else ''}")
             valid = set(re.findall(r"(?<![\w-])--[\w-]+", command.format_help()))
             command.error(unknown_name("option", unknown[0].partition("=")[0], valid))
         return options

@@ -21,6 +21,7 @@ import draccus
 import yaml
 
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+from bhd_lerobot.options.plugins import load_lerobot
 
 CONFIG_PATH = "config_path"
 RUN_CONFIG = "config.yaml"
@@ -153,12 +154,15 @@ def read_file(path: Path) -> dict[str, Any]:
 
 
 def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:
-    fields = {name: kind for name, kind, _ in options_of(config_class)}
+    fields = {name: (kind, default) for name, kind, default in options_of(config_class)}
     for key, value in values.items():
         if key not in fields:
             valid = [f"{prefix}{name}" for name in fields] + ([] if prefix else [CONFIG_PATH])
             raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
-        values[key] = _checked(f"{prefix}{key}", value, fields[key])
+        kind, default = fields[key]
+        of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
+        given = {"type": default.get_choice_name(type(default)), **value} if of_default else value
+        values[key] = _checked(f"{prefix}{key}", given, kind)
     for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not choices_of(kind):
@@ -183,8 +187,10 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
             given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
             raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(sorted(choices))}.")
         if chosen not in choices:
+            choices = choices_of(kind, of_lerobot=True)
+        if chosen not in choices:
             raise ConfigError(
-                f"{unknown_name(f'{key}.type', chosen, choices)} One that a module of yours registers: "
+                f"{unknown_name(f'{key}.type', chosen, choices)} To use one that your module registers: "
                 f"--{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}
@@ -264,7 +270,7 @@ def _keyed(names: Iterable[Any], kind: Any) -> type:
     """Return a class with a field for each name: what a mapping from these names has to hold."""
     for name in names:
         if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
-            raise ConfigError(f"{name!r} is no name: names are made of letters, digits and underscores.")
+            raise ConfigError(f"{name!r} is not a valid name: names consist of letters, digits and underscores.")
     return dataclasses.make_dataclass("Entries", [(name, kind) for name in names])
 
 
@@ -272,13 +278,23 @@ def _allows_none(kind: Any) -> bool:
     return type(None) in typing.get_args(kind)
 
 
-def choices_of(kind: Any) -> dict[str, type]:
-    """Return the registered classes of a choice type, or of one that may be nothing; empty if it is none."""
+def choices_of(kind: Any, *, of_lerobot: bool = False) -> dict[str, type]:
+    """Return the registered classes of a choice type, or of one that may be nothing; empty if it is none.
+
+    Args:
+        kind: the type.
+        of_lerobot: import what LeRobot itself has to choose from, robots, teleoperators or cameras, which takes a
+            moment; of a type without any choice that is always done.
+    """
     if _allows_none(kind) and len(typing.get_args(kind)) == 2:
         kind = typing.get_args(kind)[0]
-    if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
-        return kind.get_known_choices()
-    return {}
+    if not (isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry)):
+        return {}
+    known = kind.get_known_choices()
+    if of_lerobot or not known:
+        load_lerobot(getattr(kind, "lerobot_package", kind.__module__))
+        known = kind.get_known_choices()
+    return known
 
 
 def _cause(error: BaseException) -> BaseException:

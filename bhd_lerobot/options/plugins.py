@@ -5,7 +5,9 @@ one with an entry point of the group `ENTRY_POINTS`, or a module that a command 
 ``--….discover_packages_path``. It registers what it has while it is imported.
 """
 
+import contextlib
 import importlib
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -31,7 +33,7 @@ def load_plugins(report: Callable[[str], object] | None = None) -> None:
     """Import every plug-in that is installed, once; report those that fail, on standard error if None."""
     for name, reason in import_plugins():
         if reason:
-            text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
+            text = f"The plug-in {name} cannot be imported, and its robots, tasks and brains are missing: {reason}"
             report(text) if report else print(f"warning: {text}", file=sys.stderr)
 
 
@@ -49,10 +51,28 @@ def import_plugins() -> Iterator[tuple[str, str]]:
         yield name, reason
 
 
+def load_lerobot(module: str) -> None:
+    """Import all of LeRobot's robots, teleoperators or cameras, which register themselves.
+
+    One whose driver is not installed is left out: it says what it needs when it is made.
+
+    Args:
+        module: `lerobot.robots`, `lerobot.teleoperators`, `lerobot.cameras`, or a module in one of them; nothing is
+            done for others.
+    """
+    package = ".".join(module.split(".")[:2])
+    if package not in ("lerobot.robots", "lerobot.teleoperators", "lerobot.cameras"):
+        return
+    for found in pkgutil.iter_modules(importlib.import_module(package).__path__, f"{package}."):
+        if found.ispkg:
+            with contextlib.suppress(Exception):  # whatever a driver raises while it is imported
+                importlib.import_module(found.name)
+
+
 def misnamed() -> list[tuple[str, str]]:
     """Return the distributions that LeRobot passes over although they look like plug-ins, and why."""
     return [
-        (name, f"LeRobot wants a name with underscores, {name.replace('-', '_')!r}.")
+        (name, f"LeRobot expects a name with underscores, {name.replace('-', '_')!r}.")
         for name in map(_name_of, metadata.distributions())
         if name.replace("-", "_").startswith(PREFIXES) and not name.startswith(PREFIXES)
     ]
@@ -75,7 +95,7 @@ def load_named(arguments: Sequence[str]) -> list[str]:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             here = Path(f"{name}.py").is_file() or Path(name, "__init__.py").is_file()
             remedy = (
-                "Give a module that Python finds: one that is installed, or in a folder of PYTHONPATH."
+                "Give a module that Python can find: an installed one, or one in a folder of PYTHONPATH."
                 if not (isinstance(error, ModuleNotFoundError) and error.name == name and here)
                 else "It is in this folder, where Python does not look: write PYTHONPATH=. before the command."
             )

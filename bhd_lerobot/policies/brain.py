@@ -87,6 +87,7 @@ class RobotFeatures:
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
         body: the robot's hardware; None if it is not known.
         cameras: image shapes (height, width, channels) [px] by camera name; None if they are not known.
+        robot_type: the robot's type; nothing if it is not known.
     """
 
     observation_names: Sequence[str]
@@ -95,6 +96,7 @@ class RobotFeatures:
     environment_names: Sequence[str] = ()
     body: Body | None = None
     cameras: Mapping[str, tuple[int, int, int]] | None = None
+    robot_type: str = ""
 
 
 class Brain(Protocol):

@@ -103,7 +103,7 @@ class TrainedConfig(PreTrainedConfig):
         """Refuse columns that are not known, or not among the `width` columns of the state."""
         if self.ignore and not self.ignored_columns:
             raise ConfigError(
-                f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
+                f"policy.ignore is {self.ignore}, but the names of the columns of {OBS_STATE} are unknown: make the "
                 "policy with the metadata of its dataset, or give policy.ignored_columns."
             )
         if not all(0 <= column < width for column in self.ignored_columns):

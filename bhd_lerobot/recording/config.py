@@ -1,7 +1,7 @@
 """Configuration of `bhd-record`."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from lerobot.robots.config import RobotConfig
 
@@ -11,9 +11,16 @@ from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig
+from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.recording.live_view import check_options
-from bhd_lerobot.registry import check_brain, check_robot_and_task
+from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
+from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
+    config_bhd_keyboard_arm,
+    config_bhd_keyboard_base,
+)
 
 
 @dataclass
@@ -21,16 +28,18 @@ class DatasetConfig:
     """What is recorded and where. The names are those of `lerobot-record`.
 
     Attributes:
-        repo_id: name of the dataset on the Hub, `user/name`; `local/` and the folder's name if only `root` is given.
-        root: folder of the dataset; LeRobot's default place if nothing.
+        repo_id: name of the dataset on the Hub, `user/name`; by default `local/` and the folder's name.
+        root: folder of the dataset; by default LeRobot's place for `repo_id`.
         fps: frames a second [Hz]; the robot's own if 0.
-        num_episodes: number of episodes that the dataset holds in the end.
-        episode_time_s: longest duration of an episode [s]; the task's if nothing.
-        language: also write what the brain was doing, and its plan, into LeRobot's column `language_persistent`, for
-            brains with a plan. Off, because PyTorch's own collating and `lerobot-dataset-viz` fail on that column;
-            LeRobot's training knows it.
-        expert_action: also record what the expert would do in every frame, `expert.action`: of the brain `dagger` its
-            expert; of any other rule what it does.
+        num_episodes: total number of episodes in the dataset.
+        reset_time_s: time to set up the scene of a real robot between two episodes [s]; Enter ends it, and a
+            teleoperator drives the robot meanwhile.
+        episode_time_s: maximum duration of an episode [s]; by default the task's.
+        language: also write the brain's plan and its current step into LeRobot's column `language_persistent`, for
+            brains with a plan. Off by default, because PyTorch's collating and `lerobot-dataset-viz` fail on that
+            column; LeRobot's training supports it.
+        expert_action: also record the expert's action in every frame, `expert.action`: with the brain `dagger`, that
+            of its expert; with another rule, the rule's own action.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.
@@ -41,6 +50,7 @@ class DatasetConfig:
     fps: int = 0
     num_episodes: int = 50
     episode_time_s: float | None = None
+    reset_time_s: float = 0.0
     language: bool = False
     expert_action: bool = False
     push_to_hub: bool = False
@@ -48,42 +58,54 @@ class DatasetConfig:
     tags: list[str] = field(default_factory=list)
 
 
+_FPS = 30  # frames a second of a robot whose configuration does not say it, as with LeRobot's recorder [Hz]
+
+
 @dataclass
 class RecordConfig:
-    """Record episodes of a simulated robot, driven by a brain, into a LeRobotDataset.
+    """Record episodes of a robot, driven by a brain or a person, into a LeRobotDataset.
 
     Attributes:
         robot: the robot; its `fps` is the dataset's.
-        dataset: what is recorded and where.
-        brain: what drives the robot.
-        task: what it is to achieve, and where.
-        timing: how unpunctual frames may be, and what becomes of an episode with too many of them.
-        seed: every episode's seed follows from this and its number.
-        split: `train`, `validation` or `held_out`: which set of seeds.
-        n_envs: simulations that run side by side; changes the speed and nothing else.
-        threads: threads that step the physics; all processors if nothing.
-        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
-        ray: which cluster, and how much of it.
+        dataset: contents and place of the dataset.
+        task: the task, and its scenes; `free` by default.
+        brain: the brain that drives the robot.
+        teleop: the teleoperator with which a person drives the robot or, beside a brain, takes over from it; short for
+            `brain.type=teleop`. Any teleoperator of LeRobot and of plug-ins.
+        map: sources of the robot's actions among those of the teleoperator, see the brain `teleop`.
+        processor: function between teleoperator and robot, see the brain `teleop`.
+        gate: limits of what is sent to a robot of another package.
+        timing: tolerance for late frames, and whether an episode with too many of them is rejected.
+        seed: run seed, from which, with its number, each episode's seed is computed.
+        split: set of seeds: `train`, `validation` or `held_out`.
+        n_envs: number of parallel simulations; changes only the speed.
+        threads: threads that step the physics; by default one for each processor.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes only the speed.
+        ray: the cluster, and the share of it that is used.
         resume: continue the dataset at `dataset.root`, or start it if there is none.
-        output_dir: run folder, for the resolved configuration and images; a new one in `outputs/record` if nothing.
-        preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
-        estop_key: space or `e` in the terminal is an emergency stop, `s` ends the episode as a success and `f` as a
-            failure, and with `i` an intervention begins or ends; if nothing, where there is a terminal and the robot
-            runs on the wall clock.
-        estop_signal: this signal is an emergency stop, too: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
-        display_data: show what happens live in Rerun or Foxglove; of robots side by side the first. The names of these
-            options are those of `lerobot-record`.
-        display_mode: where: `rerun` or `foxglove`.
-        display_ip: for `rerun`, where a viewer runs, if not here; for `foxglove`, the interface that it can connect to,
-            127.0.0.1 if nothing.
-        display_port: for `rerun`, the viewer's port, if it does not run here; for `foxglove`, the port that it can
-            connect to, 8765 if nothing.
-        display_compressed_images: send images as JPEG; always so to a viewer that does not run here.
+        output_dir: run folder, for the resolved configuration and images; by default a new one in `outputs/record`.
+        preview_video: make an MP4 of the first episode; by default if images can be rendered.
+        estop_key: space or `e` in the terminal triggers an emergency stop, `s` ends the episode as a success, `f` as a
+            failure, and `i` begins or ends an intervention (Enter, Backspace and Tab with a keyboard teleoperator of
+            ours); by default if there is a terminal and the robot runs on the wall clock.
+        estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
+        display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
+            these options are those of `lerobot-record`.
+        display_mode: viewer: `rerun` or `foxglove`.
+        display_ip: for `rerun`, the address of a viewer on another machine; for `foxglove`, the interface that it can
+            connect to, by default 127.0.0.1.
+        display_port: for `rerun`, the port of a viewer on another machine; for `foxglove`, the port that it can connect
+            to, by default 8765.
+        display_compressed_images: send images as JPEG; always on for a viewer on another machine.
     """
 
     robot: RobotConfig
-    brain: BrainConfig
-    task: TaskConfig
+    task: TaskConfig = field(default_factory=FreeConfig)
+    brain: BrainConfig | None = None
+    teleop: PersonConfig | None = None
+    map: dict[str, Any] = field(default_factory=dict)
+    processor: str = ""
+    gate: GateConfig = field(default_factory=GateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     timing: TimingTolerance = field(default_factory=TimingTolerance)
     seed: int = 0
@@ -110,7 +132,7 @@ class RecordConfig:
                 raise ConfigError("dataset.push_to_hub is true: set --dataset.repo_id=user/name, or leave it out.")
             self.dataset.repo_id = local_name(self.dataset.root)
         check_robot_and_task(self.robot, self.task, "bhd-record")
-        check_brain("brain", self.brain, self.robot.type)
+        self._settle_brain()
         for name, value in (
             ("dataset.num_episodes", self.dataset.num_episodes),
             ("n_envs", self.n_envs),
@@ -118,6 +140,10 @@ class RecordConfig:
         ):
             if value < 1:
                 raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        if not 0 <= self.dataset.reset_time_s < float("inf"):
+            raise ConfigError(
+                f"dataset.reset_time_s is {self.dataset.reset_time_s}; it must be finite and not negative."
+            )
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)
@@ -126,6 +152,10 @@ class RecordConfig:
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot
+        if not is_ours(robot.type):
+            self.dataset.fps = self.dataset.fps or _FPS
+            self._settle_duration()
+            return
         if self.dataset.fps == 0:
             self.dataset.fps = robot.fps
         if robot.fps not in (self.dataset.fps, type(robot).fps):
@@ -135,6 +165,30 @@ class RecordConfig:
             )
         robot.fps = self.dataset.fps
         _ = robot.rates
+        self._settle_duration()
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the robot runs on the wall clock."""
+        return not is_ours(self.robot.type) or cast(Any, self.robot).clock == "realtime"
+
+    def _settle_brain(self) -> None:
+        """Put the teleoperator into the place of the brain, if there is no other."""
+        person = TeleopConfig(self.teleop, self.map, self.processor) if self.teleop is not None else None
+        if person is None and (self.map or self.processor):
+            raise ConfigError("map and processor belong to a teleoperator; set --teleop.type as well.")
+        if self.brain is None:
+            if person is None:
+                raise ConfigError("Nothing drives the robot; set --brain.type, or --teleop.type for a person.")
+            self.brain, self.teleop, self.map, self.processor = person, None, {}, ""
+        check_brain("brain", self.brain, self.robot.type)
+        if (self.teleop is not None or isinstance(self.brain, TeleopConfig)) and not self.is_live:
+            raise ConfigError(
+                "A person drives on the wall clock, and robot.clock is 'lockstep', on which time advances as fast as "
+                "this machine can simulate. Add --robot.clock=realtime."
+            )
+
+    def _settle_duration(self) -> None:
         if self.dataset.episode_time_s is not None:
             if not 0 < self.dataset.episode_time_s < float("inf"):
                 raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
@@ -142,6 +196,7 @@ class RecordConfig:
             if chosen.duration_s not in (type(chosen).duration_s, self.dataset.episode_time_s):
                 raise ConfigError(
                     f"task.duration_s is {chosen.duration_s} and dataset.episode_time_s is "
-                    f"{self.dataset.episode_time_s}. Both say how long an episode may take; set them alike, or one."
+                    f"{self.dataset.episode_time_s}. Both limit an episode's duration; set one of them, or both to the "
+                    "same value."
                 )
             chosen.duration_s = self.dataset.episode_time_s

@@ -128,8 +128,8 @@ class LiveView:
                 self._extras = RerunExtras(self._cameras, self._range_max)
         except Exception as error:  # of libraries that are not ours: a port in use, a package that does not fit
             raise ConfigError(
-                f"--display_data=true: {options.display_mode} could not be started: {error}. Repair that, choose "
-                "another --display_mode or --display_port, or leave --display_data out."
+                f"--display_data=true: {options.display_mode} could not be started: {error}. Fix that, choose another "
+                "--display_mode or --display_port, or leave --display_data out."
             ) from error
 
     def __call__(self, sim: int, columns: Mapping[str, Any]) -> None:

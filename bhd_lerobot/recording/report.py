@@ -3,7 +3,6 @@
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -81,13 +80,12 @@ class RecordResult:
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
     """Print what the run did; `video` reports whether it left a video."""
-    robot: Any = config.robot
     table = Table(title="Recorded", show_header=False, title_justify="left")
     table.add_row("dataset", counted(result.episodes, "episode"))
     table.add_row(
         "this run",
         f"{counted(result.recorded, 'episode')}, {counted(result.frames, 'frame')}, {result.simulated_s:.0f} s"
-        f"{' simulated' if robot.clock == 'lockstep' else ''}",
+        f"{' simulated' if not config.is_live else ''}",
     )
     if result.recorded:
         table.add_row("success", f"{result.successes} of {result.recorded}")
@@ -101,7 +99,7 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         )
     files = [
         "config.yaml",
-        *(["trajectories.png"] if result.recorded else []),
+        *(["trajectories.png"] if (result.output_dir / "trajectories.png").is_file() else []),
         *(["episode.mp4", "episode.png"] if video else []),
     ]
     table.add_row("files", ", ".join(files))
@@ -111,19 +109,19 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
     if result.estop is not None:
         console.print(
             f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
-            "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
+            "outcome 'estop', and no other was started. Clear the cause and continue with --resume=true."
         )
     if result.fault is not None:
         console.print(
             f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] The episode that was running is saved "
-            "with the outcome 'fault', and no other was begun. Clear the cause and go on with --resume=true."
+            "with the outcome 'fault', and no other was started. Clear the cause and continue with --resume=true."
         )
     if result.stopped_by:
         console.print(
             f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
-            "Go on with --resume=true: the dropped ones are run again, the same."
+            "Continue with --resume=true: the dropped ones are repeated identically."
         )
 
 
 def _clock(config: RecordConfig) -> str:
-    return "on the wall clock" if config.robot.clock == "realtime" else f"n_envs = {config.n_envs}"
+    return "on the wall clock" if config.is_live else f"n_envs = {config.n_envs}"

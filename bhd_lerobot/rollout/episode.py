@@ -13,6 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import BrainStoppedError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -38,14 +39,17 @@ class EpisodeLoop:
     recorded action, applied again, is exactly the action that was applied.
 
     Attributes:
+        before_start: called before an episode starts, with its specification: a person may have to set up its scene.
         observer: receives every frame of every simulation, and every image; None if there is none.
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
-        fault: whether a real robot's fault has.
+        fault: whether a real robot's fault has, or a brain that has stopped.
+        problem: why the brain has stopped, as text; empty if it has not.
         marks: takes the marks of a person for the running episodes.
         act_times: how long each call of the brain's `act` took [s].
     """
 
     observer: Observer | None = None
+    before_start: Callable[[EpisodeSpec], None] | None = None
 
     def __init__(
         self,
@@ -57,6 +61,7 @@ class EpisodeLoop:
         self.robots, self.task, self.brain = robots, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = self.fault = False
+        self.problem = ""
         self.marks = Marks(robots.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
@@ -78,6 +83,7 @@ class EpisodeLoop:
                 environment,
                 robots.body,
                 robots.camera_shapes,
+                robots.config.type,
             )
         )
 
@@ -112,12 +118,15 @@ class EpisodeLoop:
                 if stop():
                     return
                 finished = self._frame()
+                if self.marks.take_again() and not finished:
+                    self._take_again(waiting)
+                    continue
                 for sim, event in finished:
                     episode = self._finish(sim, event)
                     done[episode.spec.index] = episode
                     self.emergency_stop |= event == Event.ESTOP
                     # A person finds out why a real robot stopped before it moves again.
-                    self.fault |= event == Event.FAULT and self.robots.world is None
+                    self.fault |= event == Event.FAULT and (self.robots.world is None or bool(self.problem))
                 if not finished:
                     continue
                 ids = np.array([sim for sim, _ in finished])
@@ -132,6 +141,16 @@ class EpisodeLoop:
                 if episode.writer is not None:
                     episode.writer.discard()
 
+    def _take_again(self, waiting: list[EpisodeSpec]) -> None:
+        """Discard the running take of the first robot, and start it again."""
+        first, spec = np.zeros(1, np.intp), self._specs[0]
+        if spec is None or not self.robots.running[0]:
+            return
+        self.robots.stop(first)
+        self._images.drop(0)
+        waiting.append(spec)
+        self._start(first, waiting)
+
     def _start(self, ids: NDArray[np.intp], waiting: list[EpisodeSpec]) -> None:
         """Start the next episodes in idle simulations."""
         ids = ids[: len(waiting)]
@@ -142,6 +161,8 @@ class EpisodeLoop:
         if self.emergency_stop or self.fault:
             waiting.clear()
             return
+        if self.before_start is not None:
+            self.before_start(waiting[-1])
         specs = [waiting.pop() for _ in ids]
         scenes = [self.task.sample(spec.seed) for spec in specs]
         states = self.robots.reset(ids, scenes, [spec.seed for spec in specs])
@@ -182,11 +203,13 @@ class EpisodeLoop:
             robots.running,
         )
         started = time.perf_counter()
-        command = brain.act(seen)
+        try:
+            command = in_single_precision(brain.act(seen))
+        except BrainStoppedError as error:
+            command, self.problem = None, str(error)
         self.act_times.append(time.perf_counter() - started)
         # On the lockstep clock time stands still during inference.
         inference_time = np.full(robots.n, 0.0 if robots.clock is None else self.act_times[-1])
-        command = in_single_precision(command)
         report = robots.step(command)
         self._log(command, report)
         if brain.has_plan:
@@ -221,6 +244,8 @@ class EpisodeLoop:
         reward, event = self.task.judge(self._truth, robots.running)
         event = add_faults(event, report.mode, robots.running)
         event, driven = self.marks.frame(event, robots.running)
+        if self.problem:
+            event = np.where(robots.running & (event == Event.NOTHING), int(Event.FAULT), event)
         taken = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
             keys.ACTION: report.requested.astype(np.float32),

@@ -208,15 +208,16 @@ def draw_divergence(
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)
     columns = figure.add_gridspec(1, 2, width_ratios=(1, 1.3))
-    left, rows = figure.add_subplot(columns[0]), columns[1].subgridspec(len(curves), 1)
+    above, differences = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
+    left, rows = above.subplots(), differences.subplots(len(curves), 1, squeeze=False)[:, 0]
     draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
     left.plot(replayed[:, 0], replayed[:, 1], color=_BAD, linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False, fontsize=9)
-    figure.supylabel("largest difference between replay and recording", fontsize=9, x=0.41)
+    differences.supylabel("largest difference between replay and recording", fontsize=9)
     for row, (label, values) in enumerate(curves.items()):
-        axes = figure.add_subplot(rows[row])
+        axes = rows[row]
         axes.plot(time, values, color=_BAD, linewidth=1.3)
         axes.set_title(label, fontsize=9, loc="left")
         axes.grid(alpha=0.3)

@@ -1,7 +1,6 @@
 """What every run of episodes shows in the terminal, and its exit status."""
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bhd_lerobot.robots.host.robots import Robots
@@ -22,10 +21,7 @@ def progress_bars(console: Console, *fields: str) -> Progress:
     )
 
 
-def print_refusals(robots: Robots, console: Console) -> None:
-    """Print what the system refused the real-time process, and the remedy."""
-    grants = robots.clock.grants if robots.clock is not None else None
-    for grant in (grant for grant in grants or () if not grant["granted"]):
-        console.print(
-            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
-        )
+def print_notes(robots: Robots, console: Console) -> None:
+    """Print what has to be known of the robots before they move."""
+    for note in robots.notes:
+        console.print(note, soft_wrap=True, highlight=False)

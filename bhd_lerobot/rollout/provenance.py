@@ -122,13 +122,15 @@ def scene_to_json(scene: Any) -> str:
                 **({"report_seed": scene.report_seed} if scene.report_seed else {}),
             }
         )
-    return _json(asdict(scene))
+    return "null" if scene is None else _json(asdict(scene))
 
 
 def scene_from_json(text: str) -> Any:
-    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`."""
+    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`; None if it is not known."""
     try:
         scene = json.loads(text)
+        if scene is None:
+            return None
         if "shapes" in scene:
             shapes = tuple(Shape(*row) for row in scene["shapes"])
             goal = tuple(scene["goal"]) if "goal" in scene else None

@@ -259,7 +259,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             "observation, largest": result.observation,
         }
         time = np.arange(len(result.state)) / episode.fps
-        heading = f"Episode {config.dataset.episode}, replay mode {mode}"
+        heading = f"Episode {config.dataset.episode}, replay of the {mode.replace('_', ' ')}"
         path = folder / f"episode_{config.dataset.episode:06d}_{mode}.png"
         draw_divergence(
             scene=episode.scene,

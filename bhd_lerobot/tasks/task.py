@@ -21,6 +21,7 @@ class TaskConfig(draccus.ChoiceRegistry):
 
 _OWN: dict[str, Any] = {
     "avoid": "bhd_lerobot.tasks.avoid:AvoidTask",
+    "free": "bhd_lerobot.tasks.free:FreeTask",
     "navigate": "bhd_lerobot.tasks.navigate:NavigateTask",
     "pick": "bhd_lerobot.tasks.pick:PickTask",
     "reach": "bhd_lerobot.tasks.reach:ReachTask",

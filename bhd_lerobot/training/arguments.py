@@ -71,7 +71,7 @@ def _resumed(path: Path, output_dir: Any) -> Path:
         if run is None or not (run / CHECKPOINTS_DIR).is_dir():
             raise
         raise ConfigError(
-            f"{error} To go on with the run in {run}: bhd-train --resume=true --config_path={shlex.quote(str(run))}"
+            f"{error} To continue the run in {run}: bhd-train --resume=true --config_path={shlex.quote(str(run))}"
         ) from None
 
 

@@ -24,19 +24,18 @@ STATISTICS = ("checkpoint", "dataset")
 
 @dataclass
 class SelectionConfig:
-    """Which frames are learned from.
+    """Selection of the frames to train on.
 
     Attributes:
-        outcome: episodes that ended so: `all`, or events that an episode can end with, such as `success`.
-        min_score: episodes with at least this score, 0 to 1; any if nothing.
+        outcome: episodes with these outcomes: `all`, or events that an episode can end with, such as `success`.
+        min_score: episodes with at least this score, 0 to 1; by default any.
         exclude_late: leave out episodes with more late frames than their recording tolerated.
-        intervention_weight: how often frames in which someone intervened are drawn, compared with others; 0 drops
-            them.
-        learner_weight: how often frames are drawn that a learner drove while someone could have intervened, compared
-            with others; 0 drops them: what is learned is what the expert did.
-        expert_action: learn what the expert would have done in every frame, `expert.action`, in place of what was done.
-        hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,
-            of each instruction's, and at least one of each, as `lerobot-train` does.
+        intervention_weight: sampling weight of frames in which someone intervened, relative to others; 0 drops them.
+        learner_weight: sampling weight of frames that a learner drove while someone could have intervened, relative to
+            others; 0 drops them, so that only the expert's own driving is learned.
+        expert_action: learn the expert's action of every frame, `expert.action`, instead of the executed one.
+        hold_out: unit of `dataset.eval_split`: `episode`, a share of all episodes; `instruction`, a share of each
+            instruction's episodes, at least one of each, as `lerobot-train` does.
     """
 
     outcome: list[str] = field(default_factory=lambda: ["all"])
@@ -74,18 +73,18 @@ class BhdTrainConfig(TrainPipelineConfig):
     `policy.push_to_hub` is true only if it was set.
 
     Attributes:
-        selection: which frames are learned from.
-        budget_gib: memory that the dataset may take as tensors [GiB]; beyond it LeRobot's own loader is used.
+        selection: the frames to train on.
+        budget_gib: memory for the dataset as tensors [GiB]; a larger dataset is read by LeRobot's own loader.
         fine_tune: checkpoint to start from: a folder, or a name on the Hub. Like `policy.path`, but the dataset is
-            checked against what the checkpoint was trained on.
-        fine_tune_statistics: with `fine_tune`, by which statistics observations and actions are normalised: those of
-            the `checkpoint`, which keep the meaning of its weights, or those of the `dataset`.
-        fine_tune_parameters: which of the policy's parameters are trained, by name or pattern; the others stay as they
-            are. `["*.bias"]` changes so little that a few episodes suffice for a shift (E. Ben Zaken et al., "BitFit",
-            2022).
-        fine_tune_camera: with `fine_tune` of a policy that knows where its camera stands, find out from the dataset
-            where it stands now, and begin with that.
-        threads: threads of a training process on the CPU; PyTorch's own number if nothing. The last bits of a loss
+            checked against the checkpoint's training data.
+        fine_tune_statistics: with `fine_tune`, the statistics that normalise observations and actions: those of the
+            `checkpoint`, which keep the meaning of its weights, or those of the `dataset`.
+        fine_tune_parameters: the policy's parameters that are trained, by name or pattern; the others are not
+            changed. `["*.bias"]` changes so little that a few episodes suffice for a shift (E. Ben Zaken et al.,
+            "BitFit", 2022).
+        fine_tune_camera: with `fine_tune` of a policy that models its camera's pose, first estimate the present pose
+            from the dataset.
+        threads: threads of a training process on the CPU; by default PyTorch's number. The last bits of a loss
             depend on it.
     """
 

@@ -67,7 +67,7 @@ class RunOutput:
         self.draw(step)
         config = self._config
         if config.save_checkpoint_to_hub and config.policy is not None:
-            again = f"When that is repaired, go on with:\n  {checkpoint.resume_command(self.checkpoint)}"
+            again = f"When that is repaired, continue with:\n  {checkpoint.resume_command(self.checkpoint)}"
             with self._uploading(str(config.policy.repo_id), "The checkpoint", again):
                 push_checkpoint_to_hub(self.checkpoint, config.policy.repo_id, private=config.policy.private)
         if self._wandb is not None:

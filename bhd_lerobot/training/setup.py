@@ -155,8 +155,8 @@ def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
     for name, value in given.items():
         if value is _DIFFERS or np.any(np.asarray(value, float)):
             raise DatasetError(
-                f"{meta.root} was recorded with task.{name} = {value}: what it says of the objects is not true, and a "
-                f"{policy.type!r} would learn to say that. Record it without."
+                f"{meta.root} was recorded with task.{name} = {value}: its object poses are not the true ones, and a "
+                f"{policy.type!r} would learn them. Record it without this option."
             )
 
 
@@ -215,7 +215,7 @@ def fit_camera(policy: Any, loader: Loader, prepare: Callable[[Batch], Batch], *
             "'bhd_perception' does. Leave it out."
         )
     if processes > 1:
-        raise ConfigError(f"fine_tune_camera is for one process; {processes} would each find something else.")
+        raise ConfigError(f"fine_tune_camera is for one process; {processes} would each find a different result.")
     state = loader.state_dict()
     found = policy.fit_camera([prepare(batch) for batch in islice(loader, _BATCHES)])
     loader.load_state_dict(state)

@@ -65,7 +65,7 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
     lines = []
     if result.stopped_by:
         lines.append(
-            f"Stopped by {result.stopped_by.name}. " + ("Go on with:" if result.checkpoint else "Nothing saved.")
+            f"Stopped by {result.stopped_by.name}. " + ("Continue with:" if result.checkpoint else "Nothing saved.")
         )
         if result.checkpoint is not None:
             lines.append(f"  {resume_command(result.checkpoint)}")
@@ -103,11 +103,11 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
         rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
-        return ["Let it drive the robot for a minute with:", f"  {rollout}"]
+        return ["Run it on the robot for a minute with:", f"  {rollout}"]
     text, usual = "Evaluate it with:", {}
     if task is None:
         task, found = tasks_for(contract.robot_type)[0], {}
-        text = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
+        text = f"The dataset does not record its task. Evaluate it in simulation at {task!r}, for example, with:"
     elif task in TaskConfig.get_known_choices():
         chosen = TaskConfig.get_choice_class(task)
         usual = asdict(chosen())

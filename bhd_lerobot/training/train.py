@@ -145,7 +145,7 @@ def _run(
     if config.checkpoint_path:
         loop.load_state_dict(step, state)
     if step >= config.steps:
-        raise ConfigError(f"The run has done {step} of {config.steps} steps. To go on, set more with --steps.")
+        raise ConfigError(f"The run has done {step} of {config.steps} steps. To continue, set more with --steps.")
     is_main = accelerator.is_main_process
     output = RunOutput(config, parts, step, is_main=is_main, processes=accelerator.num_processes)
     print_start(console, config, parts.policy, data, step)

@@ -80,7 +80,7 @@ def test_a_cluster_that_does_not_exist_is_reported_soon(tmp_path, monkeypatch):
         for address, message in (
             (f"127.0.0.1:{unused}", "cannot be reached"),
             (f"127.0.0.1:{mute.getsockname()[1]}", "does not answer"),
-            (f"127.0.0.1:{other.getsockname()[1]}", "is no Ray cluster"),
+            (f"127.0.0.1:{other.getsockname()[1]}", "is not a Ray cluster"),
             ("no-such-host.invalid:6379", "cannot be reached"),
         ):
             with pytest.raises(ClusterError, match=message) as error:

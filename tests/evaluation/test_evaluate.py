@@ -221,7 +221,7 @@ def test_partial_results_of_the_same_evaluation_are_completed_and_no_others(whol
         )
         result, printed = run_eval(tmp_path / "e", **recorded)
     assert result.exit_status == 143
-    assert "The same command runs those that are missing." in printed
+    assert "The same command runs the missing episodes." in printed
     assert "--resume" not in printed
     with pytest.raises(ConfigError, match="holds the results of an evaluation"):
         run_eval(tmp_path / "e", **{**recorded, "seed": 1})

@@ -145,7 +145,7 @@ def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(kind: str, options: 
         ("bhd_mlp", {"scan": ScanConfig(beams=4)}, "give both or neither"),
         ("bhd_mlp", {"ignore": ["*.vle"]}, "'*.vle' matches no number of observation.state: x.vel, scan_000"),
         ("bhd_mlp", {"ignored_columns": [3, 10]}, "has the columns 0 to 9"),
-        ("bhd_mlp", {"environment": 0, "ignore": ["*"]}, "leaves nothing"),
+        ("bhd_mlp", {"environment": 0, "ignore": ["*"]}, "leaves no input"),
         ("bhd_mlp", {"yaw_harmonics": 2}, "no quaternion"),
         ("bhd_mlp", {"yaw_harmonics": 2, "environment_quaternions": [0]}, "do not fit into the 3"),
         ("bhd_mlp", {"sort_objects": True}, "object_0_present"),

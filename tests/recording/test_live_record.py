@@ -247,7 +247,7 @@ def test_a_press_between_two_episodes_begins_no_other(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"estop_signal": "SIGINT"}, "'SIGINT'. Valid: SIGUSR1"),
-        ({"estop_key": "true"}, "standard input is no terminal"),
+        ({"estop_key": "true"}, "standard input is not a terminal"),
     ],
 )
 def test_an_input_that_cannot_be_is_refused_before_anything_is_written(tmp_path, change, message):

@@ -12,7 +12,6 @@ from bhd_lerobot.cli.replay import main
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
-from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.rollout.replay import Replay, ReplayConfig
 from tests.recording.support import run_record
 
@@ -126,20 +125,14 @@ def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_pat
         Replay(tmp_path / "other", 0)
 
 
-class FollowsGoalsLater(ReachBrain):
-    """Holds by setpoints for 10 frames, then gives goals."""
-
-    def act(self, observation):
-        self.frame = getattr(self, "frame", -1) + 1
-        if self.frame < 10:
-            self.start = observation.state[:, :7] if self.frame == 0 else self.start
-            return self.start
-        return super().act(observation)
-
-
 def test_an_episode_of_setpoints_and_goals_as_version_0_3_recorded_it_is_repeated(tmp_path, monkeypatch):
-    root = tmp_path / "d"
-    monkeypatch.setattr(record_module, "make_brain", FollowsGoalsLater)
+    root, held, give_goals = tmp_path / "d", [], ReachBrain.act
+
+    def hold_first(self, observation):
+        held.append(observation.state[:, :7])
+        return held[0] if len(held) <= 10 else give_goals(self, observation)
+
+    monkeypatch.setattr(ReachBrain, "act", hold_first)
     arm = {"robot__type": "ur5", "robot__beams": None, "task__type": "reach", "brain__type": "reach"}
     run_record(root, **arm, dataset__num_episodes=1)
     frames = len(Replay(root, 0).columns["action"])

@@ -59,7 +59,7 @@ def test_options_at_their_defaults_are_not_repeated() -> None:
 
 def test_a_robot_that_is_not_simulated_is_driven_by_lerobot() -> None:
     said, command = how_to_evaluate(PolicyContract(robot_type="so101_follower"), "c")
-    assert "drive the robot" in said
+    assert "on the robot for a minute" in said
     assert command == "  lerobot-rollout --robot.type=so101_follower --policy.path=c/pretrained_model --duration=60"
 
 
@@ -108,6 +108,6 @@ def test_the_command_after_every_recipe_evaluates_whole_episodes_of_its_task(rec
 @pytest.mark.parametrize("robot", [TurtleBot3Config(), UR5Config()])
 def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robot) -> None:
     said, command = how_to_evaluate(PolicyContract(robot_type=robot.type), "c")
-    assert "does not say its task" in said
+    assert "does not record its task" in said
     config = parse(EvalConfig, [*shlex.split(command)[1:], "--brain.type=learned"])
     assert is_for(robot_of_task(config.task), robot.type)

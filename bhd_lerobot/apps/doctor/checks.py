@@ -29,7 +29,7 @@ from bhd_lerobot.realtime.privileges import (
 from bhd_lerobot.versions import DISTRIBUTION, required_versions
 
 ROBOTS = ("turtlebot3", "ur5")
-TELEOPERATORS = ("bhd_brain",)
+TELEOPERATORS = ("bhd_brain", "bhd_keyboard_arm", "bhd_keyboard_base")
 
 # Of the period, for the latest wake-up. What is lost to waiting is lost to the tick: beyond a half, one of a quarter of
 # the period has no reserve.
@@ -202,7 +202,7 @@ def check_throttling(folder: Path = Path("/proc/sys/kernel")) -> list[Finding]:
     try:
         runtime, period = (int((folder / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
     except (OSError, ValueError) as error:
-        return [fine("RT throttling", f"this kernel does not say ({error})")]
+        return [fine("RT throttling", f"not reported by this kernel ({error})")]
     if runtime < 0:
         return [wrong("throttling.off", "off")]
     share = runtime / period
@@ -217,7 +217,7 @@ def check_clock(folder: Path = Path("/sys/devices/system/clocksource/clocksource
         source = (folder / "current_clocksource").read_text().strip()
         others = (folder / "available_clocksource").read_text().split()
     except OSError as error:
-        return [fine("clock source", f"this kernel does not say ({error})")]
+        return [fine("clock source", f"not reported by this kernel ({error})")]
     found = f"{source} (available: {', '.join(others)})"
     if source in _SLOW_CLOCKS:
         return [wrong("clock", found, source=source)]

@@ -96,8 +96,8 @@ def _wrapped(heading: str, text: str, width: int) -> str:
 def _print_latency(measured: dict[str, Any], console: Console) -> None:
     p50, p99, longest = (f"{measured[key] * 1e6:.0f} µs" for key in ("p50", "p99", "max"))
     console.print(
-        f"Wake-up latency over {measured['points']} points at {measured['rate']} Hz: p50 {p50}, p99 {p99}, "
-        f"max {longest}; missed {measured['missed']} points. Measured now, on this load; no promise.",
+        f"Wake-up latency over {measured['points']} points at {measured['rate']} Hz: p50 {p50}, p99 {p99}, max "
+        f"{longest}; missed {measured['missed']} points. Measured now, under the present load; not a guarantee.",
         highlight=False,
     )
     most = max(measured["histogram"])

@@ -163,7 +163,9 @@ def list_plugins() -> dict[str, list[str]]:
         if not error:
             registered.setdefault(name, [])
         else:
-            failed.append(f"The plug-in {name} cannot be imported, and what it has is missing: {error}")
+            failed.append(
+                f"The plug-in {name} cannot be imported, and its robots, tasks and brains are missing: {error}"
+            )
         for kind, registry in kinds.items():
             for choice, config in registry.get_known_choices().items():
                 package = config.__module__.partition(".")[0]

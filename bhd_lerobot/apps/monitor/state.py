@@ -191,8 +191,8 @@ class Sampler:
             # The brain's process asks for both; a loop that finds itself alone has at most one of them.
             if words[Word.END] and words[Word.PAUSE]:
                 return "ended"
-            return "came to rest and ended by itself: its brain's process is gone"
-        return None if self._block.is_held else "is gone without having ended: its processes were killed"
+            return "came to rest and ended by itself: its brain's process has ended"
+        return None if self._block.is_held else "disappeared without ending: its processes were killed"
 
     def sample(self) -> MonitorState:
         """Return what is so now."""

@@ -27,11 +27,11 @@ _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "d
 
 def add_to(commands: Commands) -> None:
     """Add `check`."""
-    help_text = "is a dataset valid? Exit status 0 if it is, 1 if not; changes nothing without --fix"
+    help_text = "validate a dataset; exit status 0 if it is valid, 1 if not; changes nothing without --fix"
     command = add_command(commands, "check", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
-    command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
-    command.add_argument("--no-videos", action="store_true", help="leave the videos out, which take longest")
+    command.add_argument("--strict", action="store_true", help="exit with status 1 for warnings, too")
+    command.add_argument("--no-videos", action="store_true", help="do not check the videos, which takes longest")
     command.add_argument("--fix", action="store_true", help="correct wrong statistics and counts, and check again")
 
 
@@ -47,8 +47,8 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
     """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not."""
     if is_being_written(root):
         raise DatasetLockedError(
-            f"{root} is being recorded or changed at this moment, so it is neither valid nor not. Check it when "
-            "that has ended."
+            f"{root} is being recorded or changed at this moment and cannot be checked. Check it again when that has "
+            "ended."
         )
     found = check_dataset(root, limits_of, videos=videos)
     is_valid = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)

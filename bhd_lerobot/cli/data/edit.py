@@ -14,25 +14,26 @@ from bhd_lerobot.errors import ConfigError
 
 def add_to(commands: Commands) -> None:
     """Add the four commands."""
-    text = "one dataset of the episodes of several, which stay as they are"
+    text = "merge several datasets into a new one; they are not changed"
     command = add_command(commands, "merge", text, _merge, names_dataset=False)
     command.add_argument("roots", metavar="ROOT", nargs="+", type=Path, help="folders of the datasets, in order")
     command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder of the new dataset")
 
-    text = "a dataset of some episodes of another, which stays as it is"
+    text = "copy some episodes of a dataset to a new one; the original is not changed"
     command = add_command(commands, "filter", text, _filter)
-    command.add_argument("--episodes", metavar="LIST", help="among these only, for example 0,3,5-9")
-    text = "with these outcomes, for example success or stuck,timeout; all is every outcome"
+    command.add_argument("--episodes", metavar="LIST", help="only among these episodes, for example 0,3,5-9")
+    text = "only episodes with these outcomes, for example success or stuck,timeout; all is every outcome"
     command.add_argument("--outcome", metavar="NAMES", help=text)
-    command.add_argument("--min_score", metavar="SCORE", type=float, help="with at least this score, 0 to 1")
-    command.add_argument("--exclude_late", action="store_true", help="without those that have too many late frames")
+    text = "only episodes with at least this score, 0 to 1"
+    command.add_argument("--min_score", metavar="SCORE", type=float, help=text)
+    command.add_argument("--exclude_late", action="store_true", help="leave out episodes with too many late frames")
     command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder of the new dataset")
 
     text = "remove episodes from a dataset, in place; the others are renumbered"
     command = add_command(commands, "delete", text, _delete)
-    command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
+    command.add_argument("--episodes", metavar="LIST", required=True, help="episodes, for example 0,3,5-9")
 
-    text = "several datasets of the episodes of one, which stays as it is"
+    text = "split a dataset into several new ones; the original is not changed"
     command = add_command(commands, "split", text, _split)
     command.add_argument(
         "--parts",
@@ -41,11 +42,9 @@ def add_to(commands: Commands) -> None:
         help="names and shares, such as train=0.8,val=0.2, or episodes: train=0-7;val=8,9",
     )
     command.add_argument(
-        "--shuffle_seed", metavar="SEED", type=int, help="deal the episodes out in an order drawn with this seed"
+        "--shuffle_seed", metavar="SEED", type=int, help="shuffle the episodes with this seed before the split"
     )
-    command.add_argument(
-        "--output", metavar="FOLDER", type=Path, required=True, help="folder in which the new datasets come to lie"
-    )
+    command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder for the new datasets")
 
 
 def _merge(options: argparse.Namespace) -> int:
@@ -57,7 +56,7 @@ def _filter(options: argparse.Namespace) -> int:
     root = root_of(options)
     if options.episodes is None and options.outcome is None and options.min_score is None and not options.exclude_late:
         raise ConfigError(
-            "filter needs to know which episodes are wanted: --episodes 0,3,5-9, --outcome success, --min_score 0.5 or "
+            "filter needs a selection of episodes: --episodes 0,3,5-9, --outcome success, --min_score 0.5 or "
             "--exclude_late. With --outcome all it copies them all."
         )
     from bhd_lerobot.datasets.loader.selection import EpisodeFilter, StoredEpisodes  # seconds to import
@@ -71,7 +70,7 @@ def _filter(options: argparse.Namespace) -> int:
 
 def _delete(options: argparse.Namespace) -> int:
     def print_report(report: EditReport) -> None:
-        gone = f"; episodes {options.episodes} are gone, and those behind them have new numbers"
+        gone = f"; episodes {options.episodes} were removed, and those after them have new numbers"
         print(f"{report}{'' if report.is_repeated else gone}", flush=True)
 
     delete(root_of(options), parse_episodes(options.episodes), print_report)

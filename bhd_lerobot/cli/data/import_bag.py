@@ -49,22 +49,24 @@ _REAL = (
 
 def add_to(commands: Commands) -> None:
     """Add `import`."""
-    help_text = "make a dataset of ROS 2 bags: of a real TurtleBot3, or of `bhd-data export`"
+    help_text = "convert ROS 2 bags to a dataset: bags of a real TurtleBot3, or of `bhd-data export`"
     command = add_command(commands, "import", help_text, _run, names_dataset=False)
     command.set_defaults(stopped="no dataset was made")
     command.add_argument("bags", nargs="+", type=Path, help="bags: folders, .mcap or .db3 files, or a folder of bags")
     command.add_argument("--repo_id", required=True, help="name of the dataset, user/name")
     command.add_argument("--root", type=Path, help="where to put it; LeRobot's default place if left out")
-    command.add_argument("--task", help="the instruction, a sentence; exported bags say it themselves")
+    command.add_argument("--task", help="the instruction, a sentence; exported bags contain it")
     command.add_argument("--fps", type=int, help="frames a second (default: 10, or that of the exported dataset)")
-    command.add_argument("--stamps", default="receive", help="whose time counts: receive (default), header or auto")
+    command.add_argument("--stamps", default="receive", help="source of timestamps: receive (default), header or auto")
     command.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
-    command.add_argument("--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (1.0)")
+    command.add_argument(
+        "--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (default: 1.0)"
+    )
     command.add_argument(
         "--min_episode_s", type=float, metavar="S",
-        help="shorter ones are left out (default: 1.0, or 0 for exported bags)",
+        help="shorter episodes are left out (default: 1.0, or 0 for exported bags)",
     )  # fmt: skip
-    command.add_argument("--outcome", help=f"what the episodes ended with: {', '.join(OUTCOMES)}; nothing if left out")
+    command.add_argument("--outcome", help=f"outcome of the episodes: {', '.join(OUTCOMES)}; nothing if left out")
     real = command.add_argument_group("bags of a real robot")
     real.add_argument(
         "--robot", help=f"valid: {', '.join(ROBOTS)} (default); given, exported bags are read as a real robot's, too"
@@ -80,11 +82,11 @@ def add_to(commands: Commands) -> None:
     real.add_argument("--odometry", action="store_true", default=None, help="observe x.pos, y.pos and theta.pos, too")
     real.add_argument("--beams", type=int, help="beams of a scan in the dataset (default: 360)")
     real.add_argument("--scan_frame", metavar="FRAME", help="name of the scanner's frame, if it is not base_scan")
-    real.add_argument("--scan_yaw", type=float, metavar="RAD", help="where its zero points; 0 is straight ahead")
+    real.add_argument("--scan_yaw", type=float, metavar="RAD", help="direction of its zero angle; 0 is straight ahead")
     real.add_argument("--odom_frame", metavar="FRAME", help="name of the base's frame, if it is not base_footprint")
     real.add_argument(
         "--command_timeout", type=float, metavar="S",
-        help="silence after which the robot stands; inf (default): it goes on with the last command, as a TurtleBot3",
+        help="silence after which the robot stops; inf (default): the last command continues, as on a TurtleBot3",
     )  # fmt: skip
 
 
@@ -176,7 +178,7 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
     if robot not in ROBOTS:
         raise ConfigError(f"{unknown_name('robot', robot, ROBOTS)} Only bags of this robot can be imported.")
     if not options.task:
-        raise ConfigError("Say what the robot was to do: --task='Drive around without touching anything.'")
+        raise ConfigError("Describe the robot's task: --task='Drive around without touching anything.'")
     fps = 10 if options.fps is None else options.fps
     times = _times(options, fps, least=1.0)
     body = turtlebot3_burger()
@@ -241,6 +243,6 @@ def _print(report: ImportReport, bags: list[Bag]) -> None:
     episodes = counted(report.episodes, "episode")
     source = "1 bag" if len(bags) == 1 else f"{len(bags)} bags"
     print(
-        f"{report.root}: {episodes}, {report.frames} frames, of {source}. Is it valid? "
-        f"bhd-data check {quoted(report.root)}"
+        f"{report.root}: {episodes}, {report.frames} frames, of {source}. To validate it: bhd-data check "
+        f"{quoted(report.root)}"
     )

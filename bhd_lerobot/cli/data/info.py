@@ -24,10 +24,10 @@ from bhd_lerobot.errors import DatasetError, counted
 
 def add_to(commands: Commands) -> None:
     """Add `info`."""
-    help_text = "what is in a dataset: features, and outcome and timing of every episode; changes nothing"
+    help_text = "print a dataset's features, and outcome and timing of every episode; changes nothing"
     command = add_command(commands, "info", help_text, _run, takes_several=True)
     how = command.add_mutually_exclusive_group()
-    how.add_argument("--short", action="store_true", help="a line for each dataset")
+    how.add_argument("--short", action="store_true", help="print one line for each dataset")
     how.add_argument("--json", action="store_true", help="everything as JSON; of several datasets, a list")
 
 

@@ -13,13 +13,13 @@ def add_to(commands: Commands) -> None:
     """Add `mark`."""
     text = "mark how episodes ended, or interventions; former marks stay in meta/edits.jsonl"
     command = add_command(commands, "mark", text, _run)
-    command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
-    text = f"how they ended: {', '.join(OUTCOMES)}; of the robots and tasks of this package, what they can end with"
+    command.add_argument("--episodes", metavar="LIST", required=True, help="episodes, for example 0,3,5-9")
+    text = f"outcome of the episodes: {', '.join(OUTCOMES)}; for this package's tasks, only those that they have"
     command.add_argument("--outcome", metavar="NAME", help=text)
     text = "first and last frame of an intervention, such as 20-35"
     command.add_argument("--intervention", metavar="FIRST-LAST", help=text)
-    command.add_argument("--clear_interventions", action="store_true", help="take back all interventions")
-    command.add_argument("--note", metavar="TEXT", default="", help="why; for the log")
+    command.add_argument("--clear_interventions", action="store_true", help="remove all interventions")
+    command.add_argument("--note", metavar="TEXT", default="", help="reason, for the log")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -29,14 +29,15 @@ def add_to(commands: Commands) -> None:
     """Add `pull`."""
     help_text = "download a dataset from the Hub or from below a URL; from the Hub, also some episodes of it"
     command = add_command(commands, "pull", help_text, _run, names_dataset=False)
+    command.set_defaults(too_many="Name the folder to download to with --root=FOLDER.")
     command.add_argument("source", nargs="?", help="user/name on the Hub, or a URL")
     command.add_argument("--repo_id", help="the name on the Hub, as an option")
-    command.add_argument("--root", help="where to; of a name on the Hub, LeRobot's default place if nothing")
-    command.add_argument("--revision", help="branch, tag or commit; the one that stock LeRobot takes if nothing")
+    command.add_argument("--root", help="folder to download to; by default LeRobot's, for a name on the Hub")
+    command.add_argument("--revision", help="branch, tag or commit; if left out, the one that stock LeRobot takes")
     command.add_argument("--episodes", help="only the files of these episodes, such as 0,3,5-9")
-    command.add_argument("--outcome", help="only the files of episodes that ended so, such as success")
+    command.add_argument("--outcome", help="only the files of episodes with this outcome, such as success")
     command.add_argument("--min_score", type=float, help="only the files of episodes with at least this score, 0 to 1")
-    command.add_argument("--replace", action="store_true", help="give up another or a changed dataset that is there")
+    command.add_argument("--replace", action="store_true", help="replace another or a changed dataset in the folder")
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
 
@@ -45,8 +46,8 @@ def _run(options: argparse.Namespace) -> int:
 
     source, root = _places(options)
     again = repeat_line(options, source, root=root)
-    kept = f"{root} is as it was{'' if is_url(source) else ', and what arrived is not fetched again'}."
-    options.stopped = f"{kept} Go on with:\n  {again}"
+    kept = f"{root} is unchanged{'' if is_url(source) else ', and downloaded files are not fetched again'}."
+    options.stopped = f"{kept} Continue with:\n  {again}"
     select = _selection(options)
     quiet_bars()
     with prompt_interrupt(options.stopped):
@@ -75,11 +76,11 @@ def format_report(report: "PullReport", source: str) -> str:
         others = f"all {report.total_episodes}" if report.is_whole else "others, too"
         words = ["bhd-train", f"--dataset.repo_id={source}", f"--dataset.root={report.root}"]
         lines += [
-            f"  a file holds many episodes: those that are here hold {others}. Name yours where you load them:",
+            f"  a file holds many episodes: the downloaded ones hold {others}. Select yours when you load them:",
             f'    {shlex.join(words)} --dataset.episodes="{report.episodes}"',
         ]
     if report.problem:
-        lines.append(f"  it is a copy of what is there, and is not valid: {report.problem}")
+        lines.append(f"  it is a copy of the remote dataset, which is not valid: {report.problem}")
     return "\n".join(lines)
 
 
@@ -101,10 +102,10 @@ def _places(options: argparse.Namespace) -> tuple[str, Path]:
     refuse_empty(options)
     source = options.source or options.repo_id
     if source is None or (options.source and options.repo_id):
-        raise ConfigError("Say where from, once: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
+        raise ConfigError("Give one source: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
     if is_url(source):
         if options.root is None:
-            raise ConfigError(f"Say where to: bhd-data pull {source} --root=DIR.")
+            raise ConfigError(f"Give the target: bhd-data pull {source} --root=DIR.")
         if options.revision is not None:
             raise ConfigError(f"{source} is a URL: it has no revisions. Leave --revision out.")
         return source, folder_of(options.root)

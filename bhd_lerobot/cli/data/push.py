@@ -25,18 +25,20 @@ def add_to(commands: Commands) -> None:
     command.add_argument("places", nargs="*", metavar="ROOT [TARGET]", help="folder; user/name on the Hub, or a URL")
     command.add_argument("--root", help="the folder, as an option; LeRobot's default place of the name if nothing")
     command.add_argument("--repo_id", help="the name on the Hub, as an option")
-    command.add_argument("--branch", "--revision", help="branch to write to; it is made if it does not exist")
+    command.add_argument("--branch", "--revision", help="branch to write to; created if it does not exist")
     command.add_argument("--tag", help="a further tag for what is pushed")
     seen = command.add_mutually_exclusive_group()
-    seen.add_argument("--private", action="store_true", help="a repository for you alone")
-    seen.add_argument("--public", action="store_true", help="a repository for everybody")
+    seen.add_argument("--private", action="store_true", help="a private repository")
+    seen.add_argument("--public", action="store_true", help="a public repository")
     command.add_argument("--tags", help="tags of the card, separated by commas")
     command.add_argument("--licence", "--license", default="apache-2.0", help="licence of the card")
     command.add_argument(
-        "--no_card", "--no-card", action="store_true", help="send no card but one that lies in the folder"
+        "--no_card", "--no-card", action="store_true", help="upload no card, except a README.md in the folder"
     )
     command.add_argument(
-        "--replace", action="store_true", help="overwrite a dataset there that is another one, or has more episodes"
+        "--replace",
+        action="store_true",
+        help="overwrite the target, even if it is another dataset or has more episodes",
     )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
@@ -72,11 +74,12 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
     if places and options.repo_id is None:
         options.repo_id = places.pop(0)
     if places:
-        raise ConfigError(f"{' '.join(places)} is too much; give the folder and one target.")
+        raise ConfigError(f"Unexpected argument: {' '.join(places)}. Give the folder and one target.")
     target = options.repo_id
     if target is None:
         raise ConfigError(
-            "Say where to: bhd-data push ROOT user/name for the Hub, or bhd-data push ROOT s3://bucket/dir for a URL."
+            "Give the target: bhd-data push ROOT user/name for the Hub, or bhd-data push ROOT s3://bucket/dir for a "
+            "URL."
         )
     if is_url(target):
         if options.branch or options.tag or options.private or options.public:

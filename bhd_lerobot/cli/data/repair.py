@@ -9,7 +9,7 @@ from bhd_lerobot.datasets.recovery.repair import repair
 
 def add_to(commands: Commands) -> None:
     """Add `repair`."""
-    help_text = "finish what was interrupted, recover what is whole where files are damaged, and leave it compact"
+    help_text = "complete interrupted changes, recover the intact episodes of damaged files, and compact the dataset"
     command = add_command(commands, "repair", help_text, _run)
     command.add_argument(
         "--info",

@@ -14,15 +14,15 @@ _IMAGES = (".png", ".pdf", ".svg")
 
 def add_to(commands: Commands) -> None:
     """Add `timing`."""
-    help_text = "how punctual a recording was: tables and an image; changes nothing"
+    help_text = "report the timing of a recording, in tables and an image; changes nothing"
     command = add_command(commands, "timing", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
-    command.add_argument("--episode", metavar="NUMBER", type=int, help="this episode only")
+    command.add_argument("--episode", metavar="NUMBER", type=int, help="only this episode")
     command.add_argument(
         "--output",
         metavar="FILE",
         type=Path,
-        help="image, PNG, PDF or SVG; outputs/timing/NAME.png if nothing, and none with --json",
+        help="image, PNG, PDF or SVG; outputs/timing/NAME.png if left out, and none with --json",
     )
 
 

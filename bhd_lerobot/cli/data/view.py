@@ -18,7 +18,7 @@ PORT = 8766
 
 def add_to(commands: Commands) -> None:
     """Add `view`."""
-    help_text = "look at a dataset in a browser: videos, scan, plots, outcomes; Ctrl-C ends it"
+    help_text = "show a dataset in a browser: videos, scan, plots, outcomes; Ctrl-C ends it"
     command = add_command(commands, "view", help_text, _run)
     command.add_argument(
         "--port", metavar="PORT", type=int, default=PORT, help=f"on 127.0.0.1; 0 for any free one; default {PORT}"

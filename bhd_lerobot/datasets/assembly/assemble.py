@@ -118,7 +118,7 @@ def check_alike(sources: Sequence[DatasetState]) -> None:
             lines = "\n  ".join(line.replace("recorded", "there").replace("requested", "here") for line in found)
             raise DatasetMismatchError(
                 f"{other.root} does not fit {first.root}:\n  {lines}\nOnly datasets with the same robot, frame rate "
-                "and features can be one. lerobot-edit-dataset can remove features from one of them."
+                "and features can be merged. lerobot-edit-dataset can remove features from one of them."
             )
 
 
@@ -152,8 +152,8 @@ def _sources(picks: Sequence[Pick], has_stats: bool) -> list[DatasetState]:
     for source in sources if not has_stats else ():
         if has_unfinished_episodes(source.root) or (source.without_stats and source.identity is not None):
             raise DatasetError(
-                f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
-                f"{quoted(source.root)}` first."
+                f"{source.root} is not finalised: its recording was interrupted, or is still running. Run `bhd-data "
+                f"repair {quoted(source.root)}` first."
             )
         if source.without_stats:
             raise DatasetError(
@@ -170,7 +170,7 @@ def _types(sources: Sequence[DatasetState], name: str, prefix: str) -> dict[str,
             if types.setdefault(column, kind) != kind:
                 raise DatasetMismatchError(
                     f"{source.root}: the metadata {prefix}{column} of its episodes is {kind}; in {sources[0].root} it "
-                    f"is {types[column]}. They cannot be one column."
+                    f"is {types[column]}. They cannot be merged into one column."
                 )
     return types
 
@@ -250,14 +250,14 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
         for name, values in stat.items():
             if len({np.shape(value) for value in values}) > 1:
                 raise DatasetMismatchError(
-                    f"The statistic {name} of {key} has {np.size(values[0])} numbers in one episode, and another "
-                    "number of them in others. `lerobot-edit-dataset --operation.type recompute_stats` computes them."
+                    f"The statistic {name} of {key} has {np.size(values[0])} numbers in one episode, and a different "
+                    "number in others. `lerobot-edit-dataset --operation.type recompute_stats` computes them."
                 )
             if len(values) != len(plan.picks):
                 # Later files of LeRobot's would have more columns than these, and nothing would load any more.
                 raise DatasetMismatchError(
-                    f"Only some of the datasets have the statistic {name} of {key}; there are others of before it came "
-                    "up. `lerobot-edit-dataset --operation.type recompute_stats` computes all of them."
+                    f"Only some of the datasets have the statistic {name} of {key}; the others are older than this "
+                    "statistic. `lerobot-edit-dataset --operation.type recompute_stats` computes all of them."
                 )
     return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
 

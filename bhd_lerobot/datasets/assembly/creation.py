@@ -71,7 +71,7 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
 def _exists(root: Path, remedy: str) -> DatasetError:
     """Return what is in the way of a new dataset; for a recorder also that another one is at work there."""
     if not root.is_dir():
-        return DatasetExistsError(f"{root} is no folder, but a file or a link to nothing. Choose another root.")
+        return DatasetExistsError(f"{root} is not a folder, but a file or a broken link. Choose another root.")
     if remedy == _RESUME:
         try:
             RootLock(root, is_choice=True).release()

@@ -156,4 +156,4 @@ def _as(schema: pa.Schema, table: pa.Table, path: Path) -> pa.Table:
     try:
         return table.select(schema.names).cast(schema)
     except (pa.ArrowException, KeyError) as error:
-        raise DatasetMismatchError(f"The columns of {path} are stored in another way: {error}.") from error
+        raise DatasetMismatchError(f"The columns of {path} are stored in a different format: {error}.") from error

@@ -75,7 +75,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
 
 
 def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:
-    """Make a dataset of some episodes of another, which stays as it is."""
+    """Copy some episodes of a dataset to a new one; the original is not changed."""
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         edit, recording = _kept(state, episodes, "keep")
@@ -83,12 +83,12 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
 
 
 def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | str) -> list[EditReport]:
-    """Make several datasets of the episodes of one, which stays as it is."""
+    """Split a dataset into several new ones; the original is not changed."""
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
         for episode in episodes:
             if owner.setdefault(episode, name) != name:
-                raise ConfigError(f"Episode {episode} is wanted in {owner[episode]!r} and in {name!r}.")
+                raise ConfigError(f"Episode {episode} is assigned to {owner[episode]!r} and to {name!r}.")
     folder = Path(folder)
     remove_abandoned(real(folder))
     with opened([Path(root)]) as (state,):
@@ -207,9 +207,9 @@ def check_reported(root: Path) -> None:
     request = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
     (root / layout.UNREPORTED).unlink(missing_ok=True)
     raise DatasetError(
-        f"{root} is not what it was: an edit ({request}) that was interrupted at {last.get('time')} had been "
-        f"completed, so episodes may have other numbers now. Check `bhd-data info {quoted(root)}`, then repeat this "
-        "command. Nothing was changed now."
+        f"{root} has changed: an edit ({request}) that was interrupted at {last.get('time')} had been completed, so "
+        f"episodes may have other numbers now. Check `bhd-data info {quoted(root)}`, then repeat this command. Nothing "
+        "was changed now."
     )
 
 

@@ -53,9 +53,9 @@ def mark(
     if outcome is not None and outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", outcome, OUTCOMES))
     if outcome is None and intervention is None and not clear_interventions:
-        raise ConfigError(f"Say what to mark: an outcome ({', '.join(OUTCOMES)}), or frames of an intervention.")
+        raise ConfigError(f"Give a mark: an outcome ({', '.join(OUTCOMES)}), or frames of an intervention.")
     if not episodes:
-        raise ConfigError("Say which episodes to mark.")
+        raise ConfigError("Give the episodes to mark.")
     request = {
         "edit": "mark",
         "episodes": list(episodes),

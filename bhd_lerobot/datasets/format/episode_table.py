@@ -84,9 +84,7 @@ def episode_table(
         try:
             arrays.append(pa.array([row.get(name) for row in rows], type=kind))
         except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
-            raise FrameError(
-                f"{name!r} of the episodes is {kind} and cannot hold what is to be written: {error}."
-            ) from error
+            raise FrameError(f"{name!r} of the episodes is {kind} and cannot hold the new value: {error}.") from error
     for feature, values in stats.items():
         for statistic, stacked in values.items():
             names.append(f"stats/{feature}/{statistic}")

@@ -43,7 +43,7 @@ def wrong_columns(schema: pa.Schema, features: Mapping[str, Mapping[str, Any]]) 
 
 
 def _described(feature: Mapping[str, Any]) -> str:
-    return f"meta/info.json says {feature['dtype']} of shape {list(feature['shape'])}"
+    return f"meta/info.json declares {feature['dtype']} of shape {list(feature['shape'])}"
 
 
 def _is_like(kind: pa.DataType, dtype: str, shape: tuple[int, ...]) -> bool:

@@ -27,6 +27,7 @@ WATCHDOG = "control.watchdog"
 MODE = "control.mode"
 EFFORT = "control.effort"
 WRENCH = "control.wrench"
+IMAGE_AGE = "control.image_age"
 EXPERT_ACTION = "expert.action"
 
 REWARD = "next.reward"
@@ -51,13 +52,13 @@ SCALARS: dict[str, tuple[str, str]] = {
     LATE: ("bool", "the frame violates the timing tolerance; false in lockstep"),
     LIMITS: (
         "int64",
-        "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position, 32 posture, "
-        "64 clearance; sum",
+        "limits that changed the command: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position, 32 "
+        "posture, 64 clearance; sum",
     ),
     WATCHDOG: (
         "int64",
-        "what the watchdogs noticed: 1 command too old, 2 arm blocked, 4 brain silent, 8 recorder silent, "
-        "16 plant silent, 32 too many missed ticks, 64 guard, 128 force; sum",
+        "watchdogs that were triggered: 1 command too old, 2 arm blocked, 4 brain silent, 8 recorder silent, 16 plant "
+        "silent, 32 too many missed ticks, 64 guard, 128 force; sum",
     ),
     MODE: (
         "int64",
@@ -69,8 +70,8 @@ SCALARS: dict[str, tuple[str, str]] = {
     DONE: ("bool", "the episode ended with this frame"),
     EVENT: (
         "int64",
-        "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop, 7 wrong object, "
-        "8 dropped, 9 unreachable, 10 fault, 11 failure, of which a person did not say the cause",
+        "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop, 7 wrong object, 8 "
+        "dropped, 9 unreachable, 10 fault, 11 failure without a stated cause",
     ),
 }
 
@@ -143,11 +144,11 @@ def meaning_of(key: str, feature: dict[str, Any]) -> str:
     names = feature.get("names") or []
     told = [str(name) for name in names] if isinstance(names, list) else []
     text = f"{', '.join(told[:3])}, … {told[-1]}" if len(told) > 6 else ", ".join(told)
-    return f"privileged, the simulator's truth: {text}" if key == ENVIRONMENT_STATE else text
+    return f"privileged, from the simulator's true state: {text}" if key == ENVIRONMENT_STATE else text
 
 
 _LEROBOT_COLUMNS = {
-    SUBTASK: "what the brain was doing, in words",
+    SUBTASK: "the brain's current step, in words",
     "timestamp": "frame_index / fps [s]",
     "frame_index": "number of the frame in its episode",
     "episode_index": "number of the episode in the dataset",

@@ -54,7 +54,7 @@ def check_identity(
         name = edit.get("edit", "edit") if isinstance(edit, Mapping) else "edit"
         raise DatasetEditedError(
             f"{state.root} was edited after its recording ({name}), so it cannot be continued: its next episode would "
-            "not be the one of its seed. Record what is missing into another root, with another seed, and merge "
+            "not be the one of its seed. Record the missing episodes into another root, with another seed, and merge "
             "the two."
         )
     recorded: dict[str, Any] = {"robot_type": state.info.get("robot_type"), "fps": state.info["fps"]}

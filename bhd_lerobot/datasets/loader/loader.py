@@ -227,8 +227,8 @@ def expert_stats(meta: Any) -> None:
     """Put the statistics of what the expert would have done in place of those of what was done."""
     if EXPERT_ACTION not in meta.features:
         raise DatasetError(
-            f"{meta.root} has no column {EXPERT_ACTION!r}: what an expert would have done was not recorded. Record it "
-            "with --dataset.expert_action=true, or leave selection.expert_action false."
+            f"{meta.root} has no column {EXPERT_ACTION!r}: the expert's actions were not recorded. Record it with "
+            "--dataset.expert_action=true, or leave selection.expert_action false."
         )
     if meta.stats:
         meta.stats[ACTION] = meta.stats[EXPERT_ACTION]

@@ -102,7 +102,7 @@ class BatchOrder:
         epoch, position = int(state["epoch"]), int(state["position"])
         if epoch < 0 or not 0 <= position <= len(self.samples):
             raise ConfigError(
-                f"The order of samples cannot go on at epoch {epoch}, position {position}: an epoch has "
+                f"The order of samples cannot continue at epoch {epoch}, position {position}: an epoch has "
                 f"{len(self.samples)} samples. The state is of another dataset or selection."
             )
         left = len(self.samples) - position

@@ -119,8 +119,8 @@ class EpisodeFilter:
             counts = Counter(str(outcomes[episode]) for episode in candidates)
             found = f": {', '.join(f'{count} {name}' for name, count in counts.most_common())}"
         return (
-            f"No episode of {meta.root} is left after filtering: {' and '.join(criteria)} was asked for, and it has "
-            f"{len(candidates)} episodes{found}. Ask for less, or record more."
+            f"No episode of {meta.root} is left after filtering by {' and '.join(criteria)}; it has "
+            f"{len(candidates)} episodes{found}. Relax the filter, or record more."
         )
 
 
@@ -194,8 +194,8 @@ def frame_weights(
         return None
     if EVENT not in meta.features:
         raise DatasetError(
-            f"{meta.root} has no column {EVENT!r}, so it does not say where somebody intervened. Leave the weights of "
-            f"interventions and of learners at 1. It has: {', '.join(meta.features)}."
+            f"{meta.root} has no column {EVENT!r}, so interventions are unknown. Leave the weights of interventions "
+            f"and of learners at 1. It has: {', '.join(meta.features)}."
         )
     table = FrameTable.open(meta, episodes, [EVENT])
     events = table.columns[EVENT]

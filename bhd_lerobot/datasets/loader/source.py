@@ -39,8 +39,8 @@ def local_metadata(
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     if revision is not None and (folder / layout.INFO).is_file() and not (folder / ".cache/huggingface").is_dir():
         raise ConfigError(
-            f"Revision {revision!r} of {repo_id} is asked for, but {folder} holds a dataset that does not say which "
-            "revision it is, and LeRobot would take it whatever it is. Leave the revision out, or name another root."
+            f"Revision {revision!r} of {repo_id} is asked for, but {folder} holds a dataset of unknown revision, which "
+            "LeRobot would use in any case. Leave the revision out, or name another root."
         )
     complete_interrupted(folder)
     try:

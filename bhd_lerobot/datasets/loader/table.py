@@ -160,7 +160,7 @@ class FrameTable:
         offset = np.arange(len(of_row)) - np.repeat(starts, lengths)
         whole = np.array_equal(end - begin, lengths) and np.array_equal(index, np.repeat(begin, lengths) + offset)
         if not whole or len(self._position) != len(self.episodes):
-            raise corrupt(self.meta.root / "data", "the frames of the data files are not those that meta/episodes says")
+            raise corrupt(self.meta.root / "data", "the frames of the data files do not match meta/episodes")
         self.starts, self.lengths = torch.from_numpy(starts), torch.from_numpy(lengths)
         self.first = torch.repeat_interleave(self.starts, self.lengths)
         self.last = self.first + torch.repeat_interleave(self.lengths, self.lengths) - 1

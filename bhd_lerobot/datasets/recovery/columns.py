@@ -34,7 +34,7 @@ def wrong_rate(info: Mapping[str, Any], table: pa.Table) -> str:
     seconds, frames = table["timestamp"].to_numpy(), table["frame_index"].to_numpy()
     last = int(frames.argmax())
     if frames[last] > 0 and seconds[last] > 0 and abs(seconds[last] * info["fps"] - frames[last]) > 0.5:
-        return f"it says {info['fps']:g} frames a second, and the timestamps say {frames[last] / seconds[last]:.3g}"
+        return f"it states {info['fps']:g} frames a second, but the timestamps give {frames[last] / seconds[last]:.3g}"
     return ""
 
 
@@ -96,5 +96,5 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     for key in sorted(sizes.keys() & wanted):
         shape, size = features[key]["shape"], sizes[key]
         if size is not None and len(shape) == 1 and shape[0] != size:
-            texts.append(f"it says that {key} has {shape[0]} numbers, and it has {size}")
+            texts.append(f"it states that {key} has {shape[0]} numbers, but it has {size}")
     return "; ".join(texts)

@@ -67,7 +67,7 @@ def rebuild(state: DatasetState, disk: Disk, lock: RootLock, *, order: bool = Fa
     root, counted, done = state.root, load_info(state.root)["total_frames"], []
     info = {**state.info, "total_frames": state.num_frames}
     if counted != state.num_frames:
-        done.append(f"{layout.INFO}: total_frames is {state.num_frames}, as the episodes say; it was {counted}")
+        done.append(f"{layout.INFO}: total_frames is {state.num_frames}, as in the episodes; it was {counted}")
     rows = [dict(row) for row in state.rows]
     known = compute_stats(state) if stats or (order and state.without_stats) else None
     with Workspace(root, disk, lock) as space:

@@ -214,7 +214,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     dropped: list[str] = []
     if state.identity is not None:
         if unfinished := went_on(root):
-            raise corrupt(unfinished[0], "another program went on with this dataset and was killed")
+            raise corrupt(unfinished[0], "another program continued this dataset and was killed")
         # Only in our own datasets: another program may know what its files are for.
         dropped = sorted(layout.recorded_files(root) - state.files())
         for name in dropped:

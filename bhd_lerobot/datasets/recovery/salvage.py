@@ -170,7 +170,7 @@ def _info_of(root: Path) -> dict[str, Any]:
     except DatasetCorruptError as error:
         reason = str(error.__cause__ or error)
     raise DatasetCorruptError(
-        f"{root / layout.INFO} is corrupt: {reason}. It says what the columns are, without which nothing can be read. "
+        f"{root / layout.INFO} is corrupt: {reason}. It describes the columns, without which nothing can be read. "
         f"{repair_with_info(root)}"
     )
 

@@ -195,7 +195,7 @@ class Videos:
                 taken.append(episode)
                 start += episode.table.num_rows
             if start < frames and not problem and not (is_torn or len(without_row) > certain):
-                what = f"its {frames} frames are not those of whole episodes, so whose they are is not known"
+                what = f"its {frames} frames are not those of whole episodes, so their episodes are unknown"
                 findings.error("video", path.relative_to(self._root).as_posix(), what)
                 for episode in taken:
                     del episode.videos[key]
@@ -221,7 +221,7 @@ class Videos:
         others = sorted(set((self._root / "videos" / key).glob("chunk-*/file-*.mp4")) - seen)
         if others:
             names = ", ".join(path.relative_to(self._root).as_posix() for path in others[:3])
-            findings.error("video", names, "a video before is missing, so whose they are is not known")
+            findings.error("video", names, "an earlier video is missing, so their episodes are unknown")
 
     def _find_unjoined(self, key: str, episode: FoundEpisode, *, is_last: bool) -> None:
         """Find a video that was not joined yet, or images that were not encoded yet."""

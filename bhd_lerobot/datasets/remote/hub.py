@@ -97,7 +97,7 @@ class HubDataset:
             found = self._tags().get(self._tag or "")
             if found is not None and (items or deleted or found != self.commit):
                 raise TransferError(
-                    f"{self.name} has a tag {self._tag!r} already, which stands for something else. Choose another."
+                    f"{self.name} has a tag {self._tag!r} already, which marks another version. Choose another."
                 )
             if items or deleted:
                 self._commit(source, items, deleted)

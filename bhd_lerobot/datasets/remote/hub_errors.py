@@ -97,14 +97,14 @@ def _status(error: BaseException, name: str) -> str:
 
     status = getattr(getattr(error, "response", None), "status_code", 0)
     answer = " ".join(str(getattr(error, "server_message", None) or "").split())
-    quoted = f' The Hub says: "{answer[:200]}".' if answer else ""
+    quoted = f' The answer of the Hub: "{answer[:200]}".' if answer else ""
     if status == 401 and get_token():
         meaning = f"the Hub does not accept the token: it has expired or was revoked. {_LOGIN} to a new one."
     elif status in (401, 404):
         private = "this token may not see it" if get_token() else f"it is private. {_LOGIN} if it is"
         meaning = f"there is no such repository, or {private}. Check the name {name!r}."
     elif status >= 500:
-        meaning = f"the Hub has an error of its own (status {status}). Wait a while."
+        meaning = f"the Hub reports an internal error (status {status}). Wait a while."
     else:
         meaning = _STATUS.get(status, f"the Hub answers with status {status}.")
     return meaning + quoted

@@ -61,7 +61,8 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
     refuse_overlap(root, remote)
     if select is not None and not remote.has_checksums:
         raise ConfigError(
-            f"{remote.name} is a URL, of which only whole datasets are pulled. Do that, then run bhd-data filter."
+            f"{remote.name} is a URL, from which only whole datasets can be pulled. Pull all of it, then run bhd-data "
+            "filter."
         )
     with write_errors("pull the dataset", root, "The dataset itself was not changed."):
         complete_interrupted(root)
@@ -151,7 +152,7 @@ class _Pull:
         if changed and not replace:
             raise DatasetExistsError(
                 f"{root} holds another dataset, or was changed since it was pulled: {listed(changed)}. Choose another "
-                "folder with --root, or give what is there up with --replace."
+                "folder with --root, or replace it with --replace."
             )
         self._is_given_up = bool(changed)
 

@@ -134,7 +134,7 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
     name, info = remote.name, there.get(layout.INFO)
     if info is None or (info.digest is not None and info.matches(local.root / layout.INFO)):
         return
-    remedy = "or give up what lies there with --replace."
+    remedy = "or overwrite it with --replace."
     try:
         found = parse_info(remote.read(layout.INFO), name)
     except DatasetError as error:

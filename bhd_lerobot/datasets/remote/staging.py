@@ -31,8 +31,8 @@ class Staging:
         self.is_new = not os.path.lexists(folder)
         if not self.is_new and not _is_ours(folder):
             raise DatasetError(
-                f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
-                "there. Move it, or choose another --root."
+                f"{folder} is in the way: bhd-data pull needs this name temporarily and did not create it. Move it, or "
+                "choose another --root."
             )
         if root.is_dir():
             (root / _MARKER).unlink(missing_ok=True)  # of a pull that was killed as soon as it was done

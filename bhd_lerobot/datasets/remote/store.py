@@ -78,7 +78,7 @@ class StoreDataset:
             source.check_unchanged()
             there = self.files()
             if lost := [path for path, one in sent.items() if path not in there or there[path].size != one.size]:
-                raise TransferError(f"{self.name} does not have what was sent: {listed(lost)}.")
+                raise TransferError(f"{self.name} lacks files that were sent: {listed(lost)}.")
             self._write(info)
 
     def _list(self) -> dict[str, dict[str, Any]]:

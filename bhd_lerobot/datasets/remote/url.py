@@ -39,12 +39,12 @@ def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple
     try:
         fs, path = url_to_fs(url.rstrip("/"), **(storage_options or {}))
     except ImportError as error:
-        raise TransferError(f"What serves {protocol}:// is not installed: {error}.") from error
+        raise TransferError(f"The package for {protocol}:// is not installed: {error}.") from error
     except OSError as error:  # those that connect at once: FTP, SFTP
         _drop_half_made(error)
         reason = " ".join(str(error).split()).rstrip(".")
         raise TransferError(
-            f"What serves {shown(url)} cannot be reached ({reason}). Check the name and the connection."
+            f"The server of {shown(url)} cannot be reached ({reason}). Check the name and the connection."
         ) from error
     except Exception as error:  # each file system has its own idea of what it needs
         reason = " ".join(str(error).split()).rstrip(".")
@@ -57,14 +57,14 @@ def check_url(url: str) -> None:
     protocol, _, path = url.partition("://")
     name = shown(url)
     if not url.isprintable():
-        raise ConfigError(f"{name!r} has characters in it that no URL has. Write it again.")
+        raise ConfigError(f"{name!r} has characters that are not valid in a URL. Correct it.")
     if "::" in url:
-        raise ConfigError(f"{name} is a chain of file systems. Name the one where the dataset is to lie.")
+        raise ConfigError(f"{name} is a chain of file systems. Name the one that holds the dataset.")
     if not protocol:
         raise ConfigError(f"{name} names no protocol. Write, for example, s3{name}.")
     if protocol in _NO_PLACES:
         raise ConfigError(
-            f"{name} cannot be written to or listed: {protocol}:// is no place for a dataset. Name a folder, such as "
+            f"{name} cannot be written to or listed: {protocol}:// cannot hold a dataset. Name a folder, such as "
             "s3://bucket/folder or file:///folder, or a dataset on the Hub as user/name."
         )
     if not path.strip("/"):

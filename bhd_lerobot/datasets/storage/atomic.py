@@ -164,7 +164,7 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
             raise
         sentences = _done.get()
         before = None if sentences is None else list(sentences)
-        note_done(f"the change of {place} is decided, and the next command completes it")
+        note_done(f"the change of {place} is committed, and the next command completes it")
         with _decided(place):
             roll_forward(place, disk)
         if sentences is not None and before is not None:
@@ -189,7 +189,7 @@ def is_free(place: Path) -> bool:
 def refuse_inside(target: Path, source: Path) -> None:
     """Refuse to write into a dataset that is only read: it would be uploaded and checked with it."""
     if real(source) in real(target).parents:
-        raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
+        raise ConfigError(f"{target} lies in {source}, which must not change. Choose a folder outside it.")
 
 
 def remove_abandoned(place: Path) -> None:
@@ -499,6 +499,6 @@ def _names(folder: Path) -> set[str]:
 @contextlib.contextmanager
 def _decided(place: Path) -> Iterator[None]:
     """Add to an error that the next command completes the change."""
-    consequence = "The change is decided, and the next command completes it."
+    consequence = "The change is committed, and the next command completes it."
     with write_errors("complete a change", place, consequence):
         yield

@@ -23,8 +23,8 @@ _MOST = 1e18  # of counts and seconds: beyond it is no measurement
 CLOCKS = ("lockstep", "realtime")
 
 SIMULATED = (
-    "Time was simulated (clock: lockstep). It stood still during inference and while a tick was computed, so "
-    "nothing could be late; how punctual this machine is does not show in this dataset."
+    "Time was simulated (clock: lockstep). It stood still during inference and while a tick was computed, so nothing "
+    "could be late; this dataset does not show the timing of this machine."
 )
 
 
@@ -162,7 +162,7 @@ def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
     columns = read_columns(root, _COLUMNS, episode)
     chosen = info.episodes if episode is None else (info.episodes[episode],)
     if not chosen:
-        raise DatasetError(f"{info.root} holds no episode yet, so there is no timing to be shown.")
+        raise DatasetError(f"{info.root} holds no episode yet, so there is no timing to report.")
     found = []
     for one, stored in zip(chosen, columns, strict=True):
         summary = timing_of(one)

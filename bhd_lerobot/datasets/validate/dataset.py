@@ -20,16 +20,16 @@ __all__ = ["CHECKS", "DatasetCheck", "Finding", "Severity", "check_dataset"]
 
 CHECKS = {
     "schema": "features, their shapes, names and columns",
-    "files": "every file is there, and can be read to its last page",
+    "files": "every file exists and can be read to its last page",
     "counts": "meta/info.json, meta/episodes and the data files agree",
     "order": "files, frames and instructions lie in the order of their numbers, by which LeRobot finds them",
-    "stats": "statistics are there, and are those of the data",
+    "stats": "statistics exist and match the data",
     "video": "every video has as many frames as its episodes",
     "finite": "no NaN, no infinity, nothing missing",
-    "frozen": "no number stands still that moves elsewhere",
+    "frozen": "no value is constant that changes in other episodes",
     "jumps": "no action jumps",
     "limits": "positions and commands are within the robot's limits",
-    "timing": "timestamps are where they say they are; frames were not late",
+    "timing": "timestamps match the frame numbers; frames were not late",
     "outcome": "how many episodes succeeded",
 }
 """What is checked, and what for."""

@@ -36,7 +36,7 @@ from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
 RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
-_RECORD = "Restore it from a copy; bhd-data repair goes on without what is lost with it."
+_RECORD = "Restore it from a copy; bhd-data repair continues without the data that is lost with it."
 _LIGHT = (
     *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
     "tasks",
@@ -152,7 +152,7 @@ def _read_tasks(files: Files, findings: Findings) -> None:
         return
     numbers = list(tasks)
     if sorted(numbers) != list(range(len(numbers))):
-        what = f"its numbers are {few(numbers)}; they have to be 0 to {len(numbers) - 1}, for LeRobot counts rows"
+        what = f"its numbers are {few(numbers)}; they have to be 0 to {len(numbers) - 1}, because LeRobot counts rows"
         findings.error("counts", layout.TASKS, what, "bhd-data repair numbers the instructions again.")
         return
     files.tasks = [tasks[number] for number in range(len(tasks))]
@@ -272,7 +272,7 @@ def _interrupted(files: Files) -> tuple[str, str]:
     is_whole = not files.is_ours or (bool(files.episodes) and files.has_stats)
     if is_whole and not has_unfinished_episodes(files.root):
         # A recording whose files are being merged has episodes without statistics.
-        return "an edit was interrupted; nothing of it was done", "bhd-data repair drops it. Repeat the edit."
+        return "an edit was interrupted before it changed anything", "bhd-data repair drops it. Repeat the edit."
     what = "a recording was interrupted; what it saved is complete, and not yet merged"
     return what, "bhd-data repair finishes it."
 

@@ -70,7 +70,7 @@ class FrozenCheck:
             return
         dead = column.low == column.high
         if dead.all():
-            findings.warning("frozen", key, "none of its numbers ever changes", "Check that it was connected.")
+            findings.warning("frozen", key, "its values never change", "Check that it was connected.")
             return
         if dead.any():
             names = few(name_of(self._features[key], int(i)) for i in np.flatnonzero(dead))

@@ -95,8 +95,8 @@ class CnnConfig(MlpConfig):
         names = names_of(features, OBS_STATE)
         if missing := [name for name in ODOMETRY if name not in names]:
             raise ConfigError(
-                f"bhd_cnn keeps in mind where things are by the robot's odometry, and {OBS_STATE} of this dataset has "
-                f"no {missing[0]!r}. Record it with --robot.odometry=true."
+                f"bhd_cnn maps obstacles by the robot's odometry, but {OBS_STATE} of this dataset has no "
+                f"{missing[0]!r}. Record it with --robot.odometry=true."
             )
         beams, angles = find_scan(names, self.type)
         super().set_dataset_feature_metadata(features)

@@ -69,7 +69,7 @@ class DaggerConfig(BrainConfig):
                 raise ConfigError(f"brain.{name}.type is 'dagger' itself; choose a brain that drives.")
         if getattr(self.learner, "stream", False):
             raise ConfigError(
-                "brain.learner.stream is true, but who drives is decided anew in every frame. Set it to false."
+                "brain.learner.stream is true, but the driver is chosen anew in every frame. Set it to false."
             )
 
 

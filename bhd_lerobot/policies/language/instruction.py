@@ -47,7 +47,7 @@ class RulePlanner:
         advice = ", ".join(repr(each[0]) for each in exact if each)
         raise InstructionError(
             f"'{phrase}' fits {len(found)} objects: {', '.join(map(name, found))}. "
-            + (f"Say one of: {advice}." if advice else "No words known here tell them apart; move one of them.")
+            + (f"Say one of: {advice}." if advice else "No known words distinguish them; move one of them.")
         )
 
 

@@ -42,8 +42,8 @@ class LanguageBrainConfig(PickBrainConfig):
         super().__post_init__()
         if self.perception.path and any(self.camera_error_m):
             raise ConfigError(
-                f"brain.camera_error_m is {list(self.camera_error_m)}, by which the task is wrong, and with "
-                "brain.perception.path the brain does not ask the task. Leave one of them out."
+                f"brain.camera_error_m is {list(self.camera_error_m)}, an error added to the task's poses, but with "
+                "brain.perception.path the brain does not use these poses. Leave one of them out."
             )
 
 
@@ -204,7 +204,7 @@ class LanguageBrain(PickBrain):
             )
         if not target.error_90_m <= options.max_error_m:
             raise PerceptionError(
-                f"Where the {name} is, is known to {1000 * target.error_90_m:.0f} mm only, which is more than "
+                f"The position of the {name} is known to {1000 * target.error_90_m:.0f} mm only, which is more than "
                 f"perception.max_error_m ({1000 * options.max_error_m:.0f} mm)."
             )
 

@@ -119,8 +119,8 @@ class LearnedBrain(ConfiguredBrain):
         )
         if not self.contract.is_known:
             _log.warning(
-                "%s does not say what it was trained on, and its dataset is not here: only the number of its inputs is "
-                "checked, not which they are, nor the robot, nor the frame rate.",
+                "%s does not record its training data, and its dataset is not available: only the number of its "
+                "inputs is checked, not their names, the robot or the frame rate.",
                 who,
             )
         for key, names in (
@@ -221,8 +221,8 @@ class LearnedBrain(ConfiguredBrain):
             if camera not in cameras:
                 size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""
                 raise ConfigError(
-                    f"The policy {self.config.path!r} looks at the camera {camera!r} ({key}), which this robot does "
-                    f"not have. There is: {', '.join(cameras) or 'none'}. Set --robot.camera=true{size}."
+                    f"The policy {self.config.path!r} uses the camera {camera!r} ({key}), which this robot does not "
+                    f"have. There is: {', '.join(cameras) or 'none'}. Set --robot.camera=true{size}."
                 )
             if shape and cameras[camera] != shape:
                 height, width, channels = shape

@@ -68,7 +68,7 @@ def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:
     except Exception as error:  # the Hub's client lets through whatever its transport raises
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ConfigError(
-            f"There is no policy at {text!r}: no such folder is here, and as a model on the Hub it cannot be had "
+            f"There is no policy at {text!r}: no such folder is here, and it cannot be downloaded from the Hub "
             f"({reason}) Check the name, your login (hf auth login) and the network, or copy the checkpoint here."
         ) from error
 

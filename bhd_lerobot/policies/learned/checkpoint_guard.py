@@ -91,8 +91,8 @@ def _check_step(file: Path, step: dict[str, Any], allowed: Callable[[], set[str]
         packages = ", ".join(sorted(allowed()))
         raise ConfigError(
             f"{file} asks for the processor step {name!r}, which is not loaded: it would run code of the checkpoint's "
-            f"choice. Allowed are registered steps, and processor steps of {packages}. {_BEWARE} A step of your own "
-            "belongs into an installed package lerobot_policy_…, decorated with ProcessorStepRegistry.register()."
+            f"choice. Allowed are registered steps, and processor steps of {packages}. {_BEWARE} Put a step of your "
+            "own into an installed package lerobot_policy_…, decorated with ProcessorStepRegistry.register()."
         )
     state = step.get("state_file")
     if state is not None and (not isinstance(state, str) or Path(state).name != state or state in ("", "..")):

@@ -96,7 +96,7 @@ class PolicyContract:
             return cls(**{key: _frozen(key, value) for key, value in values.items() if key in names})
         except (OSError, ValueError, TypeError, AttributeError) as error:
             raise ConfigError(
-                f"{file} cannot be read: {error}. It says what the policy was trained on. Copy the checkpoint again; "
+                f"{file} cannot be read: {error}. It describes the policy's training data. Copy the checkpoint again; "
                 "or delete the file, and only the shapes of features can be checked."
             ) from error
 
@@ -123,14 +123,14 @@ class PolicyContract:
         """
         if None not in (robot_type, self.robot_type) and robot_type != self.robot_type:
             raise ConfigError(
-                f"{who} was trained on the robot {self.robot_type!r} and is to drive a {robot_type!r}. Choose that "
+                f"{who} was trained on the robot {self.robot_type!r} and would drive a {robot_type!r}. Choose that "
                 f"robot (--robot.type={self.robot_type}), or a policy that was trained on a {robot_type}."
             )
         if None not in (self.units, "SI") and self.units != "SI":
-            raise ConfigError(f"{who} was trained on values in {self.units}; robots here speak SI units and radians.")
+            raise ConfigError(f"{who} was trained on values in {self.units}; robots here use SI units and radians.")
         if fps is not None and self.fps is not None and fps != self.fps:
             raise ConfigError(
-                f"{who} was trained at {self.fps} frames a second and is to drive a robot at {fps}. Set "
+                f"{who} was trained at {self.fps} frames a second and would drive a robot at {fps}. Set "
                 f"--robot.fps={self.fps} (--dataset.fps={self.fps} when recording), or train on data of {fps} fps."
             )
         for what, trained, here, remedy in (
@@ -148,7 +148,7 @@ class PolicyContract:
                 break
             if name not in cameras:
                 raise ConfigError(
-                    f"{who} looks at the camera {name!r}, which this robot does not have. There is: "
+                    f"{who} uses the camera {name!r}, which this robot does not have. There is: "
                     f"{', '.join(cameras) or 'none'}. Turn cameras on (--robot.camera=true)."
                 )
             if tuple(cameras[name]) != tuple(shape):

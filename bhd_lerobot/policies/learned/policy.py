@@ -80,7 +80,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
     for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
         if not (folder / f"{name}.json").is_file():
             raise ConfigError(
-                f"The checkpoint {folder} has no {name}.json, so nothing says how its inputs were normalised. Copy it "
+                f"The checkpoint {folder} has no {name}.json, so the normalisation of its inputs is unknown. Copy it "
                 "again; if a LeRobot before 0.4 wrote it, convert it with LeRobot's migrate_policy_normalization.py."
             )
     check_checkpoint(folder)

@@ -273,7 +273,7 @@ class MlpConfig(TrainedConfig):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
         self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept and not self.sight_size:
-            raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
+            raise ConfigError(f"policy.ignore is {self.ignore}, which leaves no input.")
         scan = self.scan
         if scan.is_used and (not scan.beams or scan.start is None or scan.start + scan.beams > width):
             raise ConfigError(
@@ -287,6 +287,6 @@ class MlpConfig(TrainedConfig):
             return
         if len(self.objects) != 3 + len(FIELDS) or self.objects[0] + self.objects[1] * self.objects[2] > width:
             raise ConfigError(
-                f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset tells of no objects with "
+                f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset describes no objects with "
                 f"{', '.join(f'object_0_{one}' for one in FIELDS)}. Leave it false, or record the task 'pick'."
             )

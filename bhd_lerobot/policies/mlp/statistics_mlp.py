@@ -51,7 +51,7 @@ class KeepsStatistics:
             raise ConfigError(
                 f"A part of the weights of this {self.name!r} are statistics of what it was trained on, and this "
                 "dataset has others. Fine-tune it by bhd-train: --fine_tune=CHECKPOINT "
-                "--fine_tune_statistics=dataset; or go on with its run: bhd-train --resume=true."
+                "--fine_tune_statistics=dataset; or continue its run: bhd-train --resume=true."
             )
         parent: Any = super()
         return parent.train(mode)

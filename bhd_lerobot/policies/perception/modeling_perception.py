@@ -305,21 +305,20 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         if not bool(torch.isfinite(self.factor)):
             raise ConfigError(
-                "This bhd_perception does not know how large its errors are: since its last step of training it looked "
-                "at no held-out images, or found nothing in them. Train it with --dataset.eval_split=0.05 and "
-                "--eval_steps=2000, and long enough. Of a training that was stopped, use the checkpoint before, or go "
-                "on with it."
+                "This bhd_perception has no estimate of its errors: since its last training step it saw no held-out "
+                "images, or found nothing in them. Train it with --dataset.eval_split=0.05 and --eval_steps=2000, and "
+                "long enough. If a training was stopped, use the checkpoint before, or continue it."
             )
         self.eval()
         answers = self.look(self.checked({self.config.image_key: images}))[1]
         if not all(bool(torch.isfinite(values).all()) for values in answers.values()):
-            raise ConfigError("This bhd_perception answers with numbers that are not finite. Use another checkpoint.")
+            raise ConfigError("This bhd_perception returns values that are not finite. Use another checkpoint.")
         return self._found(answers, float(self.factor))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Raise an error: there are no actions."""
         raise ConfigError(
-            "bhd_perception sees objects and gives no actions. Use it in a brain: --brain.type=language "
+            "bhd_perception detects objects and gives no actions. Use it in a brain: --brain.type=language "
             "--brain.perception.path=CHECKPOINT."
         )
 

@@ -40,7 +40,7 @@ def _tokens(text: str, length: int) -> Tensor:
         raise ConfigError(f"The instruction {text!r} is no text that UTF-8 can write: {error.reason}.") from None
     if len(encoded) > length:
         raise ConfigError(
-            f"The instruction {text!r} takes {len(encoded)} bytes; this bhd_pixels reads {length}. Say it shorter, or "
+            f"The instruction {text!r} takes {len(encoded)} bytes; this bhd_pixels reads {length}. Shorten it, or "
             "train one with a larger policy.longest_instruction."
         )
     return torch.tensor([byte + 1 for byte in encoded] + [0] * (length - len(encoded)))

@@ -1,5 +1,6 @@
 """n robots under one cerebellum: what a LeRobot `Robot`, the batched runs and a real robot are all made of."""
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -7,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
+import draccus
 import numpy as np
 from numpy.typing import NDArray
 
@@ -252,6 +254,11 @@ class Host(ABC):
         return self.cerebellum.readings.problem
 
     @property
+    def notes(self) -> list[str]:
+        """Nothing has to be known of a simulation before it moves."""
+        return []
+
+    @property
     def estop_pressed(self) -> bool:
         """Whether the emergency stop of any robot is pressed, be it latched already or not."""
         return self.bridge.estop_pressed
@@ -340,6 +347,8 @@ LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "co
 
 def describe(config: Any) -> dict[str, Any]:
     """Return everything about a robot that shapes its data, as plain values; of an absolute path its name."""
+    if not hasattr(config, "clock"):
+        return _described(config)
     left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", *config.not_recorded]
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
@@ -350,6 +359,22 @@ def describe(config: Any) -> dict[str, Any]:
         **values,
         **({"realtime": asdict(config.realtime)} if config.clock == "realtime" else {}),
     }
+
+
+_WHERE = re.compile("id|calibration_dir|port|.*_port|ip|.*_ip|host|address|.*path|.*token|.*password|.*secret", re.I)
+"""Options of another package's robot that say where it is, not what it is."""
+
+
+def _described(config: Any) -> dict[str, Any]:
+    """Return everything about a robot of another package that is not where it is, as plain values."""
+
+    def without_places(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        return {key: without_places(one) for key, one in value.items() if not _WHERE.fullmatch(str(key))}
+
+    described: dict[str, Any] = without_places(draccus.encode(config))
+    return {"type": config.type, **described}
 
 
 def _without_place(value: Any) -> Any:

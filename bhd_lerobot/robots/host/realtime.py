@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.markup import escape
 
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.fifo import RingReader
@@ -110,6 +111,15 @@ class LiveHost:
     def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return commands of the cerebellum in the space of the actions."""
         return self.mirror.to_action(command)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the system refused the real-time process, and the remedy."""
+        return [
+            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
+            for grant in self.link.grants
+            if not grant["granted"]
+        ]
 
     @property
     def estop_pressed(self) -> bool:

@@ -189,6 +189,10 @@ class Robots(Protocol):
         """Why robots were last stopped by a fault, as text; empty if that is not known."""
 
     @property
+    def notes(self) -> list[str]:
+        """What has to be known before they move, a line each, with Rich's markup."""
+
+    @property
     def estop_pressed(self) -> bool:
         """Whether the emergency stop of any robot is pressed, be it latched already or not."""
 

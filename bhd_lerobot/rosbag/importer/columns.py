@@ -77,7 +77,7 @@ def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) ->
     moving = int((silent & _moves(options, columns[keys.OBSERVATION_STATE])).sum())
     drove = f", though the robot moved in {moving} of them" if moving else ""
     if moving and not for_ever:
-        drove += ": --command_timeout=inf is for robots that go on with the last command"
+        drove += ": --command_timeout=inf is for robots that continue with the last command"
     return f"{int(silent.sum())} of {n} frames of the episode {lacking}; their action is 0{drove}"
 
 
@@ -87,8 +87,8 @@ def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) 
     if against <= MOST_UNEXPLAINED * len(driven):
         return None
     return (
-        f"in {against} of {len(driven)} frames of the episode the robot stands though its last command is to drive. "
-        "If it stops by itself when no command comes, say after which time: --command_timeout=S"
+        f"in {against} of {len(driven)} frames of the episode the robot stands though its last command is to drive. If "
+        "it stops by itself when no command comes, give that time: --command_timeout=S"
     )
 
 

@@ -281,7 +281,7 @@ class _RobotBag:
         raise DatasetError(
             f"{self._bag.path}: the robot moves in {moving} of {n} frames ({100 * moving / n:.0f} %) without a command "
             f"of {self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove "
-            f"it with --cmd, or say what is in force while no command comes. {choices}."
+            f"it with --cmd, or choose what is in force while no command comes. {choices}."
         )
 
     def save(self, episode: _Episode) -> int:

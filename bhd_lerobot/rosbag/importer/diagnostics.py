@@ -42,9 +42,9 @@ def pace_warnings(paces: Mapping[str, float]) -> list[str]:
         return []
     topics = ", ".join(f"{topic} ({pace:.2f} s)" for topic, pace in other.items())
     return [
-        f"in a second of the recorder the headers do not go on by a second: {topics}. So it is if a simulation does "
-        "not keep up with the wall clock, or a bag was played at another rate. In the recorder's time the robot moves "
-        "slower or faster than its speeds say; record such a simulation with ros2 bag record --use-sim-time"
+        f"in a second of the recorder the headers do not advance by a second: {topics}. This happens if a simulation "
+        "does not keep up with the wall clock, or a bag was played at another rate. In the recorder's time the robot "
+        "moves slower or faster than its speeds state; record such a simulation with ros2 bag record --use-sim-time"
     ]
 
 

@@ -162,8 +162,8 @@ def _decoded(bag: Bag, topic: Topic, messages: Messages) -> tuple[Messages, list
     what = f"{lost} of the {total} messages of {topic.name} cannot be read"
     if lost > MOST_LOST * total:
         raise DatasetError(
-            f"{bag.path}: {what}, which is more than {100 * MOST_LOST:.0f} %: too many to go on without them. "
-            f"The first: {reason}"
+            f"{bag.path}: {what}, which is more than {100 * MOST_LOST:.0f} %: too many to continue without them. The "
+            f"first: {reason}"
         )
     bag.problems.append(f"{bag.path.name}: {what}, and are left out as if they had been lost; the first: {reason}")
     return messages.part(mask), decoded

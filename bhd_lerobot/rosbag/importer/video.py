@@ -69,7 +69,7 @@ class CameraImages:
                     if image is None or broken > max(1, MOST_LOST * total):
                         raise DatasetError(
                             f"{broken} of {total} images of an episode cannot be decoded, which is more than "
-                            f"{100 * MOST_LOST:.0f} %: too many to go on without them. The first: {reason}"
+                            f"{100 * MOST_LOST:.0f} %: too many to continue without them. The first: {reason}"
                         ) from error
                 before = row
             assert image is not None
@@ -77,8 +77,8 @@ class CameraImages:
             writer.add_image(f"{keys.OBSERVATION_IMAGES}.{self.name}", image)
         if broken:
             self._notes.append(
-                f"{track.topic}: {broken} of {total} images of an episode cannot be decoded; the one before is there "
-                f"in their place. The first: {reason}"
+                f"{track.topic}: {broken} of {total} images of an episode cannot be decoded; the previous image takes "
+                f"their place. The first: {reason}"
             )
         return track.times[shown]
 

@@ -69,8 +69,8 @@ def _decompressed(topic: str, form: str, data: NDArray[np.uint8]) -> NDArray[np.
             return np.asarray(image.convert("RGB"))
     except Image.UnidentifiedImageError as error:
         raise DatasetError(
-            f"An image of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Of compressed depth "
-            "nothing is made."
+            f"An image of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Compressed depth is not "
+            "supported."
         ) from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DatasetError(f"An image of {topic} ({what}) cannot be decoded: {error}.") from error

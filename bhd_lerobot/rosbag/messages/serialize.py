@@ -38,8 +38,7 @@ def decode(msgtype: str, data: bytes) -> Any:
         raise DatasetError(
             f"A message of type {msgtype} is not serialised as plain CDR: it begins with {data[:4].hex(' ')!r}, where "
             "00 00 or 00 01 was expected. Either a plug-in of the recorder has compressed it, in a way that is not "
-            "known here (ros2 bag convert takes that away), or the ROS 2 middleware that was recorded does not write "
-            "CDR."
+            "known here (ros2 bag convert removes it), or the ROS 2 middleware that was recorded does not write CDR."
         )
     try:
         return type_store().deserialize_cdr(data, msgtype)

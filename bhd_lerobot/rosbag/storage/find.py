@@ -36,8 +36,8 @@ def find_bags(path: Path) -> list[Bag]:
     if bag and inside:
         raise DatasetError(
             f"{path} has bag files of its own ({', '.join(file.name for file in bag.files)}) and folders of bags "
-            f"({', '.join(found.path.name for found in inside)}), and it is not known what belongs together. Name the "
-            "bags one by one, or put the files into a folder of their own."
+            f"({', '.join(found.path.name for found in inside)}), so their grouping is not known. Name the bags one by "
+            "one, or put the files into a folder of their own."
         )
     if bag:
         return [bag]

@@ -20,7 +20,7 @@ def refuse_existing(target: Path, option: str) -> None:
         DatasetExistsError: something is there.
     """
     if target.is_symlink() and not target.exists():
-        raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
+        raise DatasetExistsError(f"{target} is a broken link. Remove it, or choose another {option}.")
     remove_abandoned(real(target))  # a name such as ``new/..`` is no name for a folder beside it
     complete_interrupted(target)
     if not is_free(target):

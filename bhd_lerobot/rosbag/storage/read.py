@@ -173,7 +173,7 @@ class Bag:
         if counts["packed"] and not self.per_message:
             yield (
                 f"{name}: its messages are compressed one by one (compression_mode: MESSAGE), which only the missing "
-                "metadata.yaml could say; they were decompressed"
+                "metadata.yaml could state; they were decompressed"
             )
         elif self.expected is not None and counts["all"] < self.expected and not has_problems and not counts["lost"]:
             yield f"{name}: its metadata count {self.expected} messages; it has {counts['all']}"

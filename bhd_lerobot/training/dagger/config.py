@@ -8,6 +8,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options import parse as configuration
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.training.arguments import parse_train
@@ -32,7 +33,7 @@ class StageConfig:
 
     Attributes:
         config: its configuration file.
-        options: of its command line, for example ``["--task.trail=true"]``.
+        options: options of its command line, for example ``["--task.trail=true"]``.
     """
 
     config: str = ""
@@ -52,17 +53,17 @@ class AggregationConfig:
     Attributes:
         algorithm: ``"dagger"``.
         expert: a configuration of `bhd-record`, whose brain is the expert.
-        learner: a configuration of `bhd-record`, with the brain ``dagger``; its learner's path is the last policy.
+        learner: a configuration of `bhd-record`, with the brain ``dagger``; its learner is the last policy.
         policy: a configuration of `bhd-train`.
-        evaluation: a configuration of `bhd-eval`; of it robot and task are used, for the curve over the rounds.
+        evaluation: a configuration of `bhd-eval`, whose robot and task are used for the curve over the rounds.
         data: folders of datasets that were recorded before, of the same robot and task; every round learns from them,
             too.
-        output_dir: where everything goes; the same command continues there with what is not done yet.
-        rounds: rounds after the first.
-        expert_episodes: that the expert drives alone.
-        episodes: that the policy of the last round drives in each further round.
-        validation_episodes: of the split `validation`, that each round's policy is judged by.
-        seed: of the training, and of the recordings: each round has its own episodes.
+        output_dir: folder for all results; the same command continues there with the steps that are missing.
+        rounds: number of rounds after the first.
+        expert_episodes: number of episodes that the expert drives alone.
+        episodes: number of episodes that the policy of the last round drives in each further round.
+        validation_episodes: number of episodes of the split `validation` that evaluate each round's policy.
+        seed: seed of the training and of the recordings; each round has its own episodes.
     """
 
     algorithm: str = ALGORITHM
@@ -115,7 +116,7 @@ def read_stages(config: AggregationConfig) -> Stages:
     """Return what the configurations say, so that what is wrong in one of them is known before the first round."""
     expert = configuration.parse(RecordConfig, command(config.expert, {}))
     learner = configuration.parse(RecordConfig, command(config.learner, {}))
-    kinds = [one.brain.get_choice_name(type(one.brain)) for one in (expert, learner)]
+    kinds = [BrainConfig.get_choice_name(type(one.brain)) for one in (expert, learner)]
     if not isinstance(learner.brain, DaggerConfig):
         raise ConfigError(
             f"learner.config is {config.learner.config!r}, whose brain is {kinds[1]!r}; it must be 'dagger', in which "
@@ -124,8 +125,8 @@ def read_stages(config: AggregationConfig) -> Stages:
     for stage, parsed in ((config.expert, expert), (config.learner, learner)):
         if parsed.split != "train":
             raise ConfigError(
-                f"split is {parsed.split!r} in {stage.config!r}: its episodes are not for learning from, but for "
-                "judging what was learned. Leave it out."
+                f"split is {parsed.split!r} in {stage.config!r}: its episodes are reserved for evaluation. Leave it "
+                "out."
             )
     evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
     for other, name in ((learner, "learner"), (evaluation, "evaluation")):
@@ -135,8 +136,8 @@ def read_stages(config: AggregationConfig) -> Stages:
     if not learner.dataset.expert_action and weight in _names(config.policy):
         raise ConfigError(
             f"The option --{weight} of {config.policy.config!r} weighs frames in which {config.learner.config!r} does "
-            "not record what the expert would have done (dataset.expert_action is false): they are not learned from. "
-            "Leave it out of its options."
+            "not record the expert's action (dataset.expert_action is false): they are not used for training. Leave "
+            "it out of its options."
         )
     return Stages(
         expert=str(kinds[0]),

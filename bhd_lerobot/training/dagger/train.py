@@ -103,7 +103,7 @@ def _check_data(config: AggregationConfig, stages: Stages) -> None:
             )
         if stages.has_advice and EXPERT_ACTION not in found.features:
             raise ConfigError(
-                f"data names {root}, which has no {EXPERT_ACTION}, from which is learned here. Record it with "
+                f"data names {root}, which has no {EXPERT_ACTION} to train on. Record it with "
                 "--dataset.expert_action=true, or leave it out."
             )
 
@@ -115,7 +115,7 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
     """
     before = kept(folder)
     if before is None and folder.exists() and any(folder.iterdir()):
-        raise ConfigError(f"The folder {folder} holds something else. Set another --output_dir.")
+        raise ConfigError(f"The folder {folder} holds other files. Set another --output_dir.")
     files = {stage.config: read_file(Path(stage.config).expanduser()) for stage in config.stages}
     if before is not None:
         _check_same(folder, before, config, files)
@@ -139,8 +139,8 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
             content = known.get(then.config)
             if content is not None and (differing := _differing(content, files[now.config])):
                 raise ConfigError(
-                    f"{now.config} says something else than when the rounds in {folder} were made: "
-                    f"{', '.join(differing)}. Undo that, or set another --output_dir."
+                    f"{now.config} has changed since the rounds in {folder} were made: {', '.join(differing)}. Undo "
+                    "that, or set another --output_dir."
                 )
             same = then.options == now.options and (content is not None or then.config == now.config)
         elif one.name == "data":
@@ -149,8 +149,8 @@ def _check_same(folder: Path, before: AggregationConfig, config: AggregationConf
             same = then == now or one.name in ("rounds", "output_dir")
         if not same:
             raise ConfigError(
-                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. Go "
-                "on with the same, or set another --output_dir."
+                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. "
+                "Continue with the same, or set another --output_dir."
             )
 
 
@@ -222,7 +222,7 @@ class _Rounds:
         policy = self._policy(max(self._rows))
         evaluation = " ".join([self._config.evaluation.config, *self._config.evaluation.options])
         self._console.print(
-            f"Policies, data and curve: {self._folder}. Judge the last policy by episodes that nobody has looked at:\n"
+            f"Policies, data and curve: {self._folder}. Evaluate the last policy on unused episodes:\n"
             f"  bhd-eval --config_path={evaluation} --brains.policy.type=learned "
             f"--brains.policy.path={quoted(policy)}",
             soft_wrap=True,
@@ -320,7 +320,7 @@ class _Rounds:
         status = _PROGRAMS[program](arguments)
         if status:
             again = (
-                "the same command goes on there"
+                "the same command continues there"
                 if status > _SIGNALLED
                 else "when the cause is resolved, the same command repeats this step"
             )
@@ -356,7 +356,7 @@ class _Rounds:
             return list(values["done"]), math.nan if values["seconds"] is None else float(values["seconds"])
         except (ValueError, TypeError, KeyError) as error:
             raise BhdError(
-                f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is done anew."
+                f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is repeated."
             ) from error
 
     def _row(self, number: int, folder: Path) -> dict[str, Any]:
@@ -405,5 +405,5 @@ def _interval(one: dict[str, float]) -> str:
     return f"{one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f})"
 
 
-_KEPT = "Stopped; what is done is kept, and the same command goes on there."
+_KEPT = "Stopped; what is done is kept, and the same command continues there."
 PROGRAM = Program(AggregationConfig, train, parse_aggregation, _KEPT)

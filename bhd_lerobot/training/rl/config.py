@@ -237,8 +237,8 @@ class RlConfig:
             raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {' or '.join(robots_of(wanted))}.")
         if self.validation.seed == self.seed:
             raise ConfigError(
-                f"validation.seed and seed are both {self.seed}; the policy would be judged on the episodes that it "
-                "learned from. Set another --validation.seed."
+                f"validation.seed and seed are both {self.seed}; the policy would be evaluated on its training "
+                "episodes. Set another --validation.seed."
             )
         if self.start_from is None:
             if self.critic_warmup:

@@ -92,7 +92,7 @@ def _from_checkpoint(
     loaded = load_policy(folder)
     who = f"The policy {path!r}"
     if loaded.kind != "bhd_mlp":
-        raise ConfigError(f"{who} is of the type {loaded.kind!r}; PPO starts from a 'bhd_mlp', or from nothing.")
+        raise ConfigError(f"{who} is of the type {loaded.kind!r}; PPO starts from a 'bhd_mlp', or from scratch.")
     trained = PolicyContract.load(folder)
     inputs = loaded.config.input_features
     trained.check(

@@ -75,7 +75,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     except OSError as error:
         raise BhdError(
             f"The run in {folder} cannot be written: {error.strerror or error}. Checkpoints saved before are intact. "
-            f"Make room, and go on with --resume=true --config_path={quoted(folder)}."
+            f"Make room, and continue with --resume=true --config_path={quoted(folder)}."
         ) from error
     finally:
         if not config.resume:
@@ -166,7 +166,7 @@ class _Run:
             clean(result.output_dir)
         if result.step >= config.steps:
             raise ConfigError(
-                f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
+                f"The run has done {result.step} of {config.steps} steps. To continue, set more with --steps."
             )
         _write_config(config, result.output_dir)
         self._metrics = MetricsFile(metrics, rows)
@@ -265,7 +265,7 @@ class _Run:
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
         if self._stop:
             lines.append(
-                f"Stopped by {self._stop.name}. Go on with: bhd-train --resume=true "
+                f"Stopped by {self._stop.name}. Continue with: bhd-train --resume=true "
                 f"--config_path={quoted(result.output_dir)}"
             )
         self._console.print(escape("\n".join(lines)), soft_wrap=True, highlight=False)

@@ -22,6 +22,7 @@ from bhd_lerobot.apps.monitor.monitor import Keys, find
 from bhd_lerobot.apps.monitor.state import Count, Sampler
 from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
+from bhd_lerobot.control.keys import KeySource, KeyTerminal
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import encode_feedback
 from bhd_lerobot.control.timing import TimingStatistics
@@ -296,7 +297,7 @@ def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
     words[Word.PHASE] = Phase.ENDED
     for pause, end in ((0, 0), (1, 0), (0, 1)):
         words[Word.PAUSE], words[Word.END] = pause, end
-        assert "its brain's process is gone" in str(sampler.end())
+        assert "its brain's process has ended" in str(sampler.end())
     words[Word.PAUSE] = words[Word.END] = 1
     assert sampler.end() == "ended"
     robot.block.words[Word.PHASE] = Phase.RUNNING
@@ -445,13 +446,12 @@ def test_leaving_by_ctrl_c_gives_the_terminal_back(robot: Robot, terminal: Termi
     assert robot.block.words[Word.ESTOP] == 0
 
 
-def test_a_stop_does_not_wait_for_an_image() -> None:
+def test_a_stop_does_not_wait_for_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KeyTerminal, "usable", staticmethod(lambda descriptor: True))
     master, slave = pty.openpty()
     pressed = threading.Event()
-    usable = monitor.KeyTerminal.usable
     try:
-        monitor.KeyTerminal.usable = staticmethod(lambda descriptor: True)  # type: ignore[method-assign]
-        with Keys(pressed.set, slave) as keys:
+        with Keys(pressed.set, KeySource(slave)) as keys:
             os.write(master, b"e")
             assert pressed.wait(30)  # nothing is drawn or requested meanwhile
             assert not keys.quit.is_set()
@@ -459,7 +459,6 @@ def test_a_stop_does_not_wait_for_an_image() -> None:
             assert keys.quit.wait(30)
         assert keys.pressed == 1
     finally:
-        monitor.KeyTerminal.usable = usable  # type: ignore[method-assign]
         os.close(master)
         os.close(slave)
 

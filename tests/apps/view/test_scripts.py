@@ -32,3 +32,5 @@ def test_a_phone_keeps_the_transport_controls_in_the_window() -> None:
     timeline = re.findall(r"#timeline \{([^}]*)\}", phone)
     assert len(timeline) == 1
     assert {"position: sticky", "bottom: 0"} <= {rule.strip() for rule in timeline[0].split(";")}
+    sheets = re.findall(r'rel="stylesheet" href="([^"]*)"', (STATIC / "index.html").read_text(encoding="utf-8"))
+    assert sheets[-1] == "/static/style.css"  # else those of the timeline undo it

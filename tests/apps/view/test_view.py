@@ -276,7 +276,7 @@ def server_stamp(server: Served) -> bytes:
     [
         (b"{", 400, "not JSON"),
         ([1], 409, "A mark is an object"),
-        ({}, 409, "Say what to mark"),
+        ({}, 409, "Give a mark"),
         ({"outcome": "splendid"}, 409, "collision"),
         ({"outcome": 3}, 409, "is no mark"),
         ({"score": 1}, 409, "valid: outcome, intervention"),

@@ -477,7 +477,7 @@ def test_what_cannot_be_exported_is_refused_and_changes_nothing(turtlebot3, tmp_
         (turtlebot3, new, ["--episodes=a"], "such as 0,3,5-9"),
         (turtlebot3, new, ["--start_time=-1"], "--start_time is -1"),
         (turtlebot3, new, ["--start_time=nan"], "--start_time is nan"),
-        (turtlebot3, inside, [], "which is to stay as it is"),
+        (turtlebot3, inside, [], "which must not change"),
         (turtlebot3, mine, [], "exists already"),
         (tmp_path / "none", new, [], "none"),
     ):

@@ -564,7 +564,7 @@ def test_options_that_cannot_be_honoured_are_refused(tmp_path, plain, capsys):
         ("--camera=front", "NAME=TOPIC"),
         ("--camera=front=/nothing", "no topic /nothing"),
         ("--scan_yaw=nan", "--scan_yaw is nan"),
-        ("--task=", "Say what the robot was to do"),
+        ("--task=", "Describe the robot's task"),
     ):
         assert message in refused(plain, tmp_path / "d", capsys, argument), argument
 

@@ -341,7 +341,7 @@ def test_images_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messa
     bag = write(tmp_path / "bag", sorted([*messages, *images], key=lambda one: one[1]))
     imported(bag, tmp_path / "d", *arguments)
     error = capsys.readouterr().err
-    assert "images of an episode cannot be decoded; the one before is there in their place" in error
+    assert "images of an episode cannot be decoded; the previous image takes their place" in error
     (_, begin), (_, began) = places(tmp_path / "w")[0], places(tmp_path / "d")[0]
     skipped = round((began - begin) * 10)
     assert 1 <= skipped <= 3

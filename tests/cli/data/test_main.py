@@ -220,7 +220,8 @@ def test_a_recording_in_progress_is_not_called_interrupted(tmp_path, capsys, mon
         ("chek x", "Did you mean 'check'?"),
         ("view x --prt 0", "Did you mean '--port'?"),
         ("info --shrt", "Did you mean '--short'?"),
-        ("check a b", "an argument too many: b"),
+        ("check a b", "unexpected argument: b"),
+        ("pull s3://bucket/data here", "unexpected argument: here. Name the folder to download to with --root=FOLDER."),
     ],
 )
 def test_a_misspelt_command_or_option_gets_the_nearest_name(line, message, capsys):

@@ -46,7 +46,7 @@ def test_the_command_that_is_suggested_is_one_that_works(hub: HubServer, lesson:
     assert main.main(["pull", "me/d", f"--root={target}", "--episodes=1,3-4"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{target}: 3 episodes of 6: 1,3-4"
-    assert "hold all 6. Name yours where you load them" in lines[-2]
+    assert "hold all 6. Select yours when you load them" in lines[-2]
     words = shlex.split(lines[-1])
     assert words[0] == "bhd-train"
     dataset = parse(BhdTrainConfig, [*words[1:], "--policy.type=bhd_mlp", "--policy.push_to_hub=false"]).dataset

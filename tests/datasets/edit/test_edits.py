@@ -191,12 +191,12 @@ def test_bad_requests(plain: Path, tmp_path: Path) -> None:
         (lambda: merge([root, tmp_path / "d/../d"], tmp_path / "x"), ConfigError, "more than once"),
         (lambda: merge([root, tmp_path / "none"], tmp_path / "x"), DatasetError, "does not exist"),
         (lambda: merge([root, plain], root), DatasetExistsError, "exists already. Remove it"),
-        (lambda: keep(root, [0], root / "new"), ConfigError, "which is to stay as it is"),
+        (lambda: keep(root, [0], root / "new"), ConfigError, "which must not change"),
         (lambda: keep(root, [6], tmp_path / "x"), DatasetError, "no episode 6.*0 to 5"),
         (lambda: keep(root, [1, 1], tmp_path / "x"), ConfigError, "twice"),
         (lambda: keep(root, [], tmp_path / "x"), DatasetError, "No episode is left"),
         (lambda: delete(root, range(6)), DatasetError, "No episode is left"),
-        (lambda: split(root, {"a": [0, 1], "b": [1]}, tmp_path / "x"), ConfigError, "'a' and in 'b'"),
+        (lambda: split(root, {"a": [0, 1], "b": [1]}, tmp_path / "x"), ConfigError, "'a' and to 'b'"),
         (lambda: split(root, {"a": [0], "b": []}, tmp_path / "x"), ConfigError, "would have no episode"),
     ):
         with pytest.raises(error, match=text):

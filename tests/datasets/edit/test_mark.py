@@ -134,8 +134,8 @@ def test_bad_requests_change_nothing(tmp_path: Path) -> None:
     root = recorded(tmp_path / "d")
     before = content(root)
     for wanted, error, text in (
-        ({"episodes": [0]}, ConfigError, "what to mark"),
-        ({"episodes": [], "outcome": "success"}, ConfigError, "which episodes"),
+        ({"episodes": [0]}, ConfigError, "Give a mark"),
+        ({"episodes": [], "outcome": "success"}, ConfigError, "Give the episodes"),
         ({"episodes": [0], "outcome": "sucess"}, ConfigError, "Did you mean 'success'"),
         ({"episodes": [3], "outcome": "success"}, DatasetError, "no episode 3.*0 to 2"),
         ({"episodes": [-1], "outcome": "success"}, DatasetError, "no episode -1"),

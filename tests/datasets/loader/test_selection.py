@@ -66,9 +66,9 @@ def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, A
 
 def test_no_episode_left_says_what_there_is(plain: Path) -> None:
     meta = open_metadata(plain)
-    with pytest.raises(DatasetError, match="outcome stuck was asked for, and it has 5 episodes: 3 success, 1 coll"):
+    with pytest.raises(DatasetError, match="filtering by outcome stuck; it has 5 episodes: 3 success, 1 coll"):
         EpisodeFilter("stuck").select(meta)
-    with pytest.raises(DatasetError, match=r"a score of at least 0\.9 was asked"):
+    with pytest.raises(DatasetError, match=r"and a score of at least 0\.9; it has 2"):
         EpisodeFilter("success", min_score=0.9).select(meta, [0, 1])
 
 
@@ -325,7 +325,7 @@ def test_a_data_file_that_does_not_fit_the_metadata(tmp_path: Path) -> None:
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     pq.write_table(table.slice(0, len(table) - 1), path)
-    with pytest.raises(DatasetCorruptError, match="are not those that meta/episodes says"):
+    with pytest.raises(DatasetCorruptError, match="do not match meta/episodes"):
         TableDataset("t/t", root)
     assert len(TableDataset("t/t", root, [0, 1])) == support.length(0) + support.length(1)
     pq.write_table(table.drop_columns(["action"]), path)

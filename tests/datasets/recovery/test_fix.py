@@ -99,7 +99,7 @@ def test_a_file_that_was_being_written_is_no_unfinished_recording(tmp_path: Path
     part.parent.mkdir()
     part.write_text('{"codebase_ver')
     (warning,) = [one for one in check_dataset(root).findings if one.where == ".bhd"]
-    assert "nothing of it was done" in warning.what
+    assert "before it changed anything" in warning.what
     assert fix(root, check_dataset(root).findings)
     assert errors(root) == []
     assert content(root) == before

@@ -260,9 +260,9 @@ def changed_info(source: Path, target: Path, change: dict[str, Any], fps: int = 
 OTHER_INFO: tuple[tuple[dict[str, Any], str], ...] = (
     ({"action": None}, "it does not describe action"),
     ({"force": {"dtype": "float32", "shape": [1], "names": None}}, "it describes force, which is not there"),
-    ({"action": {"dtype": "float32", "shape": [7], "names": None}}, "action has 7 numbers, and it has 2"),
+    ({"action": {"dtype": "float32", "shape": [7], "names": None}}, "action has 7 numbers, but it has 2"),
     ({CAMERA: None}, f"it does not describe {CAMERA}"),
-    ({}, "it says 25 frames a second, and the timestamps say 10"),
+    ({}, "it states 25 frames a second, but the timestamps give 10"),
     ({"note": None}, "no frame of 1 data files can be read"),  # text is in no statistics
 )
 

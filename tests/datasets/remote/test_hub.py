@@ -240,7 +240,7 @@ def test_loading_by_name_says_what_is_wrong(hub: HubServer, root: Path, tmp_path
     send(root)
     with pytest.raises(DatasetError, match="no revision 'old'"):
         local_metadata("me/d", tmp_path / "e", revision="old")
-    with pytest.raises(ConfigError, match="does not say which"):
+    with pytest.raises(ConfigError, match="a dataset of unknown revision"):
         local_metadata("me/d", root, revision="main")
 
 

@@ -310,6 +310,6 @@ def test_what_did_not_arrive_whole_stays_invisible(root: Path, monkeypatch: pyte
     store = StoreDataset("memory://b/short")
     with monkeypatch.context() as patch:
         patch.setattr(store._fs, "put_file", lambda path, target: store._fs.pipe_file(target, b"short"))
-        with pytest.raises(TransferError, match="does not have what was sent"):
+        with pytest.raises(TransferError, match="lacks files that were sent"):
             push(root, store)
     assert layout.INFO not in StoreDataset("memory://b/short").files()

@@ -1,4 +1,4 @@
-"""URLs that are no place for a dataset, each with a sentence that says why."""
+"""URLs that are cannot hold a dataset, each with a sentence that says why."""
 
 from pathlib import Path
 
@@ -22,12 +22,12 @@ from tests.cases import each_case
         ("file:///", "names no folder"),
         ("://b/d", "names no protocol"),
         ("http://127.0.0.1/d", "cannot be written"),
-        ("zip://d.zip", "no place for a dataset"),
-        ("zip://", "no place for a dataset"),
-        ("reference://a/b", "no place for a dataset"),
+        ("zip://d.zip", "cannot hold a dataset"),
+        ("zip://", "cannot hold a dataset"),
+        ("reference://a/b", "cannot hold a dataset"),
         ("simplecache::s3://bucket/d", "a chain"),
-        ("memory://b/a\0b", "characters in it that no URL has"),
-        ("memory://b/a\nb", "characters in it that no URL has"),
+        ("memory://b/a\0b", "characters that are not valid in a URL"),
+        ("memory://b/a\nb", "characters that are not valid in a URL"),
         ("webdav+x://b/d", "Protocol not known"),
     ],
 )

@@ -128,7 +128,7 @@ def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, t
         support.record(recorder)
     assert support.read_back(tmp_path / "new") == 1
     (tmp_path / "dangling").symlink_to("nowhere")
-    with pytest.raises(DatasetExistsError, match="link to nothing"):
+    with pytest.raises(DatasetExistsError, match="broken link"):
         keep(root, [0], tmp_path / "dangling")
 
 
@@ -210,7 +210,7 @@ def test_without_an_atomic_swap_the_content_is_moved_in(root: Path, monkeypatch:
 
 def test_unusual_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "loop").symlink_to("loop")
-    with pytest.raises(DatasetExistsError, match="link to nothing"):
+    with pytest.raises(DatasetExistsError, match="broken link"):
         keep(root, [0], tmp_path / "loop")
     long = tmp_path / ("x" * 250)  # too long for a hidden folder beside it
     shutil.copytree(root, long)
@@ -453,7 +453,7 @@ def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, 
         patch.setattr(Disk, "swap", refuse)
         assert main.main(["delete", str(root), "--episodes=1"]) == 2
     message = capsys.readouterr().err
-    assert "The change is decided, and the next command completes it." in message
+    assert "The change is committed, and the next command completes it." in message
     assert "nothing was changed" not in message
     assert main.main(["info", str(root), "--short"]) == 0
     assert len(content(root)) == 2

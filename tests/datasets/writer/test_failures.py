@@ -176,7 +176,7 @@ def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(DatasetWriteError, match="is a file, not a folder"):
         support.create(tmp_path / "file" / "d")
-    with pytest.raises(DatasetExistsError, match="is no folder"):
+    with pytest.raises(DatasetExistsError, match="is not a folder"):
         support.create(tmp_path / "file")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").touch()

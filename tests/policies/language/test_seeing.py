@@ -348,5 +348,5 @@ def test_options_that_cannot_be_honoured(options: dict[str, Any], message: str) 
 
 
 def test_what_it_does_not_ask_cannot_be_wrong() -> None:
-    with pytest.raises(ConfigError, match=r"camera_error_m is \[0.01, 0, 0\].*does not ask the task"):
+    with pytest.raises(ConfigError, match=r"camera_error_m is \[0.01, 0, 0\].*does not use these poses"):
         LanguageBrainConfig(perception=PerceptionOptions("somewhere"), camera_error_m=[0.01, 0, 0])

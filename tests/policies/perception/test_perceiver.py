@@ -182,7 +182,7 @@ def test_checkpoints_that_are_none(run: Path, tmp_path: Path) -> None:
     weights = load_file(broken / "model.safetensors")
     weights["network.stem.0.0.weight"][...] = math.nan
     save_file(weights, broken / "model.safetensors")
-    with pytest.raises(ConfigError, match="answers with numbers that are not finite"):
+    with pytest.raises(ConfigError, match="returns values that are not finite"):
         Perceiver(PerceptionOptions(str(broken))).look(images(), 0)
     (broken / "model.safetensors").rename(broken / "adapter_model.safetensors")
     with pytest.raises(ConfigError, match="cannot be loaded"):
@@ -209,7 +209,7 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
         told = tmp_path / name
         wrong = {option: value, "task__randomisation__enabled": "true", "dataset__num_episodes": 1, "n_envs": 1}
         run_record(told, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, **wrong)
-        with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn to say that"):
+        with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn them"):
             train(told, tmp_path / "run")
     merge([looks, tmp_path / "report.noise_m"], tmp_path / "merged")
     with pytest.raises(DatasetError, match=r"recorded with task\.report\.noise_m = several values"):
@@ -218,7 +218,7 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
 
 def test_without_held_out_episodes_the_checkpoint_refuses_to_see(looks: Path, tmp_path: Path) -> None:
     train(looks, tmp_path / "run", **{"dataset.eval_split": 0.0, "eval_steps": 0, "steps": 2})
-    with pytest.raises(ConfigError, match="does not know how large its errors are"):
+    with pytest.raises(ConfigError, match="has no estimate of its errors"):
         Perceiver(PerceptionOptions(str(tmp_path / "run"))).look(images(), 0)
 
 

@@ -120,7 +120,7 @@ def test_a_new_look_at_held_out_images_replaces_the_calibration(trained: Percept
 
 
 def test_without_held_out_images_it_refuses_to_see() -> None:
-    with pytest.raises(ConfigError, match=r"does not know how large its errors are.*eval_split"):
+    with pytest.raises(ConfigError, match=r"has no estimate of its errors.*eval_split"):
         PerceptionPolicy(config()).detect(torch.zeros(1, 3, HEIGHT, WIDTH))
 
 
@@ -232,7 +232,7 @@ def test_a_step_of_training_forgets_how_large_errors_were_before(trained: Percep
     policy.config.recolour = policy.config.zoom = 0.5
     with torch.autocast("cpu", torch.bfloat16):  # `policy.use_amp`
         policy.forward(samples)[0].backward()
-    with pytest.raises(ConfigError, match="does not know how large its errors are"):
+    with pytest.raises(ConfigError, match="has no estimate of its errors"):
         policy.detect(samples[IMAGE])
 
 

@@ -77,7 +77,7 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
     monkeypatch.setattr(dagger, "_PROGRAMS", {name: watched(name, name == "bhd-train") for name in PROGRAMS})
     assert main([argument]) == 130
     assert [name for name, _ in called] == ["bhd-record", "bhd-train", "bhd-eval", "bhd-record", "bhd-train"]
-    assert "the same command goes on there" in " ".join(capsys.readouterr().err.split())
+    assert "the same command continues there" in " ".join(capsys.readouterr().err.split())
     assert [row["round"] for row in results(tmp_path)["rounds"]] == [0]
     # The time of what was stopped counts.
     spent = [json.loads((tmp_path / "run" / f"round_{one}" / "done.json").read_text())["seconds"] for one in (0, 1)]
@@ -208,7 +208,7 @@ def test_after_a_failure_the_same_command_is_said_to_repeat_the_step_and_not_to_
     assert main([f"--config_path={settings(tmp_path)}"]) == 2
     printed = " ".join(capsys.readouterr().err.split())
     assert "when the cause is resolved, the same command repeats this step" in printed
-    assert "goes on there" not in printed
+    assert "continues there" not in printed
 
 
 def test_files_that_say_something_else_than_before_are_not_gone_on_with(
@@ -230,7 +230,7 @@ def test_files_that_say_something_else_than_before_are_not_gone_on_with(
     before = values["policy"].get("optimizer_lr")
     assert main([argument]) == 2
     printed = " ".join(capsys.readouterr().err.split())
-    assert f"policy.yaml says something else than when the rounds in {tmp_path / 'run'} were made" in printed
+    assert f"policy.yaml has changed since the rounds in {tmp_path / 'run'} were made" in printed
     assert f"policy.optimizer_lr was {before}, and is 0.5." in printed
 
 
@@ -348,7 +348,7 @@ def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_l
         ),
         (
             {"expert": {"config": "held_out.yaml", "options": BRIEF}},
-            "split is 'held_out' in 'held_out.yaml': its episodes are not for learning from",
+            "split is 'held_out' in 'held_out.yaml': its episodes are reserved for evaluation",
         ),
         ({"data": ["without"]}, r"data names without, which has no expert\.action"),
         (
@@ -374,7 +374,7 @@ def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_l
                 "learner": {"config": "without_advice.yaml", "options": []},
                 "policy": stage("train/bc_ur5_pick_servo", "--selection.learner_weight=2"),
             },
-            "--selection.learner_weight of .* they are not learned from",
+            "--selection.learner_weight of .* they are not used for training",
         ),
         (
             {"learner": stage("record/ur5_pick_servo", "--brain.expert.type=pick")},
@@ -404,7 +404,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path, capsys: pyte
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.txt").write_text("mine")
     assert main([f"--config_path={settings(tmp_path)}"]) == 2
-    assert "holds something else" in " ".join(capsys.readouterr().err.split())
+    assert "holds other files" in " ".join(capsys.readouterr().err.split())
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["thesis.txt"]
 
 

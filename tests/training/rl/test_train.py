@@ -306,7 +306,7 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
     ({"reward__potential": "pose"}, "only a task with a target pose"),
     ({"algorithm": "sac"}, "Valid: ppo"),
-    ({"validation__seed": 0}, "judged on the episodes"),
+    ({"validation__seed": 0}, "evaluated on its training episodes"),
     ({"critic_warmup": 10}, "needs --start_from"),
     ({"robot__type": "ur5", "robot__beams": None}, "this task is for turtlebot3"),
     ({"ppo__gamma": 1.5}, "between 0 and 1"),

@@ -28,7 +28,7 @@ function card(name, episode, onCompareEnd) {
 
 function facts(episode) {
   const { score } = episode.metadata;
-  const found = [`${(episode.frames / episode.fps).toFixed(1)} s`, `${episode.frames} frames`];
+  const found = [`${(episode.frames / episode.fps).toFixed(1)} s`, `${episode.frames} ${episode.frames === 1 ? "frame" : "frames"}`];
   if (typeof score === "number") found.push(`score ${score.toFixed(3)}`);
   for (const [key, [word, unit]] of Object.entries(MEASURES)) {
     if (typeof episode.metadata[key] === "number") found.push(`${word} ${episode.metadata[key].toPrecision(3)} ${unit}`);
@@ -73,9 +73,10 @@ function showAll(episode) {
   for (const [frame, name, code, message] of episode.goals) rows.push([`goal ${name}`, `${code} in frame ${frame}: ${message}`]);
   for (const [key, value] of Object.entries(episode.timing ?? {})) rows.push([`timing: ${key}`, value]);
   const text = (value) => (typeof value === "object" ? JSON.stringify(value) : `${value}`);
+  const breakable = (value) => text(value).split(/(?<=,)/).flatMap((part) => [part, make("wbr")]); // JSON has no spaces
   dialog.replaceChildren(
     make("h2", { tabindex: "-1", autofocus: true }, `Episode ${episode.index}`),
-    rows.length ? make("table", {}, ...rows.map(([key, value]) => make("tr", {}, make("td", {}, key), make("td", { style: { "word-break": "break-word" } }, text(value)))))
+    rows.length ? make("table", {}, ...rows.map(([key, value]) => make("tr", {}, make("td", {}, key), make("td", {}, ...breakable(value)))))
       : make("p", {}, "Nothing but its frames was stored."),
     make("div", { class: "end" }, make("button", { onclick: () => dialog.close() }, "Close")));
   dialog.showModal();

@@ -102,7 +102,7 @@ function built(three, renderer, together) {
   };
 }
 
-const ofExtent = ([x0, x1, y0, y1]) => ({ middle: [(x0 + x1) / 2, (y0 + y1) / 2, 0], size: Math.max(x1 - x0, y1 - y0) });
+const ofExtent = ([x0, x1, y0, y1]) => ({ middle: [(x0 + x1) / 2, (y0 + y1) / 2, 0], size: 0.85 * Math.hypot(x1 - x0, y1 - y0) });
 
 function ofWay(together) {
   const box = [-0.5, 0.5, -0.5, 0.5];

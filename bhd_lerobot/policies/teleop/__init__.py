@@ -1,0 +1,3 @@
+"""A person in the place of a brain, through any LeRobot teleoperator."""
+
+__all__ = ["brain", "calls", "config", "mapping", "takeover"]

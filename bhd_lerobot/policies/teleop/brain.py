@@ -1,0 +1,170 @@
+"""The brain `teleop`: what a person does with a teleoperator is the action."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pkgutil import resolve_name
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import Command
+from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError
+from bhd_lerobot.options.dotted import flattened
+from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.start_pose import StartsFromObservation
+from bhd_lerobot.policies.teleop.calls import Calls
+from bhd_lerobot.policies.teleop.config import TeleopConfig
+from bhd_lerobot.policies.teleop.mapping import ActionMap, Pair
+
+_OURS = "bhd_lerobot."
+
+
+class TeleopBrain(ConfiguredBrain):
+    """Drives one robot with what a person does.
+
+    Attributes:
+        teleop: the teleoperator.
+    """
+
+    name = "teleop"
+    robot_kind = ANY_ROBOT
+    uses_privileged_state = False
+    config: TeleopConfig
+
+    def __init__(self, config: TeleopConfig) -> None:
+        super().__init__(config)
+        self.teleop = _made(config.teleop)
+        self._process = _processor(config.processor)
+        self._calls: Calls | None = None
+        self._map: Callable[[Mapping[str, Any]], dict[str, float] | None] = dict
+        self._robot: RobotFeatures | None = None
+        self._is_starting = True
+        self._answered_s = 0.0
+        self._wait_s = 0.0
+
+    def bind(self, robot: RobotFeatures) -> None:
+        """Connect the teleoperator, and find out where each action of the robot comes from.
+
+        Raises:
+            ConfigError: the teleoperator cannot be connected, or it is not known where an action comes from.
+        """
+        self._robot = robot
+        self._wait_s = 1.0 / robot.fps
+        teleop_type = str(self.config.teleop.type)
+        if not self.teleop.is_connected:
+            try:
+                self.teleop.connect()
+            except ConfigError:
+                raise
+            except Exception as error:  # of another package's code
+                raise ConfigError(
+                    f"The teleoperator {teleop_type!r} cannot be connected: {_words(error)}. Check its power, its "
+                    "cable and its port, and that no other program uses it."
+                ) from error
+        features = tuple(self.teleop.action_features)
+        if set(features) == {"dtype", "shape", "names"}:  # the other form in which LeRobot's teleoperators say it
+            features = tuple(self.teleop.action_features["names"])
+        is_ours = robot.body is not None, type(self.teleop).__module__.startswith(_OURS)
+        if self._process is None:
+            asked = flattened(self.config.map)
+            pair = Pair(teleop_type, robot.robot_type, is_ours[0] == is_ours[1])
+            self._map = ActionMap(asked, pair, features, robot.action_names)
+        self._calls = self._calls or Calls(f"bhd-{teleop_type}")
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        """Start an episode: the teleoperator is given time to answer.
+
+        Raises:
+            ConfigError: there are several robots.
+        """
+        if n != 1:
+            raise ConfigError(f"n_envs is {n}; a person drives one robot: use --n_envs=1.")
+        self._answered_s = time.monotonic()
+        self._is_starting = True
+
+    def act(self, observation: Observation) -> Command:
+        """Return what the person does now; None if nothing.
+
+        Raises:
+            BrainStoppedError: the teleoperator raises, gives no action, or has not answered for `timeout_s`.
+        """
+        if self._calls is None or self._robot is None:
+            raise AssertionError("The brain was not bound.")
+        seen = dict(zip(observation.names, observation.state[0].tolist(), strict=True))
+        teleop_type = self.config.teleop.type
+        try:
+            if isinstance(self.teleop, StartsFromObservation):
+                if self._is_starting:
+                    self.teleop.start_from(seen, self._robot.body)
+                self.teleop.observe(seen)
+            self._is_starting = False
+            has_answered, given = self._calls.call(self.teleop.get_action, self._wait_s)
+            silent = time.monotonic() - self._answered_s
+            if not has_answered:
+                if silent > self.config.timeout_s:
+                    raise BrainStoppedError(f"the teleoperator {teleop_type} has not answered for {silent:.1f} s")
+                return None
+            self._answered_s = time.monotonic()
+            if self._process is not None:
+                images = {name: image[0] for name, image in observation.images.items()}
+                given = self._process(given, {**seen, **images})
+            action = self._map(given)
+        except (ActionError, BrainStoppedError) as error:
+            raise BrainStoppedError(str(error).removesuffix(".")) from error
+        except Exception as error:  # of another package's code
+            raise BrainStoppedError(f"the teleoperator {teleop_type} failed: {_words(error)}") from error
+        if action is None:
+            return None
+        if missing := [name for name in self._robot.action_names if name not in action]:
+            raise BrainStoppedError(f"the processor {self.config.processor} returned no {missing[0]!r}")
+        return np.array([[action[name] for name in self._robot.action_names]], np.float64)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the type of the teleoperator and how its actions are used; not where it is connected."""
+        config = self.config
+        return {
+            "type": self.name,
+            "teleop": str(config.teleop.type),
+            **({"map": config.map} if config.map else {}),
+            **({"processor": config.processor} if config.processor else {}),
+        }
+
+    def close(self) -> None:
+        """Disconnect the teleoperator. May be called twice."""
+        if self._calls is not None:
+            self._calls.close()
+            self._calls = None
+        if self.teleop.is_connected:
+            self.teleop.disconnect()
+
+
+def _made(config: Any) -> Any:
+    from lerobot.teleoperators.utils import make_teleoperator_from_config
+
+    try:
+        return make_teleoperator_from_config(config)
+    except Exception as error:  # of another package's code
+        raise ConfigError(
+            f"teleop.type is {config.type!r}, which cannot be made: {_words(error.__cause__ or error)}."
+        ) from error
+
+
+def _processor(name: str) -> Callable[[Any, Any], Mapping[str, Any]] | None:
+    if not name:
+        return None
+    try:
+        found = resolve_name(name)
+    except Exception as error:  # whatever a module raises while it is imported
+        raise ConfigError(
+            f"processor is {name!r}, which cannot be imported: {_words(error)}. Name a function as "
+            "package.module:name, of a module that Python finds."
+        ) from error
+    if not callable(found):
+        raise ConfigError(f"processor is {name!r}, which cannot be called.")
+    result: Callable[[Any, Any], Mapping[str, Any]] = found
+    return result
+
+
+def _words(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")

@@ -1,0 +1,69 @@
+"""Configuration of the brain `teleop`."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import draccus
+from lerobot.teleoperators.config import TeleoperatorConfig
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import BrainConfig
+
+if TYPE_CHECKING:
+    from lerobot.teleoperators.config import TeleoperatorConfig as PersonConfig
+else:
+
+    class PersonConfig(draccus.ChoiceRegistry):
+        """The configurations of teleoperators that a person holds.
+
+        LeRobot's command lines list the options of every choice, and those of the choices in them: a brain that may
+        hold the teleoperator `bhd_brain`, which holds a brain, would hold itself, without an end.
+        """
+
+        lerobot_package = "lerobot.teleoperators"
+
+        @classmethod
+        def get_known_choices(cls) -> dict[str, Any]:
+            """Return the teleoperators by their types."""
+            known = TeleoperatorConfig.get_known_choices()
+            return {name: choice for name, choice in known.items() if name != "bhd_brain"}
+
+        @classmethod
+        def get_choice_class(cls, name: str) -> Any:
+            """Return the configuration of the teleoperator of this type."""
+            return cls.get_known_choices()[name]
+
+        @classmethod
+        def get_choice_name(cls, subcls: type) -> str:
+            """Return the type of the teleoperator that a configuration is of."""
+            return TeleoperatorConfig.get_choice_name(subcls)
+
+
+@BrainConfig.register_subclass("teleop")
+@dataclass
+class TeleopConfig(BrainConfig):
+    """A person drives, through a teleoperator of LeRobot or of a plug-in.
+
+    Attributes:
+        teleop: the teleoperator, with its own options.
+        map: where actions come from, by their names, if the teleoperator calls them otherwise or has other units:
+            `--map.x.vel='{from: linear_velocity, scale: 0.22}'`, or only a name. `scale` is a number, or
+            `deg_to_rad` or `rad_to_deg`; `offset` is added afterwards.
+        processor: a function `(action, observation) -> action` of dictionaries that stands between teleoperator and
+            robot, as `package.module:name`.
+        timeout_s: a teleoperator that has not answered for so long ends the episode with a fault [s].
+    """
+
+    is_composed: ClassVar[bool] = True
+
+    teleop: PersonConfig
+    map: dict[str, Any] = field(default_factory=dict)
+    processor: str = ""
+    timeout_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.timeout_s < float("inf"):
+            raise ConfigError(f"brain.timeout_s is {self.timeout_s}; it must be positive and finite [s].")
+        module, sign, name = self.processor.partition(":")
+        if self.processor and not (sign and module and name):
+            raise ConfigError(f"brain.processor is {self.processor!r}; name a function as package.module:name.")

@@ -1,0 +1,95 @@
+"""A brain from which a person takes over, and to which they give back."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import Command, CommandResult
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Brain, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
+
+CAUSE = "person"
+
+
+class TakeoverBrain(ConfiguredBrain):
+    """Drives with a brain, and with a person while they have taken over.
+
+    Args:
+        brain: what drives otherwise; it starts afresh whenever it is given back to.
+        person: the person's teleoperator.
+        is_taken: returns whether the person drives now.
+    """
+
+    def __init__(self, brain: Brain, person: TeleopBrain, is_taken: Callable[[], bool]) -> None:
+        if isinstance(brain, GoalBrain):
+            raise ConfigError(
+                f"brain.type is {brain.name!r}, which gives goals; a person can take over from a brain that gives "
+                "actions, such as a trained policy."
+            )
+        super().__init__(None)
+        self._brain, self._person, self._is_taken = brain, person, is_taken
+        self.name, self.robot_kind, self.has_plan = brain.name, brain.robot_kind, brain.has_plan
+        self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
+        self._was_taken = False
+        self._start: tuple[Any, ...] = ()
+
+    def bind(self, robot: RobotFeatures) -> None:
+        """Learn what robot both drive."""
+        self._brain.bind(robot)
+        self._person.bind(robot)
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        """Start an episode."""
+        self._start = ids, seeds, n, instructions
+        self._was_taken = False
+        self._brain.reset(*self._start)
+        self._person.reset(*self._start)
+
+    def act(self, observation: Observation) -> Command:
+        """Return the action of the one who drives."""
+        is_taken = self._is_taken()
+        if is_taken:
+            if not self._was_taken:
+                self._person.reset(*self._start)
+            self._was_taken = True
+            return self._person.act(observation)
+        if self._was_taken:
+            self._was_taken = False
+            self._brain.reset(*self._start)  # what it planned is of another time
+        return self._brain.act(observation)
+
+    def subtasks(self) -> Sequence[str]:
+        """Return what the brain is doing."""
+        return self._brain.subtasks()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the brain's plan."""
+        return self._brain.plan(sim)
+
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return where the brain looks."""
+        return self._brain.looks(results)
+
+    def advice(self) -> NDArray[np.float64] | None:
+        """Return what the brain's expert would do."""
+        return self._brain.advice()
+
+    def interventions(self) -> NDArray[np.bool_]:
+        """Return whether the person drove in the frame that `act` decided last, shape (1,)."""
+        return np.array([self._was_taken])
+
+    def causes(self) -> Sequence[str]:
+        """Return who took over."""
+        return [CAUSE]
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters of both."""
+        return {**self._brain.parameters(), "takeover": self._person.parameters()}
+
+    def close(self) -> None:
+        """Disconnect the teleoperator."""
+        self._person.close()

@@ -1,0 +1,3 @@
+"""Any other LeRobot robot: its calls on an absolute grid of time, and a gate in front of them."""
+
+__all__ = ["config", "device", "gate", "host", "make"]

@@ -1,0 +1,96 @@
+"""The last check of actions before another package's robot: what an interface of positions and speeds allows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import Limit
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.dotted import flattened
+from bhd_lerobot.robots.external.config import GateConfig
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Passed:
+    """What the gate made of an action.
+
+    Attributes:
+        action: what may be sent, shape (actions,).
+        limits: `Limit` flags of what was changed: NON_FINITE, POSITION (the range), VELOCITY (the change).
+    """
+
+    action: Vector
+    limits: int
+
+
+class Gate:
+    """Makes actions finite, keeps them in range, and bounds their change from one frame to the next.
+
+    Args:
+        names: the action's names, in order; those that end in `.vel` are speeds, all others positions.
+        config: the options.
+        known: ranges that the robot's calibration or features say, by name.
+
+    Attributes:
+        lower: lowest values, shape (actions,); -inf where no range is known.
+        upper: highest values, likewise.
+        max_change: largest changes from one frame to the next, likewise.
+
+    Raises:
+        ConfigError: an option names no action.
+    """
+
+    def __init__(self, names: Sequence[str], config: GateConfig, known: Mapping[str, tuple[float, float]]) -> None:
+        self.names = tuple(names)
+        given = flattened(config.range)
+        by_name = flattened(config.max_change) if isinstance(config.max_change, dict) else {}
+        for option, chosen in (("gate.range", given), ("gate.max_change", by_name)):
+            if wrong := [name for name in chosen if name not in self.names]:
+                raise ConfigError(unknown_name(f"action of {option}", wrong[0], self.names))
+        ranges = [given.get(name) or known.get(name) or (-np.inf, np.inf) for name in self.names]
+        self.lower, self.upper = np.array(ranges, np.float64).reshape(-1, 2).T
+        self._is_speed = np.array([name.endswith(".vel") for name in self.names], np.bool_)
+        every = np.inf if by_name or config.max_change is None else float(config.max_change)
+        change = np.where(self._is_speed, np.inf, every)
+        for name, value in by_name.items():
+            change[self.names.index(name)] = value
+        self.max_change = change
+        self._last: Vector | None = None
+
+    def begin(self, measured: Vector) -> None:
+        """Begin an episode from what the robot measures, shape (actions,); NaN where it does not."""
+        self._last = np.where(self._is_speed & ~np.isfinite(measured), 0.0, measured)
+
+    def holding(self) -> Vector:
+        """Return the action that holds the robot: the last positions, no speed; NaN where nothing is known yet."""
+        last = np.full(len(self.names), np.nan) if self._last is None else self._last
+        return np.where(self._is_speed, 0.0, last)
+
+    def passed(self, action: Vector) -> Passed:
+        """Return what may be sent of an action, shape (actions,), and remember it as the last one."""
+        last = np.full(len(self.names), np.nan) if self._last is None else self._last
+        limits = 0
+        finite = np.isfinite(action)
+        if not finite.all():
+            limits |= Limit.NON_FINITE
+            action = np.where(finite, action, self.holding())
+        inside = np.clip(action, self.lower, self.upper)
+        if (inside != action)[finite].any():
+            limits |= Limit.POSITION
+        known = np.isfinite(last)
+        low, high = (np.where(known, last + sign * self.max_change, sign * np.inf) for sign in (-1, 1))
+        # From outside of the range it comes back at the allowed rate.
+        near = np.clip(inside, low, high)
+        if (near != inside)[np.isfinite(inside)].any():
+            limits |= Limit.VELOCITY
+        self._last = np.where(np.isfinite(near), near, last)
+        return Passed(near, int(limits))
+
+    def unlimited(self) -> list[str]:
+        """Return the names of actions whose range is not known."""
+        is_limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        return [name for name, limited in zip(self.names, is_limited, strict=True) if not limited]

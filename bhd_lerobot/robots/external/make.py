@@ -1,0 +1,39 @@
+"""Makes and connects a robot that is not ours."""
+
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.host import LeRobotHost
+
+
+def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
+    """Return the robot that a configuration of LeRobot, or of a plug-in, describes; connected.
+
+    Raises:
+        ConfigError: it cannot be made.
+        RealtimeError: it cannot be connected.
+    """
+    from lerobot.robots.utils import make_robot_from_config
+
+    try:
+        robot = make_robot_from_config(config)
+    except Exception as error:  # of another package's code
+        raise ConfigError(
+            f"robot.type is {config.type!r}, which cannot be made: {_words(error.__cause__ or error)}."
+        ) from error
+    try:
+        host = LeRobotHost(robot, fps, gate)  # what cannot be recorded is found out before the robot is touched
+        robot.connect()
+    except (ConfigError, RealtimeError):
+        raise
+    except Exception as error:  # of another package's code
+        raise RealtimeError(
+            f"The robot {config.type!r} cannot be connected: {_words(error)}. Check its power, its cable and "
+            "robot.port, and that no other program uses it."
+        ) from error
+    return host
+
+
+def _words(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")

@@ -1,0 +1,69 @@
+"""The task `free`: an instruction and a time, for every robot; a person says how an episode ends."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import ARENAS
+from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, TaskConfig
+
+
+@TaskConfig.register_subclass("free")
+@dataclass
+class FreeConfig(TaskConfig):
+    """What a robot is to do, in words.
+
+    Attributes:
+        instruction: what it is to do; also what a policy is told.
+        duration_s: longest duration of an episode [s].
+        arena: where a simulated base is: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``.
+    """
+
+    instruction: str = ""
+    duration_s: float = 60.0
+    arena: str = "turtlebot3_world"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.duration_s < float("inf"):
+            raise ConfigError(f"task.duration_s is {self.duration_s}; it must be positive and finite [s].")
+        if self.arena not in ARENAS:
+            raise ConfigError(unknown_name("task.arena", self.arena, ARENAS))
+
+
+class FreeTask(BaseTask):
+    """An episode ends when a person says how, or when its time is over; there is no reward."""
+
+    name = "free"
+    robot_kind = ""  # every robot
+    needs: frozenset[str] | None = frozenset()
+    config: FreeConfig
+
+    def sample(self, seed: int) -> Any:
+        """Return where a simulated robot is; None if it is not known what robot it is."""
+        if isinstance(self.body, MobileBase):
+            return self.arena(self.config.arena, seed)
+        return TableScene("empty", (), self.body.home) if isinstance(self.body, Arm) else None
+
+    def instruction(self, scene: Any) -> str:
+        """Return the instruction."""
+        return self.config.instruction
+
+    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
+        """Start episodes."""
+        self.frame[ids] = 0
+
+    def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return no reward, and a time-out when the time is over, each of shape (n,)."""
+        self.frame += running
+        event = np.where(running & (self.frame >= self.max_frames), Event.TIMEOUT, Event.NOTHING)
+        return np.zeros(len(self.frame)), event.astype(np.int64)
+
+    def outcome(self, sim: int, event: Event) -> Outcome:
+        """Return how an episode ended: as the person said."""
+        return Outcome(event == Event.SUCCESS, event, float(event == Event.SUCCESS))
