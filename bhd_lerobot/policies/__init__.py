@@ -13,6 +13,8 @@ __all__ = [
     "navigation",
     "perception",
     "pixels",
+    "start_pose",
+    "teleop",
     "trained",
     "trained_steps",
 ]

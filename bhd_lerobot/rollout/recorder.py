@@ -77,7 +77,12 @@ def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain
         about["task"] = _without_new(about["task"], info.recording.get("task"), type(recording.task))
         about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
-    return make(recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about)
+    recorder = make(
+        recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about
+    )
+    if robots.clock is not None and robots.camera_shapes:
+        recorder.encode_in_process()  # on the wall clock the loop waits for no encoder
+    return recorder
 
 
 _BY_OPTION = (EFFORT, EXPERT_ACTION)
@@ -169,12 +174,8 @@ def info_of(root: Path) -> DatasetSummary | None:
 
 def _check_expert(brain: Any) -> None:
     """Raise if nobody states what an expert would do."""
-    advice = getattr(brain, "gives_advice", None)
-    if advice is None and brain.name != "learned":
-        return  # a rule is its own expert
-    if not advice:
-        what = "a policy, and no expert" if advice is None else "with an expert that gives goals"
+    if brain.name == "learned":  # a rule is its own expert
         raise ConfigError(
-            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, {what}. Use a rule, "
-            "or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
+            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, a policy, and no "
+            "expert. Use a rule, or brain.type=dagger with a rule as its expert, such as gap_follower."
         )

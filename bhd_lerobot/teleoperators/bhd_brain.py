@@ -10,24 +10,14 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Rates
 from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
-
-
-class TeleoperatorConfigError(ConfigError, SystemExit):
-    """The brain does not drive the robot that there is.
-
-    LeRobot's commands catch nothing: as a `SystemExit` it ends them with its message, without a traceback.
-    """
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
-        self.code = message
+from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 
 
 class GoalStreamer:
@@ -175,11 +165,6 @@ class BhdBrain(Teleoperator):
         environment = reported[None] if is_privileged(self._brain, names) else None
         observation = Observation(robot.observation_names, state, images, environment, {0: self._results})
         wanted = self._brain.act(observation)
-        if isinstance(wanted, Mixed):
-            raise ConfigError(
-                f"The brain {self._brain_name!r} gives goals in some frames and setpoints in others, which "
-                "`lerobot-teleoperate` and `lerobot-record` cannot do. Use bhd-record."
-            )
         if isinstance(wanted, Goals):
             action, self._results = self._stream(robot, wanted)
         else:
