@@ -9,7 +9,7 @@ from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import CommandLine
 
 
-def _program(line: CommandLine) -> Program:
+def program_of(line: CommandLine) -> Program:
     """Return what evaluates as a command line asks. Only that is imported: environments need LeRobot and torch."""
     if any(name.partition(".")[0] == "env" for name in (*line.options, *line.file)):
         from bhd_lerobot.evaluation.environment import PROGRAM
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keys = [argument.partition("=")[0] for argument in given]
     if "--brain.path" in keys and "--brain.type" not in keys:
         given.append("--brain.type=learned")  # nothing else is somewhere on the disk
-    return run(_program, given)
+    return run(program_of, given)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ class Comparison:
 
 @dataclass
 class EvalConfig(Comparison):
-    """Compare brains on the same episodes.
+    """Compare brains on the same episodes; with `--env.type=TYPE`, policies in an environment of LeRobot.
 
     Attributes:
         robot: the robot, in simulation; with `robot.clock=realtime` on the wall clock.
