@@ -79,6 +79,8 @@ class EnvironmentEvalConfig(Comparison):
         for name, least in (("n_episodes", 1), ("n_envs", 1), ("seed", 0)):
             if (value := getattr(self, name)) < least:
                 raise ConfigError(f"{name} is {value}; it must be at least {least}.")
+        if self.env.fps < 1:
+            raise ConfigError(f"env.fps is {self.env.fps}; it must be at least 1.")
         self.n_envs = min(self.n_envs, self.n_episodes)
 
     @property
@@ -173,7 +175,7 @@ class _Watched:
             raise _StoppedError
         stepped = self._env.step(action)
         _, _, terminated, truncated, info = stepped
-        self.says_success &= "is_success" in info.get("final_info", info) or not (terminated | truncated).any()
+        self.says_success &= "is_success" in info.get("final_info", ("is_success",))
         self._frames += ~self._over
         self._terminated |= terminated & ~self._over
         self._over |= terminated | truncated
@@ -205,7 +207,7 @@ def evaluate_in_environment(config: EnvironmentEvalConfig, console: Console | No
 
     Raises:
         ConfigError: the environment cannot be made, or a policy cannot be loaded or does not fit it.
-        BhdError: a policy or the environment fails in an episode.
+        BhdError: a policy or the environment fails in an episode; the batches that were finished are kept.
     """
     console = console or Console(file=sys.stderr)  # by itself, while LeRobot's bars are kept from the terminal
     refuse_results(config)
@@ -213,14 +215,20 @@ def evaluate_in_environment(config: EnvironmentEvalConfig, console: Console | No
     tasks = _check(config, policies)
     requested = config.n_episodes * len(tasks)
     torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = True  # as lerobot-eval
-    with run_folder(config, "eval", config.name.replace(" ", "_").replace("/", "_")) as folder:
-        pass
-    with stop_on_signals() as stop, progress_bars(console, "success") as progress:
-        bars = [progress.add_task(escape(one.label), total=requested, success="") for one in policies]
-        for one, bar in zip(policies, bars, strict=True):
-            for _ in () if stop else _run(config, one, stop):
-                good = sum(episode.success for episode in one.episodes)
-                progress.update(bar, completed=len(one.episodes), success=f"{good}/{len(one.episodes)} succeeded")
+    failure: BhdError | None = None
+    name = config.name.replace(" ", "_").replace("/", "_")
+    with run_folder(config, "eval", name) as folder, stop_on_signals() as stop:
+        with progress_bars(console, "success") as progress:
+            bars = [progress.add_task(escape(one.label), total=requested, success="") for one in policies]
+            for one, bar in zip(policies, bars, strict=True):
+                try:
+                    for _ in () if stop or failure else _run(config, one, stop):
+                        good, n = sum(episode.success for episode in one.episodes), len(one.episodes)
+                        progress.update(bar, completed=n, success=f"{good}/{n} succeeded")
+                except BhdError as error:
+                    failure = error
+        if failure is not None and not any(one.episodes for one in policies):
+            raise failure
     facts = {
         "env": encode(config)["env"],
         "tasks": tasks,
@@ -252,6 +260,8 @@ def evaluate_in_environment(config: EnvironmentEvalConfig, console: Console | No
     result = EvalResult(folder, results, timing, folder / "report.html", stopped_by=stop)
     no_videos = "videos of an environment of LeRobot are made by lerobot-eval."
     finish(console, config, result, lambda: ReportInput(config, results, timing, {}, [], no_videos, folder))
+    if failure is not None:
+        raise failure
     return result
 
 

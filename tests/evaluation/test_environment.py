@@ -132,23 +132,26 @@ def test_the_report_has_returns_where_there_are_no_scores(compared: Compared, tm
         assert (again in shown) == (not episode["success"])
 
 
+@pytest.mark.parametrize("finished", [0, 2])
 def test_a_signal_ends_the_run_with_the_batches_that_are_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reset = LineEnv.reset
+    step = LineEnv.step
 
-    def pressed(self: LineEnv, *, seed: int | None = None, **given: Any) -> Any:
-        if seed == SEED + 2 * BATCH:
+    def pressed(self: LineEnv, action: Any) -> Any:
+        if self.np_random_seed == SEED + finished * BATCH:
             os.kill(os.getpid(), signal.SIGTERM)
-        return reset(self, seed=seed, **given)
+            monkeypatch.setattr(LineEnv, "step", step)
+        return step(self, action)
 
-    monkeypatch.setattr(LineEnv, "reset", pressed)
+    monkeypatch.setattr(LineEnv, "step", pressed)
     path = save(tmp_path / "policy", 1, 2, [0.0], [1.0])
     run = [f"--n_episodes={3 * BATCH}", f"--n_envs={BATCH}", f"--seed={SEED}", f"--output_dir={tmp_path / 'run'}"]
-    assert main([*LINE, *run, f"--brain.path={path}"]) == 128 + signal.SIGTERM
+    brains = [f"--brains.{label}.path={path}" for label in ("one", "other")]
+    assert main([*LINE, *run, *brains]) == 128 + signal.SIGTERM
     written = results(tmp_path / "run")
     assert written["partial"] is True
-    assert len(written["episodes"]) == 2 * BATCH
+    assert [episode["brain"] for episode in written["episodes"]] == ["one"] * finished * BATCH
     assert "Stopped by SIGTERM: the results are partial" in capsys.readouterr().err
 
 
@@ -164,18 +167,27 @@ def test_an_environment_that_reports_no_success_is_warned_of(
     assert "does not report is_success" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("finished", [0, 2])
 def test_an_environment_that_fails_is_named_with_the_brain(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """What was finished before is kept."""
+    step = LineEnv.step
+
     def broken(self: LineEnv, action: Any) -> Any:
-        raise ValueError("the line is cut")
+        if self.np_random_seed == SEED + finished * BATCH:
+            raise ValueError("the line is cut")
+        return step(self, action)
 
     monkeypatch.setattr(LineEnv, "step", broken)
     path = save(tmp_path / "policy", 1, 2, [0.0], [1.0])
-    assert main([*LINE, f"--brains.mine.path={path}", f"--output_dir={tmp_path / 'run'}"]) == 2
-    said = capsys.readouterr().err
-    assert "brains.mine: the policy" in said
-    assert "ValueError: the line is cut." in said
+    run = [f"--n_episodes={3 * BATCH}", f"--n_envs={BATCH}", f"--seed={SEED}", f"--output_dir={tmp_path / 'run'}"]
+    assert main([*LINE, *run, f"--brains.mine.path={path}"]) == 2
+    printed = capsys.readouterr().err
+    assert "brains.mine: the policy" in printed
+    assert "ValueError: the line is cut." in printed
+    assert len(results(tmp_path / "run")["episodes"] if finished else []) == finished * BATCH
+    assert (tmp_path / "run").exists() == bool(finished)
 
 
 @each_case(
