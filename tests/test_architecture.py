@@ -89,7 +89,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("rollout", "hub", "cluster"),
     ),
     "evaluation": (
-        *("tasks", "control", "robots.host", "policies", "policies.perception"),
+        *("tasks", "control", "robots.external", "robots.host", "policies", "policies.perception"),
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster"),
     ),

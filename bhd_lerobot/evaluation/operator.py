@@ -1,0 +1,74 @@
+"""A person beside a real robot who sets up scenes and judges, and the order in which the brains run."""
+
+import threading
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+
+from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.types import EpisodeSpec
+
+_ORDER_STREAM = 3  # beside the scenes' and the brains' random numbers
+_POLL_S = 0.05
+
+
+def random_order(labels: Sequence[str], index: int, seed: int) -> list[str]:
+    """Return in which order the brains run an episode: at random, by the run's seed and the episode's number."""
+    rng = np.random.default_rng(np.random.SeedSequence([_ORDER_STREAM, seed, index]))
+    return [labels[place] for place in rng.permutation(len(labels))]
+
+
+class Operator(Marks):
+    """A person at the terminal, who is not told which brain runs.
+
+    Args:
+        console: where the prompts are printed.
+        total: number of episodes of all brains.
+        outcomes: what an episode can end with, by name.
+
+    Attributes:
+        is_there: whether a terminal gives keys.
+        has_quit: whether the key q was pressed.
+    """
+
+    def __init__(self, console: Console, total: int, outcomes: Sequence[str]) -> None:
+        super().__init__(1, outcomes)
+        self._console, self._total = console, total
+        self.is_there = self.has_quit = False
+        self._title = ""
+        self._entered = threading.Event()
+
+    def on_key(self, keys: bytes) -> None:
+        """Take keys of a terminal: Enter, q, and those of `Marks`."""
+        self.has_quit |= b"q" in keys.lower()
+        if b"\n" in keys or b"\r" in keys:
+            self._entered.set()
+        super().on_key(keys)
+
+    def set_up(self, number: int, spec: EpisodeSpec, instruction: str, stop: Callable[[], bool]) -> None:
+        """Wait until the person has set up a scene.
+
+        Args:
+            number: of the episode among those of all brains, from 1.
+            spec: the episode.
+            instruction: what the robot is to do.
+            stop: whether the run is to end: then it is not waited for.
+        """
+        self._title = f"Episode {number} of {self._total}"
+        self._entered.clear()
+        if self.is_there:
+            words = f" ({escape(instruction)})" if instruction else ""
+            self._console.print(
+                f"{self._title}, scene {spec.index}{words}: set up the scene, then press Enter", highlight=False
+            )
+            while not (self._entered.wait(_POLL_S) or stop()):
+                pass
+
+    def begin(self, simulations: NDArray[np.intp]) -> None:
+        """Begin an episode: from now on keys judge it."""
+        super().begin(simulations)
+        if self.is_there:
+            self._console.print(f"{self._title} runs: s success, f failure, q end the evaluation", highlight=False)
