@@ -112,6 +112,11 @@ class EvalConfig:
         if self.only is not None and not self.only:
             raise ConfigError("only is empty; name at least one brain, or leave it out.")
         check_engine(self)
+        if isinstance(self.task, FreeConfig) and not self.is_live:
+            raise ConfigError(
+                "task.type is 'free', which a person judges, and robot.clock is 'lockstep', on which nobody can watch. "
+                "Add --robot.clock=realtime, or choose a task that the simulator judges."
+            )
         if not is_ours(self.robot.type):
             self.fps = self.fps or FPS
         self._check_numbers()

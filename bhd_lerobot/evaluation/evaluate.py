@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
@@ -155,7 +155,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     person = Operator(
         console, len(config.chosen) * len(config.indices), outcomes_of(config.task.get_choice_name(type(config.task)))
     )
-    pressed = EstopInputs(robots.estop, person.on_key)
+    pressed = EstopInputs(robots.estop, *([person.on_key] if config.by_person else []))
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as opened:
         pool = None if config.engine == "local" else opened.enter_context(open_pool(config.ray, console))
         runs = []
@@ -316,6 +316,7 @@ def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict
         "jerk_unit": jerk_of(robots).unit,
         **({"sequential": True} if config.sequential else {}),
         **({"order": _orders(config)} if config.by_person else {}),
+        **({"gate": asdict(config.gate)} if robots.body is None else {}),
     }
 
 

@@ -95,6 +95,8 @@ def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str
     ]
     if config.record.repo_id is not None:
         options += ["--record.repo_id=null", "--record.root=null"]
+    if config.sequential:
+        options.append("--sequential=false")
     if config.fail_below is not None:
         options.append("--fail_below=null")  # one episode proves no rate
     return shlex.join(["bhd-eval", *options])
