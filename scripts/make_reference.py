@@ -14,6 +14,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from lerobot.teleoperators.config import TeleoperatorConfig
+
+import bhd_lerobot.plugin  # noqa: F401  registers the teleoperators
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
@@ -30,7 +33,6 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
-from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.training.config import BhdTrainConfig, own_fields
 from bhd_lerobot.training.dagger.config import AggregationConfig
 from bhd_lerobot.training.rl.config import RlConfig
@@ -50,15 +52,15 @@ written `null`.
 | [`bhd-replay`](options/replay.md) | of a replay |
 | [`bhd-eval`](options/eval.md) | of an evaluation |
 | [`bhd-train`](options/train.md) | of a training, also with `algorithm: ppo` and `algorithm: dagger` |
-| [`bhd_brain`](options/bhd_brain.md) | of the teleoperator, for LeRobot's own commands |
+| [`teleop`](options/teleop.md) | of each teleoperator of ours, for LeRobot's own commands, too |
 | [`robot`](options/robot.md), [`brain`](options/brain.md), [`task`](options/task.md) | of each type |
 """
 _TRAIN = """\
 LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their names and
 meaning; they are not listed here.
 """
-_TELEOPERATOR = """\
-For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`.
+_TELEOPERATORS = """\
+Besides these options each has LeRobot's own `teleop.id` and `teleop.calibration_dir`, which ours do not need.
 """
 
 # Groups of classes whose options are listed already: what they are options of, and the page and anchor.
@@ -69,8 +71,9 @@ def pages() -> dict[Path, str]:
     """Return every page, by its file."""
     listed: Listed = {}
     groups = {name: _choices(kind) for name, kind, _ in options_of(RecordConfig)}
+    groups["teleop"] = _choices(TeleoperatorConfig)
     texts = {name: [f"# `{name}`\n"] for name in ("robot", "brain", "task")}
-    for name in texts:
+    for name in (*texts, "teleop"):
         listed[frozenset(groups[name].values())] = name, f"{name}.md"
     for name, text in texts.items():
         for chosen, one in groups[name].items():
@@ -83,10 +86,13 @@ def pages() -> dict[Path, str]:
         *("## `bhd-train` with `algorithm: ppo`\n", *_options(RlConfig, "", "train.md", listed)),
         *("## `bhd-train` with `algorithm: dagger`\n", *_options(AggregationConfig, "", "train.md", listed)),
     ]
-    texts["bhd_brain"] = [
-        *("# Teleoperator `bhd_brain`\n", _TELEOPERATOR),
-        *_options(BhdBrainConfig, "teleop.", "bhd_brain.md", listed),
-    ]
+    texts["teleop"] = ["# `teleop`\n", _TELEOPERATORS]
+    for chosen, one in groups["teleop"].items():
+        own = [name for name, _, _ in options_of(one) if name not in ("id", "calibration_dir")]
+        texts["teleop"] += [
+            f"## `teleop.type={chosen}`\n",
+            *_options(one, "teleop.", "teleop.md", listed, own),
+        ]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():
         page = "\n".join(parts)
@@ -144,7 +150,8 @@ def _options(
         choices = _choices(kind)
         groups = {f"{key}.type={name}": one for name, one in choices.items()}
         if groups:
-            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), "*required*")
+            unset = "`null`" if default is None else "*required*"
+            chosen = next((f"`{name}`" for name, one in choices.items() if one is type(default)), unset)
             rows.append((f"`{key}.type`", ", ".join(f"`{name}`" for name in choices), chosen, meaning))
         elif dataclasses.is_dataclass(kind):
             groups = {key: typing.cast(type, kind)}
@@ -159,7 +166,7 @@ def _options(
             else:
                 listed[classes] = key, f"{page}#{re.sub(r'[^a-z0-9_-]', '', next(iter(groups)))}"
                 inner += [(title, one, f"{key}.") for title, one in groups.items()]
-    yield summary_of(config_class) + "\n"
+    yield from _introduction(config_class)
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
     if elsewhere:
@@ -169,9 +176,15 @@ def _options(
         yield from _options(one, inner_prefix, page, listed)
 
 
+def _introduction(config_class: type) -> Iterator[str]:
+    summary = summary_of(config_class)
+    if not summary.startswith("Configuration of the"):  # the heading says that
+        yield summary + "\n"
+
+
 def _choices(kind: Any) -> dict[str, type]:
     """Return the classes of ours that are registered under a choice type, or nothing if it is none."""
-    known = choices_of(kind) if isinstance(kind, type) else {}
+    known = choices_of(kind)
     return {name: one for name, one in sorted(known.items()) if one.__module__.startswith("bhd_lerobot.")}
 
 

@@ -86,14 +86,17 @@ ARROWS: dict[str, tuple[str, ...]] = {
             *_DATASETS,
             "datasets.writer",
         ),
-        *("rollout", "hub", "cluster"),
+        *("rollout", "teleoperators", "hub", "cluster"),
     ),
     "evaluation": (
         *("tasks", "control", "robots.external", "robots.host", "policies", "policies.perception"),
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster"),
     ),
-    "teleoperators": ("bodies.body", "control", "control.arm", "policies.*", "robots", "registry", "rollout"),
+    "teleoperators": (
+        *("bodies", "control", "control.geometry", "control.arm"),
+        *("policies.*", "robots", "registry"),
+    ),
     "plugin": ("versions", "envs", "policies.*", "registry", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),

@@ -11,13 +11,13 @@ from functools import partial
 from types import FrameType, TracebackType
 from typing import Any, Protocol, Self
 
-from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
+from bhd_lerobot.control.keys import KeySource, key_source
 from bhd_lerobot.errors import ConfigError
 
 SIGNALS = ("SIGUSR1", "SIGUSR2", "SIGQUIT")
 """Signals that may stand for an emergency stop: those that mean nothing else to a run."""
-KEYS = b" e"
-"""Keys of the terminal that press: space and e."""
+KEYS = b" eE"
+"""Keys of the terminal that press: space and e, also as a capital."""
 POLL_S = 0.01  # [s] between two calls of a callable, by default
 _ROUND_S = 0.05  # [s] between two rounds of the thread: how often what stays pressed is pressed again
 _SILENCE_S = 1.0  # [s] a callable that has not answered for so long hangs
@@ -100,7 +100,7 @@ class EstopInputs:
         self._silence: dict[str, int] = {}  # rounds of the thread that a callable may still be silent for
         self._signals: dict[signal.Signals, Any] = {}
         self._pipe: tuple[int, int] | None = None  # signals arrive here even if the main thread is busy
-        self._terminal: KeyTerminal | None = None
+        self._keys: KeySource | None = None
         self._poll = select.poll()
         self._waker, self._wake = os.pipe()
         self._poll.register(self._waker, select.POLLIN)
@@ -139,11 +139,10 @@ class EstopInputs:
         Args:
             descriptor: of the terminal; standard input if None.
         """
-        descriptor = standard_input() if descriptor is None else descriptor
-        if descriptor is None or self._terminal is not None or not KeyTerminal.usable(descriptor):
+        if self._keys is not None or (source := key_source(descriptor)) is None:
             return False
-        self._terminal = KeyTerminal(descriptor)
-        self._watch(descriptor, self._on_terminal_keys)
+        self._keys = source
+        source.subscribe(self._on_terminal_keys, first=True)
         return True
 
     def add_signal(self, number: signal.Signals = signal.SIGUSR1) -> None:
@@ -199,8 +198,6 @@ class EstopInputs:
         if any(key in keys for key in KEYS):
             self._press("key")
         self._on_other_keys(bytes(key for key in keys if key not in KEYS))
-        if not keys and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
-            self._poll.unregister(self._terminal.descriptor)
 
     def _on_button(self, descriptor: int, name: str, received: bytes) -> None:
         if received:
@@ -249,11 +246,6 @@ class EstopInputs:
                 self._count_silence()
 
     def _listen(self, descriptor: int) -> None:
-        terminal = self._terminal
-        is_key = terminal is not None and terminal.descriptor == descriptor
-        if is_key and os.isatty(descriptor) and not KeyTerminal.usable(descriptor):
-            self._stop.wait(_ROUND_S)  # to read now would stop the whole process: the keys are another's
-            return
         try:
             received = os.read(descriptor, 4096)
         except BlockingIOError:
@@ -276,8 +268,8 @@ class EstopInputs:
             return
         self._stop.set()
         os.write(self._wake, b"\0")
-        if self._terminal is not None:
-            self._terminal.restore()
+        if self._keys is not None:
+            self._keys.unsubscribe(self._on_terminal_keys)
         # Outside of the main thread handler and pipe stay, and do nothing any more.
         with contextlib.suppress(ValueError):
             for number, handler in self._signals.items():

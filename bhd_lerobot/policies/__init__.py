@@ -13,6 +13,7 @@ __all__ = [
     "navigation",
     "perception",
     "pixels",
+    "start_pose",
     "trained",
     "trained_steps",
 ]

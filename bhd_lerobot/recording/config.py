@@ -17,6 +17,10 @@ from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
+from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
+    config_bhd_keyboard_arm,
+    config_bhd_keyboard_base,
+)
 
 
 @dataclass
@@ -28,6 +32,8 @@ class DatasetConfig:
         root: folder of the dataset; by default LeRobot's place for `repo_id`.
         fps: frames a second [Hz]; the robot's own if 0.
         num_episodes: total number of episodes in the dataset.
+        reset_time_s: time to set up the scene of a real robot between two episodes [s]; Enter ends it, and a
+            teleoperator drives the robot meanwhile.
         episode_time_s: maximum duration of an episode [s]; by default the task's.
         language: also write the brain's plan and its current step into LeRobot's column `language_persistent`, for
             brains with a plan. Off by default, because PyTorch's collating and `lerobot-dataset-viz` fail on that
@@ -44,6 +50,7 @@ class DatasetConfig:
     fps: int = 0
     num_episodes: int = 50
     episode_time_s: float | None = None
+    reset_time_s: float = 0.0
     language: bool = False
     expert_action: bool = False
     push_to_hub: bool = False
@@ -76,8 +83,8 @@ class RecordConfig:
         output_dir: run folder, for the resolved configuration and images; by default a new one in `outputs/record`.
         preview_video: make an MP4 of the first episode; by default if images can be rendered.
         estop_key: space or `e` in the terminal triggers an emergency stop, `s` ends the episode as a success, `f` as a
-            failure, and `i` begins or ends an intervention; by default if there is a terminal and the robot runs on
-            the wall clock.
+            failure, and `i` begins or ends an intervention (Enter, Backspace and Tab with a keyboard teleoperator of
+            ours); by default if there is a terminal and the robot runs on the wall clock.
         estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
         display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
             these options are those of `lerobot-record`.
@@ -130,6 +137,10 @@ class RecordConfig:
         ):
             if value < 1:
                 raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        if not 0 <= self.dataset.reset_time_s < float("inf"):
+            raise ConfigError(
+                f"dataset.reset_time_s is {self.dataset.reset_time_s}; it must be finite and not negative."
+            )
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)

@@ -1,6 +1,6 @@
 """What drives a recording: a brain, a person, or a brain from which a person takes over."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -9,7 +9,8 @@ from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_brain
-from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks
+from bhd_lerobot.teleoperators.keyboard import KeyboardConfig
 
 
 @contextmanager
@@ -31,3 +32,9 @@ def open_driver(config: RecordConfig, marks: Marks) -> Iterator[Any]:
     finally:
         if isinstance(brain, TeleopBrain | TakeoverBrain):
             brain.close()
+
+
+def mark_keys(config: RecordConfig) -> Sequence[MarkKey]:
+    """Return the keys that mark episodes: not letters while a person drives by those."""
+    person = config.brain.teleop if isinstance(config.brain, TeleopConfig) else config.teleop
+    return TELEOP_KEYS if isinstance(person, KeyboardConfig) else KEYS

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
+from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.datasets.format.features import (
@@ -25,13 +26,14 @@ from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.driver import open_driver
+from bhd_lerobot.recording.driver import mark_keys, open_driver
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_summary
-from bhd_lerobot.registry import make_robot, make_simulation, make_task
+from bhd_lerobot.recording.reset import ResetPhase
+from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
-from bhd_lerobot.rollout.marks import KEYS, Marks
+from bhd_lerobot.rollout.marks import Marks, key_help
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.progress import print_notes, progress_bars
@@ -52,25 +54,24 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    if config.resume and not is_free(root):
+    if config.resume and is_ours(config.robot.type) and not is_free(root):
         _keep_to(root, config.robot, console)
-    is_here = config.engine == "local"  # otherwise one robots, which only states what is recorded
+    is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
     robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))))
+    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))), mark_keys(config))
     pressed = EstopInputs(robots.estop, marks.on_key)
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
         task = _judged_task(config, robots, console)
         brain = cluster.enter_context(open_driver(config, marks))
-        # A brain that does not fit the robot fails here, before a dataset exists.
-        if is_here:
-            loop = EpisodeLoop(robots, task, brain, config.timing)
-        else:
-            pool = cluster.enter_context(open_pool(config.ray, console))
-            loop = ClusterLoop(robots, task, brain, config.timing, pool=pool, config=config, brain_config=config.brain)
+        pool = None if is_here else cluster.enter_context(open_pool(config.ray, console))
+        loop = _make_loop(config, robots, task, brain, pool)
         loop.marks = marks
+        if robots.clock is not None and robots.world is None:
+            seconds = config.dataset.reset_time_s
+            loop.before_start = ResetPhase(robots, brain, marks, seconds, stop=lambda: bool(stop), console=console)
         print_notes(robots, console)
         preview = _make_preview(config, robots, console)
         if robots.camera_shapes and is_here:
@@ -100,6 +101,13 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     if config.dataset.push_to_hub:
         _push(config, result, console)
     return result
+
+
+def _make_loop(config: RecordConfig, robots: Robots, task: Task, brain: Any, pool: WorkerPool | None) -> EpisodeLoop:
+    """Return what runs the episodes; a brain that does not fit the robot fails here, before a dataset exists."""
+    if pool is None:
+        return EpisodeLoop(robots, task, brain, config.timing)
+    return ClusterLoop(robots, task, brain, config.timing, pool=pool, config=config, brain_config=config.brain)
 
 
 def _run(
@@ -192,7 +200,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
     if has_key:
-        console.print(f"Keys: {KEYS}")
+        console.print(f"Keys: {key_help(mark_keys(config))}")
 
 
 def _recording(config: RecordConfig, root: Path) -> Recording:
@@ -215,8 +223,8 @@ def _judged_task(config: RecordConfig, robots: Robots, console: Console) -> Task
     task = judged(task, robots.knows, robots.n, config.dataset.fps)
     if isinstance(task, OperatorTask):
         console.print(
-            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with the keys s "
-            "(success) and f (failure); otherwise it ends in a time-out."
+            f"The robot does not measure what {task.name!r} is judged by: mark the end of each episode with a key "
+            f"({key_help(mark_keys(config))}); otherwise it ends in a time-out."
         )
     return task
 

@@ -39,6 +39,7 @@ class EpisodeLoop:
     recorded action, applied again, is exactly the action that was applied.
 
     Attributes:
+        before_start: called before an episode starts, with its specification: a person may have to set up its scene.
         observer: receives every frame of every simulation, and every image; None if there is none.
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
         fault: whether a real robot's fault has, or a brain that has stopped.
@@ -47,6 +48,7 @@ class EpisodeLoop:
     """
 
     observer: Observer | None = None
+    before_start: Callable[[EpisodeSpec], None] | None = None
 
     def __init__(
         self,
@@ -114,6 +116,9 @@ class EpisodeLoop:
                 if stop():
                     return
                 finished = self._frame()
+                if self.marks.take_again() and not finished:
+                    self._take_again(waiting)
+                    continue
                 for sim, event in finished:
                     episode = self._finish(sim, event)
                     done[episode.spec.index] = episode
@@ -134,6 +139,16 @@ class EpisodeLoop:
                 if episode.writer is not None:
                     episode.writer.discard()
 
+    def _take_again(self, waiting: list[EpisodeSpec]) -> None:
+        """Discard the running take of the first robot, and start it again."""
+        first, spec = np.zeros(1, np.intp), self._specs[0]
+        if spec is None or not self.robots.running[0]:
+            return
+        self.robots.stop(first)
+        self._images.drop(0)
+        waiting.append(spec)
+        self._start(first, waiting)
+
     def _start(self, ids: NDArray[np.intp], waiting: list[EpisodeSpec]) -> None:
         """Start the next episodes in idle simulations."""
         ids = ids[: len(waiting)]
@@ -144,6 +159,8 @@ class EpisodeLoop:
         if self.emergency_stop or self.fault:
             waiting.clear()
             return
+        if self.before_start is not None:
+            self.before_start(waiting[-1])
         specs = [waiting.pop() for _ in ids]
         scenes = [self.task.sample(spec.seed) for spec in specs]
         states = self.robots.reset(ids, scenes, [spec.seed for spec in specs])

@@ -71,15 +71,18 @@ class EpisodeImages:
         sink, self.sinks[sim] = self.sinks[sim], None
         return sink
 
+    def drop(self, sim: int) -> None:
+        """Drop the images of one episode that is running."""
+        futures.wait(self._pending[sim])
+        self._pending[sim].clear()
+        sink, self.sinks[sim] = self.sinks[sim], None
+        if sink is not None:
+            sink.discard()
+
     def discard(self) -> None:
         """Drop the images of all episodes that are running."""
-        for pending in self._pending:
-            futures.wait(pending)
-            pending.clear()
-        for sim, sink in enumerate(self.sinks):
-            self.sinks[sim] = None
-            if sink is not None:
-                sink.discard()
+        for sim in range(len(self.sinks)):
+            self.drop(sim)
 
 
 def _show(observer: Observer, sim: int, key: str, image: futures.Future[Image]) -> None:

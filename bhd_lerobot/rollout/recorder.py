@@ -77,7 +77,12 @@ def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain
         about["task"] = _without_new(about["task"], info.recording.get("task"), type(recording.task))
         about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
-    return make(recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about)
+    recorder = make(
+        recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about
+    )
+    if robots.clock is not None and robots.camera_shapes:
+        recorder.encode_in_process()  # on the wall clock the loop waits for no encoder
+    return recorder
 
 
 _BY_OPTION = (EFFORT, EXPERT_ACTION)

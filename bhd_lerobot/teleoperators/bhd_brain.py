@@ -17,17 +17,7 @@ from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_pri
 from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
-
-
-class TeleoperatorConfigError(ConfigError, SystemExit):
-    """The brain does not drive the robot that there is.
-
-    LeRobot's commands catch nothing: as a `SystemExit` it ends them with its message, without a traceback.
-    """
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
-        self.code = message
+from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 
 
 class GoalStreamer:

@@ -327,7 +327,7 @@ def test_space_and_e_press_at_once_and_other_keys_do_not(terminal):
     mode = termios.tcgetattr(one.device)
     assert not mode[3] & (termios.ICANON | termios.ECHO)
     assert mode[3] & termios.ISIG
-    for keys in (b" ", b"e", b"xyz e\n"):  # no Enter is needed
+    for keys in (b" ", b"e", b"E", b"xyz e\n"):  # no Enter is needed
         one.type(b"qx\n")
         one.type(keys)
         one.expect("pressed")

@@ -7,19 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from numpy.typing import NDArray
 
 from bhd_lerobot.cli.record import main
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks, key_help
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event
+from tests.cases import each_case
 from tests.forks import Fork
 from tests.waiting import until
 
@@ -53,16 +57,50 @@ def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
     assert marks.frame(np.array([hard, Event.TIMEOUT]), ALL)[0].tolist() == [hard, Event.SUCCESS]
 
 
-def test_keys() -> None:
-    marks = Marks(2)
-    marks.on_key(b"xI")
-    assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
-    marks.on_key(b"i")
+@each_case(
+    ("keys", "others", "typed"),
+    [
+        (KEYS, b"xe \r\t\x7f\xff", (b"sS", b"fF", b"iI", b"rR", b"pP")),
+        (TELEOP_KEYS, b"sfirx e\xff", (b"\r\n", b"\x7f\b", b"\t", b"tT", b"pP")),
+    ],
+)
+def test_keys(keys: tuple[MarkKey, ...], others: bytes, typed: tuple[bytes, ...]) -> None:
+    success, failure, intervention, again, pause = typed
+    marks = Marks(2, keys=keys)
+    marks.on_key(others)
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
     assert not marks.frame(NOTHING, ALL)[1].any()
-    marks.on_key(b"f\xff")
-    assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.FAILURE, 0]
-    marks.on_key(b"fs")
+    assert not marks.take_again()
+    assert not marks.is_paused
+    for key in intervention:
+        marks.on_key(others + bytes([key]))
+        assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
+        marks.on_key(bytes([key]))
+        assert not marks.frame(NOTHING, ALL)[1].any()
+    for sent, event in ((success, Event.SUCCESS), (failure, Event.FAILURE)):
+        for key in sent:
+            marks.on_key(bytes([key, others[0]]))
+            assert marks.frame(NOTHING, ALL)[0].tolist() == [event, 0]
+    marks.on_key(failure + success)  # the last one counts
     assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.SUCCESS, 0]
+    for key in again:
+        marks.on_key(bytes([key]))
+        assert marks.take_again()
+        assert not marks.take_again()
+    for key in pause:
+        marks.on_key(bytes([key]))
+        assert marks.is_paused == (key == pause[0])
+    with marks.waiting() as is_pressed:
+        assert not is_pressed()
+        marks.on_key(b"\r")  # begins the next episode, and is no success of it
+        assert is_pressed()
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
+
+
+def test_the_help_names_every_key() -> None:
+    rest = "discards this take and records it again, p pauses before the next episode"
+    assert key_help(KEYS) == f"s success, f failure, i intervention begins or ends, r {rest}"
+    assert key_help(TELEOP_KEYS) == f"Enter success, Backspace failure, Tab intervention begins or ends, t {rest}"
 
 
 def test_wrong_names_are_refused() -> None:
@@ -123,24 +161,43 @@ def test_in_the_loop_an_intervention_flags_its_frames() -> None:
     np.testing.assert_array_equal(marked[0].columns[keys.ACTION], plain[0].columns[keys.ACTION])
 
 
-def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
-    """`s` in a terminal ends an episode on the wall clock, minutes before its time is up."""
-    from bhd_lerobot.datasets.format.summary import dataset_info
+def record_at_a_terminal(folder: Path, typed: bytes, *options: str) -> dict[str, NDArray]:
+    """Record an episode of minutes in a terminal in which keys are pressed again and again; return its columns.
 
+    A mark ends it at once. Marks between two episodes are dropped: the keys are repeated until they take effect.
+    """
     ours, theirs = pty.openpty()
-    root, log = Path(__file__).resolve().parents[2], tmp_path / "log"
+    log = folder / "log"
     arguments = [
-        f"--config_path={root}/configs/record/turtlebot3_avoid.yaml", "--robot.clock=realtime", "--robot.beams=36",
-        f"--dataset.root={tmp_path}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
-        f"--output_dir={tmp_path}/o", "--dataset.episode_time_s=600",
+        *options, "--robot.type=turtlebot3", "--robot.clock=realtime", "--robot.beams=36",
+        f"--dataset.root={folder}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
+        f"--output_dir={folder}/o", "--dataset.episode_time_s=600",
     ]  # fmt: skip
     process = Fork(main, arguments, output=log, terminal=theirs)
     os.close(theirs)
-    until(lambda: process.poll() is not None or "s success, f failure" in log.read_text())
+    until(lambda: process.poll() is not None or " success, " in log.read_text())
     while process.poll() is None:
-        os.write(ours, b"s")  # marks between two episodes are dropped, so it is repeated until it takes effect
-        time.sleep(0.2)
+        for key in typed:
+            os.write(ours, bytes([key]))
+            time.sleep(0.2)
     os.close(ours)
     assert process.wait() == 0, log.read_text()
-    (episode,) = dataset_info(tmp_path / "d").episodes
+    (episode,) = dataset_info(folder / "d").episodes
     assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)
+    (data,) = (folder / "d" / "data").rglob("*.parquet")
+    table = pq.read_table(data)
+    return {name: np.array(table[name].to_pylist()) for name in (keys.ACTION, keys.EVENT)}
+
+
+def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[2]
+    record_at_a_terminal(tmp_path, b"s", f"--config_path={root}/configs/record/turtlebot3_avoid.yaml")
+
+
+@pytest.mark.thorough
+def test_by_keys_a_person_drives_and_marks(tmp_path: Path) -> None:
+    """`s`, `f` and `i` belong to the teleoperator; Enter marks."""
+    options = ("--teleop.type=bhd_keyboard_base", "--task.instruction=Drive.", "--task.arena=empty")
+    columns = record_at_a_terminal(tmp_path, b"sfi" * 4 + b"\r", *options)
+    assert [0.22, 0.0] in columns[keys.ACTION].round(6).tolist()
+    assert columns[keys.EVENT].tolist()[:-1] == [Event.NOTHING] * (len(columns[keys.EVENT]) - 1)

@@ -3,8 +3,6 @@
 import argparse
 import json
 import math
-import os
-import select
 import sys
 import threading
 import time
@@ -17,7 +15,8 @@ from rich.live import Live
 
 from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
 from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
-from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
+from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
+from bhd_lerobot.control.keys import KeySource, key_source
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
@@ -72,60 +71,43 @@ class Keys:
 
     Args:
         estop: what an emergency stop does.
-        descriptor: the terminal's; keys are left alone if None.
+        source: the keys of a terminal, or None if there is none.
 
     Attributes:
         quit: set when the user wants to leave.
         pressed: how often the emergency stop was pressed.
     """
 
-    def __init__(self, estop: Callable[[], None], descriptor: int | None) -> None:
+    def __init__(self, estop: Callable[[], None], source: KeySource | None) -> None:
         self.quit = threading.Event()
         self.pressed = 0
         self._estop = estop
-        self._terminal = KeyTerminal(descriptor) if descriptor is not None and KeyTerminal.usable(descriptor) else None
-        self._wake, self._waker = os.pipe()
-        self._thread = threading.Thread(target=self._work, name="bhd-monitor-keys", daemon=True)
-        if self._terminal is not None:
-            self._thread.start()
+        self._source = source
 
     @property
     def there(self) -> bool:
         """Whether there is a terminal to press keys in."""
-        return self._terminal is not None
+        return self._source is not None
 
-    def _work(self) -> None:
-        terminal = self._terminal
-        while terminal is not None:
-            ready, _, _ = select.select([terminal.descriptor, self._wake], [], [])
-            if self._wake in ready:
-                return
-            try:
-                keys = os.read(terminal.descriptor, 64)
-            except OSError:
-                keys = b""
-            if any(key in b" eE" for key in keys):
-                self._estop()
-                self.pressed += 1
-            if not keys or any(key in b"qQ\x04" for key in keys):
-                self.quit.set()
-            if not keys:
-                return
+    def _on_keys(self, keys: bytes) -> None:
+        if any(key in keys for key in ESTOP_KEYS):
+            self._estop()
+            self.pressed += 1
+        if not keys or any(key in b"qQ\x04" for key in keys):
+            self.quit.set()
 
     def __enter__(self) -> Self:
-        """Return itself."""
+        """Take the terminal."""
+        if self._source is not None:
+            self._source.subscribe(self._on_keys)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Give the terminal back."""
-        os.write(self._waker, b"\0")
-        if self._terminal is not None:
-            self._thread.join(1.0)
-            self._terminal.restore()
-        os.close(self._wake)
-        os.close(self._waker)
+        if self._source is not None:
+            self._source.unsubscribe(self._on_keys)
 
 
 def watch(
@@ -151,7 +133,7 @@ def watch(
 
 
 def _live(block: LiveBlock, sampler: Sampler, console: Console, end: float) -> str | None:
-    with Keys(block.set_estop, standard_input()) as keys:
+    with Keys(block.set_estop, key_source()) as keys:
         offered = KEYS if keys.there else "No keys: standard input is no terminal. Ctrl-C: quit"
         with Live(console=console, screen=True, auto_refresh=False) as live:
 

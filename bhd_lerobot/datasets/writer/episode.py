@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from bhd_lerobot.datasets.format.schema import LANGUAGE, Column, Schema
 from bhd_lerobot.datasets.format.video import CameraEncoder, EncodedVideo, VideoSettings
 from bhd_lerobot.datasets.storage.disk import Disk, write_errors
+from bhd_lerobot.datasets.writer.encoder_process import RemoteEncoder
 from bhd_lerobot.errors import FrameError, unknown_name
 
 _FIRST_CAPACITY = 64
+EncoderMaker = Callable[[Path, int, tuple[int, int], VideoSettings], CameraEncoder | RemoteEncoder]
 
 
 class EpisodeWriter:
@@ -30,6 +32,7 @@ class EpisodeWriter:
         folder: Path,
         disk: Disk,
         video: VideoSettings,
+        make_encoder: EncoderMaker,
         on_close: Callable[["EpisodeWriter"], None],
     ) -> None:
         """Start empty.
@@ -40,6 +43,7 @@ class EpisodeWriter:
             folder: staging folder of this episode; made when there is something to put in it.
             disk: how to write.
             video: how to encode images.
+            make_encoder: makes the encoder of a camera.
             on_close: called once when the episode was saved or discarded.
         """
         self.folder = folder
@@ -49,7 +53,8 @@ class EpisodeWriter:
         self._buffers: dict[str, np.ndarray] = {}
         self._rows = 0
         self._by_frame: bool | None = None
-        self._encoders: dict[str, CameraEncoder | EncodedVideo] = {}
+        self._make_encoder = make_encoder
+        self._encoders: dict[str, CameraEncoder | RemoteEncoder | EncodedVideo] = {}
         self._closed = False
 
     @property
@@ -128,7 +133,7 @@ class EpisodeWriter:
                     raise FrameError(unknown_name("camera", key, self._schema.videos))
                 self._disk.make_folder(self.folder)
                 path = self.folder / f"{key}.mp4"
-                encoder = CameraEncoder(path, self._fps, self._schema.videos[key], self._video)
+                encoder = self._make_encoder(path, self._fps, self._schema.videos[key], self._video)
                 self._encoders[key] = encoder
             if isinstance(encoder, EncodedVideo):
                 raise FrameError(f"The video of camera {key!r} is complete; it takes no more images.")

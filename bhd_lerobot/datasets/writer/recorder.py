@@ -15,12 +15,13 @@ from bhd_lerobot.datasets.format.episode_table import checked_metadata, metadata
 from bhd_lerobot.datasets.format.identity import FORMAT, as_json, check_identity, default_root
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, slot_of
-from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.datasets.recovery.repair import settle
 from bhd_lerobot.datasets.recovery.salvage import RepairReport
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
 from bhd_lerobot.datasets.writer.commit import Committer, EpisodeContent
+from bhd_lerobot.datasets.writer.encoder_process import EncoderProcess
 from bhd_lerobot.datasets.writer.episode import EpisodeWriter
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, FrameError
 
@@ -63,6 +64,7 @@ class DatasetRecorder:
         self._stats: dict[int, EpisodeStats] = {}
         self._open: list[EpisodeWriter] = []
         self._begun = 0
+        self._encoders: EncoderProcess | None = None
         self._is_uncertain = False
         self._finalized = False
 
@@ -173,13 +175,27 @@ class DatasetRecorder:
         """Frames of all saved episodes."""
         return self._state.num_frames
 
+    def encode_in_process(self) -> None:
+        """Encode the videos of coming episodes in a process of their own: `add_image` does not wait any more.
+
+        It takes longer to start than to encode a short episode; for what must not be held up, such as a real robot.
+        """
+        if self._encoders is None:
+            self._encoders = EncoderProcess()
+
     def begin_episode(self) -> EpisodeWriter:
         """Return a writer for a new episode. Its index is given when it is saved."""
         self._check_not_finalized()
         folder = self.root / layout.STAGING / f"episode-{self._begun}"
         self._begun += 1
         episode = EpisodeWriter(
-            self._schema, self.fps, folder=folder, disk=self._disk, video=self._video, on_close=self._close_episode
+            self._schema,
+            self.fps,
+            folder=folder,
+            disk=self._disk,
+            video=self._video,
+            make_encoder=CameraEncoder if self._encoders is None else self._encoders.encoder,
+            on_close=self._close_episode,
         )
         self._open.append(episode)
         return episode
@@ -257,6 +273,9 @@ class DatasetRecorder:
             self._finalized = True
         finally:
             self._lock.release()
+            if self._encoders is not None:
+                self._encoders.close()
+                self._encoders = None
 
     def __enter__(self) -> Self:
         """Return the recorder itself."""

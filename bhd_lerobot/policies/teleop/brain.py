@@ -12,6 +12,7 @@ from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError
 from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.calls import Calls
 from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.policies.teleop.mapping import ActionMap, Pair
@@ -38,6 +39,7 @@ class TeleopBrain(ConfiguredBrain):
         self._calls: Calls | None = None
         self._map: Callable[[Mapping[str, Any]], dict[str, float] | None] = dict
         self._robot: RobotFeatures | None = None
+        self._is_starting = True
         self._answered_s = 0.0
         self._wait_s = 0.0
 
@@ -79,6 +81,7 @@ class TeleopBrain(ConfiguredBrain):
         if n != 1:
             raise ConfigError(f"n_envs is {n}; a person drives one robot: use --n_envs=1.")
         self._answered_s = time.monotonic()
+        self._is_starting = True
 
     def act(self, observation: Observation) -> Command:
         """Return what the person does now; None if nothing.
@@ -89,11 +92,13 @@ class TeleopBrain(ConfiguredBrain):
         if self._calls is None or self._robot is None:
             raise AssertionError("The brain was not bound.")
         seen = dict(zip(observation.names, observation.state[0].tolist(), strict=True))
-        start_from = getattr(self.teleop, "start_from", None)  # of ours: a pose is moved from where the robot is
         teleop_type = self.config.teleop.type
         try:
-            if start_from is not None:
-                start_from(seen)
+            if isinstance(self.teleop, StartsFromObservation):
+                if self._is_starting:
+                    self.teleop.start_from(seen, self._robot.body)
+                self.teleop.observe(seen)
+            self._is_starting = False
             has_answered, given = self._calls.call(self.teleop.get_action, self._wait_s)
             silent = time.monotonic() - self._answered_s
             if not has_answered:

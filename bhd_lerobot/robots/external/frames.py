@@ -246,10 +246,12 @@ class FrameThread:
                         frame.mode = Mode.ESTOP
                         return self._where_it_is(frame)
                 elif self._command is not None:
-                    (frame.requested, self._came_ns), self._command = self._command, None
+                    (requested, self._came_ns), self._command = self._command, None
                     frame.mode = Mode.TRACKING
-                    passed = self._gate.passed(frame.requested)
+                    passed = self._gate.passed(requested)
                     frame.limits |= passed.limits
+                    # What is not finite cannot be learned from: it is flagged, and what was sent is recorded instead.
+                    frame.requested = np.where(np.isfinite(requested), requested, passed.action)
                     return passed.action
                 elif silent > config.end_timeout_s:
                     raise RealtimeError(f"the brain has given no action for {silent:.1f} s")

@@ -92,4 +92,5 @@ class Gate:
 
     def unlimited(self) -> list[str]:
         """Return the names of actions whose range is not known."""
-        return [name for name, low, high in zip(self.names, self.lower, self.upper, strict=True) if low == -high]
+        is_limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        return [name for name, limited in zip(self.names, is_limited, strict=True) if not limited]

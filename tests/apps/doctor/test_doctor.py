@@ -53,7 +53,7 @@ def latency(p99: float) -> Outcome:
 PLUGINS = value(
     {
         "robots": ["so101", "turtlebot3", "ur5"],
-        "teleoperators": ["bhd_brain"],
+        "teleoperators": ["bhd_brain", "bhd_keyboard_arm", "bhd_keyboard_base"],
         "bodies": ["turtlebot3", "ur5"],
         "failed": [],
     }
@@ -263,7 +263,9 @@ BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
     ),
     "plugins.error": (lambda _: checks.check_plugins(failed("error", "ImportError: no torch")), "no torch"),
     "plugins.missing": (
-        lambda _: checks.check_plugins(value({"robots": ["ur5"], "teleoperators": []}, "ImportError: pin")),
+        lambda _: checks.check_plugins(
+            value({"robots": ["ur5"], "teleoperators": list(checks.TELEOPERATORS[1:])}, "ImportError: pin")
+        ),
         "the robot turtlebot3, the teleoperator bhd_brain: `lerobot_robot_bhd` is not installed, or its import failed. "
         "ImportError: pin",
     ),

@@ -22,6 +22,7 @@ from bhd_lerobot.apps.monitor.monitor import Keys, find
 from bhd_lerobot.apps.monitor.state import Count, Sampler
 from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
+from bhd_lerobot.control.keys import KeySource, KeyTerminal
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import encode_feedback
 from bhd_lerobot.control.timing import TimingStatistics
@@ -445,13 +446,12 @@ def test_leaving_by_ctrl_c_gives_the_terminal_back(robot: Robot, terminal: Termi
     assert robot.block.words[Word.ESTOP] == 0
 
 
-def test_a_stop_does_not_wait_for_an_image() -> None:
+def test_a_stop_does_not_wait_for_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KeyTerminal, "usable", staticmethod(lambda descriptor: True))
     master, slave = pty.openpty()
     pressed = threading.Event()
-    usable = monitor.KeyTerminal.usable
     try:
-        monitor.KeyTerminal.usable = staticmethod(lambda descriptor: True)  # type: ignore[method-assign]
-        with Keys(pressed.set, slave) as keys:
+        with Keys(pressed.set, KeySource(slave)) as keys:
             os.write(master, b"e")
             assert pressed.wait(30)  # nothing is drawn or requested meanwhile
             assert not keys.quit.is_set()
@@ -459,7 +459,6 @@ def test_a_stop_does_not_wait_for_an_image() -> None:
             assert keys.quit.wait(30)
         assert keys.pressed == 1
     finally:
-        monitor.KeyTerminal.usable = usable  # type: ignore[method-assign]
         os.close(master)
         os.close(slave)
 

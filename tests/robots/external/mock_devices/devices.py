@@ -42,7 +42,8 @@ class MockCamera(Camera):
         self.latest_timestamp: float | None = None
         self._image: Any = None
         self._count = 0
-        self._noise = np.random.default_rng(0).integers(0, 255, (config.height, config.width, 3), np.uint8)
+        rows, columns = np.mgrid[0 : config.height, 0 : config.width]
+        self._scene = np.stack([rows % 256, columns % 256, (rows + columns) % 256], axis=2).astype(np.uint8)
         self._ended, self._new = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -64,7 +65,7 @@ class MockCamera(Camera):
         while not self._ended.is_set():
             config = self.config
             if not (config.freeze_after and self._count >= config.freeze_after):
-                image = self._noise.copy()
+                image = self._scene.copy()
                 image[:8, :8] = self._count % 256
                 self._image, self.latest_timestamp = image, time.perf_counter()
                 self._count += 1

@@ -1,0 +1,70 @@
+"""From a teleoperator's action to a robot's."""
+
+import math
+from typing import Any
+
+import pytest
+
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.policies.teleop.mapping import ActionMap, Pair
+
+ROVER = ("linear_velocity", "angular_velocity")
+BASE = ("x.vel", "theta.vel")
+LEADER = ("shoulder_pan.pos", "gripper.pos")
+
+
+def test_a_known_pair_needs_no_map() -> None:
+    mapped = ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)
+    action = mapped({"linear_velocity": 1.0, "angular_velocity": -0.5})
+    assert action == {"x.vel": 0.22, "theta.vel": -0.5 * 2.84}
+
+
+def test_units_scales_and_offsets() -> None:
+    asked = {
+        "shoulder_pan.pos": {"from": "shoulder_pan.pos", "scale": "deg_to_rad"},
+        "gripper.pos": {"scale": 0.001, "offset": 0.01},
+    }
+    mapped = ActionMap(asked, Pair("so101_leader", "ur5", same_project=False), LEADER, LEADER)
+    action = mapped({"shoulder_pan.pos": 180.0, "gripper.pos": 50.0})
+    assert action == {"shoulder_pan.pos": pytest.approx(math.pi), "gripper.pos": pytest.approx(0.06)}
+    renamed = ActionMap(
+        {"x.vel": "linear_velocity", "theta.vel": "angular_velocity"}, Pair("a", "b", same_project=False), ROVER, BASE
+    )
+    assert renamed({"linear_velocity": 3, "angular_velocity": 4}) == {"x.vel": 3.0, "theta.vel": 4.0}
+
+
+def test_nothing_is_nothing() -> None:
+    assert ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)({}) is None
+
+
+def test_equal_names_are_no_proof_across_projects_and_enough_within_one() -> None:
+    with pytest.raises(
+        ConfigError, match=r"so101_leader and ur5 both have 'shoulder_pan.pos'.*degrees.*--map.shoulder_pan.pos="
+    ):
+        ActionMap({}, Pair("so101_leader", "ur5", same_project=False), LEADER, LEADER)
+    within = ActionMap({}, Pair("so101_leader", "so101_follower", same_project=True), LEADER, LEADER)
+    assert within({"shoulder_pan.pos": 5, "gripper.pos": 1}) == {"shoulder_pan.pos": 5.0, "gripper.pos": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"y.vel": "linear_velocity"}, "y.vel.*x.vel"),
+        ({"x.vel": "linear"}, "linear.*linear_velocity"),
+        ({"x.vel": {"from": "linear_velocity", "factor": 2}}, "factor.*scale"),
+        ({"x.vel": {"from": "linear_velocity", "scale": "deg"}}, "map.x.vel.scale is 'deg'.*deg_to_rad"),
+        ({"x.vel": {"from": "linear_velocity", "scale": math.inf}}, "map.x.vel.scale"),
+        ({"x.vel": 3}, "map.x.vel is 3"),
+        ({}, "It is not known where .*'x.vel'.*linear_velocity"),
+    ],
+)
+def test_a_wrong_map_is_named(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ActionMap(asked, Pair("keyboard_rover", "other", same_project=False), ROVER, BASE)
+
+
+@pytest.mark.parametrize("given", [{"linear_velocity": 1.0}, {"linear_velocity": "fast", "angular_velocity": 0.0}])
+def test_a_wrong_action_is_named(given: dict[str, Any]) -> None:
+    mapped = ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)
+    with pytest.raises(ActionError, match=r"angular_velocity|fast"):
+        mapped(given)

@@ -1,0 +1,83 @@
+"""The gate in front of another package's robot, at what it lets through."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.messages import Limit
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.gate import Gate
+
+NAMES = ("arm.pos", "x.vel")
+RANGE = {"arm.pos": [-90.0, 90.0], "x.vel": [-0.3, 0.3]}
+ANY = st.one_of(st.floats(-500, 500), st.sampled_from([math.nan, math.inf, -math.inf]))
+
+
+@given(st.lists(st.tuples(ANY, ANY), min_size=1, max_size=40), st.floats(-120, 120))
+def test_whatever_comes_is_finite_in_range_and_near_to_what_was_before(
+    stream: list[tuple[float, float]], measured: float
+) -> None:
+    gate = Gate(NAMES, GateConfig(range=RANGE, max_change={"arm.pos": 5.0, "x.vel": 0.1}), {})
+    gate.begin(np.array([measured, math.nan]))
+    before = np.array([measured, 0.0])
+    for action in stream:
+        passed = gate.passed(np.array(action))
+        assert np.isfinite(passed.action).all()
+        assert (np.abs(passed.action - before) <= np.array([5.0, 0.1]) + 1e-9).all()
+        # From outside of the range it comes back, never further away.
+        room = np.array([max(90.0, abs(before[0])), 0.3])
+        assert (np.abs(passed.action) <= room + 1e-9).all()
+        changed = passed.action != np.array(action)
+        assert bool(passed.limits) == bool(changed.any())
+        assert bool(passed.limits & Limit.NON_FINITE) == (not np.isfinite(action).all())
+        before = passed.action
+
+
+def test_what_fits_passes_unchanged() -> None:
+    gate = Gate(NAMES, GateConfig(range=RANGE, max_change=5.0), {})
+    gate.begin(np.array([0.0, math.nan]))
+    for action in ([1.0, 0.3], [5.5, -0.3], [1.0, 0.0]):
+        passed = gate.passed(np.array(action))
+        assert passed.action.tolist() == action
+        assert passed.limits == 0
+
+
+def test_without_a_measurement_the_first_position_is_free_and_speeds_hold_at_zero() -> None:
+    gate = Gate(NAMES, GateConfig(max_change=5.0), {})
+    gate.begin(np.array([math.nan, math.nan]))
+    assert np.array_equal(gate.holding(), [math.nan, 0.0], equal_nan=True)
+    assert not np.isfinite(gate.passed(np.array([math.nan, 1.0])).action).all()  # nothing is known that could be sent
+    assert gate.passed(np.array([70.0, 1.0])).action.tolist() == [70.0, 1.0]
+    assert gate.passed(np.array([math.nan, 1.0])).action.tolist() == [70.0, 1.0]
+    assert gate.holding().tolist() == [70.0, 0.0]
+
+
+def test_ranges_come_from_the_options_before_the_calibration() -> None:
+    gate = Gate(NAMES, GateConfig(range={"arm": {"pos": [-1.0, 1.0]}}), {"arm.pos": (-5.0, 5.0), "x.vel": (-2.0, 2.0)})
+    assert gate.lower.tolist() == [-1.0, -2.0]
+    assert gate.unlimited() == []
+    assert Gate(NAMES, GateConfig(), {}).unlimited() == list(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"range": {"arm.pos": [1, 0]}}, r"gate.range.arm.pos is \[1, 0\]"),
+        ({"range": {"arm.pos": 3}}, "gate.range.arm.pos is 3"),
+        ({"range": {"arm.pos": [0, math.inf]}}, "gate.range.arm.pos"),
+        ({"max_change": 0}, "gate.max_change is 0"),
+        ({"max_change": {"arm.pos": -1}}, "gate.max_change.arm.pos is -1"),
+        ({"max_change": True}, "gate.max_change is True"),
+        ({"brain_timeout_s": 0}, "gate.brain_timeout_s is 0"),
+        ({"call_timeout_s": math.nan}, "gate.call_timeout_s"),
+        ({"range": {"arn.pos": [0, 1]}}, "arn.pos.*arm.pos"),
+        ({"max_change": {"y.vel": 1}}, "y.vel.*x.vel"),
+    ],
+)
+def test_wrong_options_are_named(options: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Gate(NAMES, GateConfig(**options), {})

@@ -1,0 +1,250 @@
+"""Another package's robot on an absolute grid: what it is sent, what is reported, and what can go wrong with it."""
+
+import math
+import re
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.commands import Chunk, Goals
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.host import LeRobotHost
+from tests.robots.external.mock_devices import MockArm, MockArmConfig
+from tests.robots.external.mock_devices.devices import MockCameraConfig
+
+FPS = 50
+ONLY = np.zeros(1, np.intp)
+
+
+def make(tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, **options: Any) -> LeRobotHost:
+    robot = MockArm(MockArmConfig(id="test", calibration_dir=tmp_path, log=str(tmp_path / "sent"), **options))
+    host = LeRobotHost(robot, fps, gate or GateConfig())
+    robot.connect()
+    return host
+
+
+def sent(tmp_path: Path) -> list[list[float]]:
+    path = tmp_path / "sent"
+    return [[float(word) for word in line.split()] for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def action(value: float) -> np.ndarray:
+    return np.full((1, 3), value)
+
+
+def start(host: LeRobotHost) -> None:
+    host.reset(ONLY, [None], [0])
+    host.observe()
+
+
+def test_actions_reach_the_robot_and_frames_lie_on_an_absolute_grid(tmp_path: Path) -> None:
+    with closing(make(tmp_path)) as host:
+        start(host)
+        numbers, times = [], []
+        for step in range(20):
+            frame = host.observe()
+            report = host.step(action(step))
+            assert report.requested.tolist() == report.applied.tolist() == [[step] * 3]
+            assert report.mode[0] == Mode.TRACKING
+            numbers += [one.number for one in (*report.missed, report)]
+            times.append(int(frame.time_ns[0]))
+        host.stop(ONLY)
+        summary = host.clock.statistics().summary()
+    assert [row[0] for row in sent(tmp_path)] == list(range(20))
+    assert numbers == sorted(set(numbers))
+    # However long each frame took: observations are as far apart as their numbers say.
+    assert abs(summary.rate_error) < 1
+    assert times[-1] - times[0] == pytest.approx(1e9 / FPS * numbers[-1], rel=0.5)
+
+
+def test_the_robot_follows_what_the_gate_lets_through(tmp_path: Path) -> None:
+    with closing(make(tmp_path, GateConfig(range={"elbow.pos": [-10.0, 10.0]}, max_change=2.0))) as host:
+        start(host)
+        stream = [action(100.0), np.array([[1.0, math.nan, 1.0]]), action(-50.0), action(math.inf)]
+        limits = []
+        for wanted in stream:
+            host.observe()
+            limits.append(int(host.step(wanted).limits[0]))
+        host.stop(ONLY)
+    rows = np.array(sent(tmp_path))
+    assert np.isfinite(rows).all()
+    assert (np.abs(np.diff(rows, axis=0, prepend=0.0)) <= 2.0 + 1e-9).all()
+    assert limits[0] == Limit.POSITION | Limit.VELOCITY
+    assert limits[1] == Limit.NON_FINITE
+    assert limits[3] == Limit.NON_FINITE
+
+
+def test_a_late_brain_misses_frames_and_does_not_hold_up_the_robot(tmp_path: Path) -> None:
+    with closing(make(tmp_path)) as host:
+        start(host)
+        host.observe()
+        host.step(action(1.0))
+        host.observe()
+        time.sleep(5.5 / FPS)
+        report = host.step(action(2.0))
+        host.stop(ONLY)
+    assert len(report.missed) >= 4
+    assert {float(one.requested[0, 0]) for one in report.missed} == {1.0}
+    assert report.requested[0, 0] == 2.0
+    assert all(one.seen is not None for one in report.missed)
+    assert [row[0] for row in sent(tmp_path)] == [1.0, 2.0]
+
+
+def test_a_chunk_does_not_make_the_robot_hurry(tmp_path: Path) -> None:
+    rows = np.arange(1.0, 9.0)[:, None, None] * np.ones((1, 1, 3))
+    with closing(make(tmp_path)) as host:
+        start(host)
+        host.observe()
+        host.step(Chunk(rows))
+        for command in (None, None):
+            host.observe()
+            host.step(command)
+        host.observe()
+        time.sleep(3.2 / FPS)
+        host.step(None)
+        host.stop(ONLY)
+    values = [row[0] for row in sent(tmp_path)]
+    assert values[:3] == [1.0, 2.0, 3.0]
+    assert values[3] >= 6.0
+
+
+def test_goals_are_refused(tmp_path: Path) -> None:
+    with closing(make(tmp_path)) as host:
+        start(host)
+        with pytest.raises(ConfigError, match=r"Goals.*mock_arm"):
+            host.step(Goals({}))
+
+
+def test_without_actions_the_robot_holds_and_then_there_is_a_fault(tmp_path: Path) -> None:
+    with closing(make(tmp_path, GateConfig(brain_timeout_s=0.06, end_timeout_s=0.3))) as host:
+        start(host)
+        host.observe()
+        host.step(action(7.0))
+        held = faulted = False
+        for _ in range(60):
+            host.observe()
+            report = host.step(None)
+            held |= bool(report.watchdog[0] & Watchdog.COMMAND_AGE) and report.mode[0] == Mode.HOLD
+            faulted = report.mode[0] == Mode.FAULT
+            if faulted:
+                break
+        assert held
+        assert faulted
+        assert "no action for" in host.problem
+    assert {row[0] for row in sent(tmp_path)} == {7.0}
+
+
+def test_the_emergency_stop_holds_where_the_robot_is_and_latches(tmp_path: Path) -> None:
+    with closing(make(tmp_path)) as host:
+        start(host)
+        for value in (10.0, 20.0):
+            host.observe()
+            host.step(action(value))
+        host.observe()
+        host.estop()
+        report = host.step(action(80.0))
+        assert report.mode[0] == Mode.ESTOP
+        assert host.estop_pressed
+        for _ in range(3):
+            host.observe()
+            assert host.step(action(80.0)).mode[0] == Mode.ESTOP
+        host.stop(ONLY)
+    assert max(row[0] for row in sent(tmp_path)) <= 20.0
+
+
+FAULTS = {
+    "disconnect": "get_observation raised ConnectionError: the bus does not answer",
+    "nan": "mock_arm reads nan for 'elbow.pos', which is not a finite number",
+    "missing key": "get_observation of mock_arm returned no 'elbow.pos'",
+    "image size": "The camera 'front' of mock_arm gave an image of uint8 .* must be uint8",
+    "block": "get_observation of mock_arm has not returned for",
+    "send raises": "send_action raised ConnectionError: the bus does not answer",
+    "send blocks": "send_action of mock_arm has not returned for",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_goes_wrong_ends_the_episode_with_a_fault_that_says_what(tmp_path: Path, fault: str) -> None:
+    cameras = {"front": MockCameraConfig()}
+    gate = GateConfig(call_timeout_s=0.3)
+    with closing(make(tmp_path, gate, fault=fault, fault_at=4, cameras=cameras)) as host:
+        start(host)
+        began = time.monotonic()
+        for value in range(10):
+            host.observe()
+            report = host.step(action(float(value)))
+            if report.mode[0] == Mode.FAULT:
+                break
+        host.stop(ONLY)
+        assert report.mode[0] == Mode.FAULT
+        assert report.watchdog[0] & Watchdog.PLANT
+        assert value in (2, 3)
+        assert time.monotonic() - began < 1.9  # nobody waits for a call that blocks
+        assert np.isfinite(report.applied).all()
+        assert re.search(FAULTS[fault], host.problem), host.problem
+        with pytest.raises(RealtimeError, match="in a fault"):
+            start(host)
+
+
+def test_a_slow_device_is_late_and_counted_and_no_frame_is_repeated(tmp_path: Path) -> None:
+    with closing(make(tmp_path, fault="slow", fault_at=4)) as host:
+        start(host)
+        skipped, numbers = 0, []
+        for value in range(8):
+            host.observe()
+            report = host.step(action(float(value)))
+            for one in (*report.missed, report):
+                skipped += int(one.columns[keys.SKIPPED][0])
+                numbers.append(one.number)
+        host.stop(ONLY)
+    assert skipped >= 5  # 0.15 s at 50 frames a second
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == 7 + skipped
+
+
+def test_a_frozen_camera_is_seen_in_the_age_of_its_images(tmp_path: Path) -> None:
+    cameras = {"front": MockCameraConfig(fps=100), "wrist": MockCameraConfig(fps=100, freeze_after=3)}
+    with closing(make(tmp_path, cameras=cameras)) as host:
+        assert host.columns == {keys.IMAGE_AGE: ("front", "wrist")}
+        start(host)
+        for value in range(20):
+            frame = host.observe()
+            host.step(action(float(value)))
+        host.stop(ONLY)
+    front, wrist = frame.columns[keys.IMAGE_AGE][0]
+    assert wrist > front + 0.1
+    assert frame.age_ns[0] / 1e9 >= wrist
+
+
+def test_the_first_observation_that_fails_ends_the_run(tmp_path: Path) -> None:
+    with (
+        closing(make(tmp_path, fault="disconnect", fault_at=1)) as host,
+        pytest.raises(RealtimeError, match="cannot be observed: get_observation raised ConnectionError"),
+    ):
+        start(host)
+
+
+def test_what_cannot_be_recorded_is_refused_before_the_robot_is_touched(tmp_path: Path) -> None:
+    class Depth(MockArm):
+        @property
+        def observation_features(self) -> dict[str, Any]:
+            return {**super().observation_features, "depth": (48, 64, 1)}
+
+    robot = Depth(MockArmConfig(id="depth", calibration_dir=tmp_path))
+    with pytest.raises(ConfigError, match=r"depth.*\(48, 64, 1\).*Switch depth off"):
+        LeRobotHost(robot, FPS, GateConfig())
+    assert not robot.is_connected
+
+
+def test_notes_say_what_is_limited_and_what_is_not(tmp_path: Path) -> None:
+    with closing(make(tmp_path, GateConfig(range={"elbow.pos": [0, 1]}))) as host:
+        text = "\n".join(host.notes)
+    assert "1 of 3 actions limited; not known, so not limited: shoulder.pos, gripper.pos" in text
+    assert "not promised" in text

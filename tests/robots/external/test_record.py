@@ -1,0 +1,189 @@
+"""`bhd-record` with a robot and a teleoperator of another package."""
+
+import io
+import json
+import math
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bhd_lerobot.cli.record import main
+from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.options.parse import parse
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.report import RecordResult
+from bhd_lerobot.rollout.progress import FAULT_STATUS
+from tests.forks import Fork
+from tests.recording.support import saved
+from tests.robots.external import mock_devices  # noqa: F401  registers them
+from tests.waiting import until
+
+CAMERAS = "{front: {type: mock_camera}, wrist: {type: mock_camera}}"
+
+
+def options(root: Path, **overrides: object) -> list[str]:
+    values: dict[str, object] = {
+        "robot.type": "mock_arm",
+        "robot.cameras": CAMERAS,
+        "robot.calibration_dir": root.parent / "calibration",
+        "teleop.type": "mock_leader",
+        "teleop.calibration_dir": root.parent / "calibration",
+        "task.instruction": "wave",
+        "task.duration_s": 0.5,
+        "dataset.root": root,
+        "dataset.num_episodes": 2,
+        "output_dir": root.parent / f"{root.name}_run",
+        **{key.replace("__", "."): value for key, value in overrides.items()},
+    }
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+
+
+def run(root: Path, **overrides: object) -> tuple[RecordResult, str]:
+    console = Console(file=io.StringIO(), width=200)
+    result = record(parse(RecordConfig, options(root, **overrides)), console)
+    return result, console.file.getvalue()
+
+
+def test_requested_and_applied_actions_times_and_images_of_every_device(tmp_path: Path) -> None:
+    result, text = run(tmp_path / "d", teleop__amplitude=200, gate__max_change=8)
+    assert result.exit_status == 0
+    assert "not promised" in text
+    info = dataset_info(tmp_path / "d")
+    assert (len(info.episodes), info.robot_type) == (2, "mock_arm")
+    assert check_dataset(tmp_path / "d").is_valid
+    columns = read_episode(tmp_path / "d", 0)
+    asked, applied = np.stack(columns["action"]), np.stack(columns["control.applied_action"])
+    assert np.abs(asked).max() > 100
+    assert np.abs(applied).max() <= 90  # the robot's own range, which `send_action` returns
+    assert (np.asarray(columns["control.limits"]) & Limit.VELOCITY).any()
+    assert np.stack(columns["control.image_age"]).shape == (15, 2)
+    assert set(columns["control.mode"]) <= {Mode.HOLD, Mode.TRACKING}
+    time_s = np.asarray(columns["control.time"], np.float64)
+    assert (np.diff(time_s) > 0).all()
+    about = json.loads(info.episodes[0].metadata["brain"])
+    assert about == {"type": "teleop", "teleop": "mock_leader"}
+    # Where a robot is connected is not what it is.
+    assert "port" not in json.dumps(info.recording)
+    assert "calibration" not in json.dumps(info.recording)
+
+
+def test_stock_lerobot_reads_it_and_it_is_continued(tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    run(tmp_path / "d", dataset__num_episodes=1)
+    result, _ = run(tmp_path / "d", resume="true", robot__port="/dev/other")
+    assert result.recorded == 1
+    dataset = LeRobotDataset("local/d", root=tmp_path / "d", video_backend="pyav")
+    assert dataset.num_episodes == 2
+    assert dataset[0]["observation.images.front"].shape == (3, 48, 64)
+
+
+def test_a_processor_stands_between(tmp_path: Path) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1, processor="tests.robots.external.processors:halved")
+    columns = read_episode(tmp_path / "d", 0)
+    assert np.abs(np.stack(columns["action"])).max() <= 10.0 + 1e-6
+
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "get_observation raised ConnectionError": {"robot__fault": "disconnect"},
+    "not a finite number": {"robot__fault": "nan"},
+    "returned no 'elbow.pos'": {"robot__fault": "missing key"},
+    "must be uint8": {"robot__fault": "image size"},
+    "has not returned for": {"robot__fault": "block", "gate__call_timeout_s": 0.3},
+    "send_action raised ConnectionError": {"robot__fault": "send raises"},
+    "send_action of mock_arm has not returned": {"robot__fault": "send blocks", "gate__call_timeout_s": 0.3},
+    "the camera was unplugged": {"robot__cameras": "{front: {type: mock_camera, fail_after: 5}}"},
+    "the teleoperator mock_leader failed: ConnectionError": {"teleop__fault": "raises"},
+    "The teleoperator gave no 'elbow.pos'": {"teleop__fault": "missing key"},
+}
+
+
+@pytest.mark.parametrize("words", FAULTS)
+def test_a_fault_ends_the_run_and_what_was_recorded_is_saved(tmp_path: Path, words: str) -> None:
+    result, text = run(tmp_path / "d", task__duration_s=3, **FAULTS[words])
+    assert result.exit_status == FAULT_STATUS
+    assert words in text
+    (episode,) = dataset_info(tmp_path / "d").episodes
+    assert episode.metadata["outcome"] == "fault"
+    assert check_dataset(tmp_path / "d").is_valid
+    assert 2 <= episode.frames < 60
+
+
+def test_a_silent_teleoperator_lets_the_robot_hold_and_then_ends_the_episode(tmp_path: Path) -> None:
+    limits = {"gate__brain_timeout_s": 0.1, "gate__end_timeout_s": 0.5}
+    result, text = run(tmp_path / "d", task__duration_s=5, teleop__fault="silent", **limits)
+    assert result.exit_status == FAULT_STATUS
+    assert "no action for" in text
+    columns = read_episode(tmp_path / "d", 0)
+    assert Mode.HOLD in set(columns["control.mode"])
+
+
+def test_a_teleoperator_that_gives_nan_moves_nothing(tmp_path: Path) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1, teleop__fault="nan", teleop__fault_at=1)
+    columns = read_episode(tmp_path / "d", 0)
+    applied = np.stack(columns["control.applied_action"])
+    assert np.isfinite(applied).all()
+    assert (applied[:, 1] == 0).all()
+    assert (np.asarray(columns["control.limits"])[1:-1] & Limit.NON_FINITE).all()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"robot__fault": "no connection"}, "'mock_arm' cannot be connected: ConnectionError: there is no such port"),
+        ({"task__type": "avoid", "task__instruction": None}, "task.type is 'avoid'.*--task.type=free"),
+        ({"brain__type": "avoidance"}, "brain.type is 'avoidance'.*robot.type is 'mock_arm'"),
+        ({"teleop__type": None, "teleop__calibration_dir": None}, "--brain.type, or --teleop.type"),
+        ({"teleop__type": "mock_ledger"}, "mock_ledger.*mock_leader"),
+        ({"robot__type": "mock_arms"}, "mock_arms.*mock_arm"),
+        ({"map__elbow.pos": "elbow"}, "elbow.*elbow.pos"),
+        ({"processor": "nowhere:f"}, "processor is 'nowhere:f', which cannot be imported"),
+        ({"gate__range__wrist": "[0, 1]"}, "wrist.*elbow.pos"),
+        ({"engine": "ray"}, "engine is 'ray'"),
+        ({"dataset__reset_time_s": -1}, "reset_time_s is -1"),
+        ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__calibration_dir": None}, "robot.clock=realtime"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_remedy(tmp_path: Path, overrides: dict[str, Any], message: str) -> None:
+    with pytest.raises((ConfigError, RealtimeError), match=message):
+        run(tmp_path / "d", **overrides)
+    assert not (tmp_path / "d").exists()
+
+
+def test_lerobots_own_robots_and_teleoperators_are_imported_when_they_are_asked_for() -> None:
+    arguments = [
+        "--robot.type=so101_follower",
+        "--robot.port=/dev/null",
+        "--teleop.type=so101_leader",
+        "--teleop.port=/dev/null",
+    ]
+    cameras = "--robot.cameras={front: {type: opencv, index_or_path: 0, width: 640, height: 480, fps: 30}}"
+    config = parse(RecordConfig, [*arguments, "--dataset.root=data", cameras])
+    assert config.robot.type in ("so100_follower", "so101_follower")  # one class with two names
+    assert config.robot.cameras["front"].width == 640
+    assert config.brain.teleop.type in ("so100_leader", "so101_leader")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_signal_costs_at_most_the_running_episode(tmp_path: Path, number: signal.Signals) -> None:
+    root = tmp_path / "d"
+    plugin = "--robot.discover_packages_path=tests.robots.external.mock_devices"
+    arguments = [plugin, *options(root, dataset__num_episodes=50)]
+    process = Fork(main, arguments, output=tmp_path / "log")
+    until(lambda: saved(root) >= 2 or process.poll() is not None, "two episodes are saved")
+    os.kill(process.pid, number)
+    until(lambda: process.poll() is not None, "it has ended")
+    result, _ = run(root, resume="true", dataset__num_episodes=saved(root) + 1)
+    assert result.exit_status == 0
+    assert check_dataset(root).is_valid
+    assert math.isfinite(result.wall_s)
