@@ -1,6 +1,6 @@
 """A person beside a real robot who sets up scenes and judges, and the order in which the brains run."""
 
-import threading
+import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.types import EpisodeSpec
 
 _ORDER_STREAM = 3  # beside the scenes' and the brains' random numbers
 _POLL_S = 0.05
+_JUDGING = tuple(key for key in KEYS if key.meaning in ("success", "failure"))
 
 
 def random_order(labels: Sequence[str], index: int, seed: int) -> list[str]:
@@ -35,17 +36,14 @@ class Operator(Marks):
     """
 
     def __init__(self, console: Console, total: int, outcomes: Sequence[str]) -> None:
-        super().__init__(1, outcomes)
+        super().__init__(1, outcomes, _JUDGING)
         self._console, self._total = console, total
         self.is_there = self.has_quit = False
         self._title = ""
-        self._entered = threading.Event()
 
     def on_key(self, keys: bytes) -> None:
-        """Take keys of a terminal: Enter, q, and those of `Marks`."""
+        """Take keys of a terminal: q, and those of `Marks`."""
         self.has_quit |= b"q" in keys.lower()
-        if b"\n" in keys or b"\r" in keys:
-            self._entered.set()
         super().on_key(keys)
 
     def set_up(self, number: int, spec: EpisodeSpec, instruction: str, stop: Callable[[], bool]) -> None:
@@ -58,14 +56,15 @@ class Operator(Marks):
             stop: whether the run is to end: then it is not waited for.
         """
         self._title = f"Episode {number} of {self._total}"
-        self._entered.clear()
-        if self.is_there:
-            words = f" ({escape(instruction)})" if instruction else ""
+        if not self.is_there:
+            return
+        words = f" ({escape(instruction)})" if instruction else ""
+        with self.waiting() as is_pressed:
             self._console.print(
                 f"{self._title}, scene {spec.index}{words}: set up the scene, then press Enter", highlight=False
             )
-            while not (self._entered.wait(_POLL_S) or stop()):
-                pass
+            while not (is_pressed() or stop()):
+                time.sleep(_POLL_S)
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
         """Begin an episode: from now on keys judge it."""

@@ -20,7 +20,7 @@ from bhd_lerobot.options.parse import read_file
 POWER = 0.8
 _RATES = (0.05, 0.1, 0.3, 0.5, 0.7, 0.8, 0.85, 0.9, 0.95)
 _CORRELATIONS = (0.0, 0.3, 0.6)
-_MOST = 2**20  # pairs: beyond, no one waits for the answer
+_MOST = 2**16  # pairs: beyond, no one waits for the answer
 
 
 def power_of(pairs: int, difference: float, discordant: float, confidence: float = CONFIDENCE) -> float:
@@ -41,7 +41,7 @@ def power_of(pairs: int, difference: float, discordant: float, confidence: float
 def pairs_needed(
     difference: float, discordant: float, confidence: float = CONFIDENCE, power: float = POWER
 ) -> int | None:
-    """Return the number of pairs with which McNemar's exact test shows a difference with a power; None beyond 2**20.
+    """Return the number of pairs with which McNemar's exact test shows a difference with a power; None beyond 2**16.
 
     The arguments are those of `power_of`.
     """
