@@ -60,9 +60,7 @@ class Operator(Marks):
             return
         words = f" ({escape(instruction)})" if instruction else ""
         with self.waiting() as is_pressed:
-            self._console.print(
-                f"{self._title}, scene {spec.index}{words}: set up the scene, then press Enter", highlight=False
-            )
+            self._say(f"{self._title}, scene {spec.index}{words}: set up the scene, then press Enter")
             while not (is_pressed() or stop()):
                 time.sleep(_POLL_S)
 
@@ -70,4 +68,7 @@ class Operator(Marks):
         """Begin an episode: from now on keys judge it."""
         super().begin(simulations)
         if self.is_there:
-            self._console.print(f"{self._title} runs: s success, f failure, q end the evaluation", highlight=False)
+            self._say(f"{self._title} runs: s success, f failure, q end the evaluation")
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True, highlight=False)  # a script looks for whole lines

@@ -97,8 +97,8 @@ def print_plan(config: EvalConfig, console: Console) -> None:
     console.print(
         f"Power {100 * POWER:g} %, confidence 95 %, both brains on the same episodes, McNemar's exact test.{more} "
         "Correlation: that of the outcomes of both brains; it is high where they fail in the same scenes. "
-        "–: there is none so high with these rates. With --sequential=true a run ends earlier if the difference is "
-        "larger.",
+        "–: there is none so high with these rates. With --sequential=true set --n_episodes to twice as many: the run "
+        "ends as soon as the difference is certain, much earlier if it is larger.",
         soft_wrap=True,
         highlight=False,
     )

@@ -88,12 +88,12 @@ def test_one_brain_has_a_short_form():
         ([*TWO, "--record.root=somewhere"], "record.repo_id is not"),
         (
             [*BASE, "--brain.type=avoidance", "--plan=true"],
-            "'avoidance' is the only brain: nothing is compared. Add one",
+            "'avoidance' is the only brain: nothing is compared.",
         ),
         ([*TWO, "--only=[old]", "--sequential=true"], "'old' is the only brain: nothing is compared. Add one"),
         (
             [*TWO, "--only=[old]", "--baseline=new", "--sequential=true"],
-            "baseline is 'new', which only leaves out. Add it",
+            "baseline is 'new', which only leaves out.",
         ),
         ([*TWO, "--plan=true", "--baseline=never"], "Unknown brain in baseline 'never'"),
         ([*TWO, "--plan=true", "--plan_points=0"], "plan_points is 0.0; it is a difference of rates"),

@@ -10,7 +10,10 @@ from bhd_lerobot.evaluation.plan import discordant_share
 from bhd_lerobot.evaluation.sequential import confidence_sequence, log_e_value
 from tests.cases import each_case
 
-COUNTS = [(0, 0, 3), (5, 0, 5), (8, 0, 0), (0, 8, 2), (10, 2, 30), (3, 9, 0), (60, 30, 300), (300, 600, 3000), (6000, 0, 0)]  # fmt: skip
+COUNTS = [
+    *((0, 0, 3), (5, 0, 5), (8, 0, 0), (0, 8, 2), (10, 2, 30), (3, 9, 0)),
+    *((60, 30, 300), (300, 600, 3000), (6000, 0, 0)),
+]
 
 
 def test_against_equal_brains_the_bets_win_nothing_in_the_mean():
