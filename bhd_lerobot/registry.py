@@ -12,7 +12,6 @@ from lerobot.robots.config import RobotConfig
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
 import bhd_lerobot.tasks.avoid
-import bhd_lerobot.tasks.free
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
@@ -34,6 +33,7 @@ from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import TASKS, Task, TaskConfig
 
 if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
@@ -155,6 +155,11 @@ def robots_of(wanted: str) -> list[str]:
 def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
     """Refuse a robot that cannot be simulated, one whose rates do not divide each other, and another robot's task."""
     kind = robot_of_task(task)
+    if isinstance(task, FreeConfig) and not task.instruction.strip():
+        raise ConfigError(
+            "task.type is 'free', and task.instruction does not say what the robot is to do. Set "
+            f"--task.instruction='…', or another --task.type: {', '.join(name for name in TASKS if name != 'free')}."
+        )
     if not is_ours(robot.type):
         if kind:
             raise ConfigError(

@@ -28,6 +28,7 @@ _MODULES = {
     "lerobot.policies.factory": ("get_policy_class", "make_policy", "make_pre_post_processors"),
     "lerobot.processor.factory": ("make_default_policy_processor_steps", "make_policy_processor_pipelines"),
     "lerobot.robots.utils": ("make_robot_from_config",),
+    "lerobot.teleoperators.utils": ("make_teleoperator_from_config",),
     "lerobot.scripts.lerobot_eval": ("eval_policy_all",),
     "lerobot.transforms": ("ImageTransforms",),
     "lerobot.utils": ("visualization_utils",),

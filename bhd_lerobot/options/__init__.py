@@ -1,3 +1,10 @@
 """What every command line shares: reading it, its help, its errors, plug-ins, and what can be chosen by name."""
 
-__all__ = ["command", "help", "parse", "plugins", "registry"]
+__all__ = [
+    "command",
+    "dotted",
+    "help",
+    "parse",
+    "plugins",
+    "registry",
+]

@@ -14,6 +14,7 @@ __all__ = [
     "perception",
     "pixels",
     "start_pose",
+    "teleop",
     "trained",
     "trained_steps",
 ]

@@ -1,3 +1,11 @@
 """`bhd-record`: episodes into a dataset."""
 
-__all__ = ["config", "live_view", "record", "report", "resume_advice"]
+__all__ = [
+    "config",
+    "driver",
+    "live_view",
+    "record",
+    "report",
+    "reset",
+    "resume_advice",
+]

@@ -9,6 +9,7 @@ __all__ = [
     "config_turtlebot3",
     "config_ur5",
     "conformance",
+    "external",
     "host",
     "latency",
     "robot",

@@ -1,6 +1,7 @@
 """Marks of a person while an episode is recorded: success, failure, intervention."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -58,6 +59,7 @@ def key_help(keys: Sequence[MarkKey]) -> str:
     return ", ".join(f"{key.name} {_MEANINGS[key.meaning]}" for key in keys)
 
 
+_HELD_S = 0.7  # so long an Enter that began an episode may repeat itself without ending it
 _HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
 
 
@@ -80,6 +82,7 @@ class Marks:
         self._driving: set[int] = set()
         self._again = self._is_paused = False
         self._is_waiting, self._go = False, threading.Event()
+        self._until = 0.0  # Enter means nothing before this time
 
     def outcome(self, name: str, simulation: int = 0) -> None:
         """Mark that the running episode of a simulation ends now, and how: by one of the outcomes."""
@@ -128,6 +131,7 @@ class Marks:
         finally:
             with self._lock:
                 self._is_waiting = self._is_paused = False
+                self._until = time.monotonic() + _HELD_S
 
     @property
     def is_paused(self) -> bool:
@@ -140,6 +144,8 @@ class Marks:
         for key in keys:
             if self._is_waiting and key in b"\r\n":
                 self._go.set()
+                continue
+            if key in b"\r\n" and time.monotonic() < self._until:
                 continue
             for meaning in [one.meaning for one in self._keys if key in one.sent]:
                 marks[meaning]() if meaning in marks else self.outcome(meaning)

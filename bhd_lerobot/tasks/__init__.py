@@ -3,6 +3,7 @@
 __all__ = [
     "avoid",
     "faults",
+    "free",
     "geodesic",
     "navigate",
     "operator",

@@ -1,3 +1,9 @@
 """A person in the place of a brain, through any LeRobot teleoperator."""
 
-__all__ = ["brain", "calls", "config", "mapping", "takeover"]
+__all__ = [
+    "brain",
+    "calls",
+    "config",
+    "mapping",
+    "takeover",
+]

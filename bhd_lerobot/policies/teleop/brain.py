@@ -140,7 +140,7 @@ class TeleopBrain(ConfiguredBrain):
 
 
 def _made(config: Any) -> Any:
-    from lerobot.teleoperators.utils import make_teleoperator_from_config
+    from bhd_lerobot.stock import make_teleoperator_from_config
 
     try:
         return make_teleoperator_from_config(config)

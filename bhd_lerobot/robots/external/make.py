@@ -14,7 +14,7 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         ConfigError: it cannot be made.
         RealtimeError: it cannot be connected.
     """
-    from lerobot.robots.utils import make_robot_from_config
+    from bhd_lerobot.stock import make_robot_from_config
 
     try:
         robot = make_robot_from_config(config)

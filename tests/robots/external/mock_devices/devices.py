@@ -16,6 +16,7 @@ from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 JOINTS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 
@@ -92,7 +93,10 @@ class MockCamera(Camera):
 @RobotConfig.register_subclass("mock_arm")
 @dataclass
 class MockArmConfig(RobotConfig):
-    """Options of the mock arm; a fault happens at a number of calls of `get_observation`, or of `send_action`."""
+    """Options of the mock arm; a fault happens at a number of calls of `get_observation`, or of `send_action`.
+
+    `log` is a file for the actions that it was sent, `times` one for when it was observed, monotonic [ns].
+    """
 
     port: str = "/dev/null"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
@@ -100,6 +104,7 @@ class MockArmConfig(RobotConfig):
     fault_at: int = 10
     read_s: float = 0.002
     log: str = ""
+    times: str = ""
 
 
 class MockArm(Robot):
@@ -115,6 +120,7 @@ class MockArm(Robot):
         self._position = dict.fromkeys(JOINTS, 0.0)
         self._is_connected = False
         self.observed = self.sent = 0
+        self._times: list[int] = []
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -134,6 +140,8 @@ class MockArm(Robot):
         return True
 
     def connect(self, calibrate: bool = True) -> None:
+        if self._is_connected:
+            raise DeviceAlreadyConnectedError("The mock arm is connected.")
         if self.config.fault == "no connection":
             raise ConnectionError("there is no such port")
         for camera in self.cameras.values():
@@ -144,8 +152,14 @@ class MockArm(Robot):
 
     def configure(self) -> None: ...
 
+    def _check(self) -> None:
+        if not self._is_connected:
+            raise DeviceNotConnectedError("The mock arm is not connected.")
+
     def get_observation(self) -> dict[str, Any]:
+        self._check()
         self.observed += 1
+        self._times.append(time.monotonic_ns())
         time.sleep(self.config.read_s)
         seen: dict[str, Any] = dict(self._position)
         seen |= {name: camera.read_latest() for name, camera in self.cameras.items()}
@@ -171,6 +185,7 @@ class MockArm(Robot):
         return seen
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        self._check()
         self.sent += 1
         if self.sent == self.config.fault_at:
             if self.config.fault == "send raises":
@@ -185,10 +200,13 @@ class MockArm(Robot):
 
     def disconnect(self) -> None:
         if not self._is_connected:
-            raise RuntimeError("not connected")
+            raise DeviceNotConnectedError("The mock arm is not connected.")
         for camera in self.cameras.values():
             camera.disconnect()
         self._is_connected = False
+        if self.config.times:
+            with open(self.config.times, "w", encoding="utf-8") as file:
+                file.write("\n".join(map(str, self._times)))
 
 
 @TeleoperatorConfig.register_subclass("mock_leader")
