@@ -99,7 +99,7 @@ def test_one_brain_has_a_short_form():
         ([*TWO, "--plan=true", "--plan_points=0"], "plan_points is 0.0; it is a difference of rates"),
         ([*TWO, "--sequential=true", "--engine=ray"], "Use --engine=local"),
         ([*TWO, "--fps=20"], "set --robot.fps instead"),
-        ([*TWO[:1], "--task.type=free", *TWO[2:]], "Add --robot.clock=realtime"),
+        ([*TWO[:1], "--task.type=free", "--task.instruction=go", *TWO[2:]], "Add --robot.clock=realtime"),
         ([*TWO, "--brain.type=avoidance", "--brains.avoidance.type=avoidance"], "two brains of the name 'avoidance'"),
     ],
 )
