@@ -9,13 +9,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks._episodes import add_success, parse_episodes, run
+from benchmarks._episodes import add_success, parse_episodes
 from benchmarks._report import Report, mean
 from bhd_lerobot.evaluation import statistics
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.rollout.drivers import TimedBrain
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome
 
@@ -50,9 +51,10 @@ def main() -> int:
 
 def drive(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], list[float]]:
     """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
-    robot, brain = TurtleBot3Config(collision_monitor=True), TimedBrain(NavigatorBrain())
-    episodes = run(BaseSimulation(robot, n), NavigateTask(config, n, robot.fps), brain, seeds)
-    return [episode.outcome for episode in episodes], brain.times
+    robot = TurtleBot3Config(collision_monitor=True)
+    loop = EpisodeLoop(BaseSimulation(robot, n), NavigateTask(config, n, robot.fps), NavigatorBrain())
+    episodes = loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])
+    return [episode.outcome for episode in episodes], loop.act_times
 
 
 if __name__ == "__main__":

@@ -70,11 +70,13 @@ class Ticks:
         times: when each was due, started and ended, on one clock [ns], shape (ticks, 3).
         period_ns: distance of the points of the grid [ns].
         refused: what the system refused to the loop.
+        act_times: how long each call of the brain took [s].
     """
 
     times: NDArray[np.int64]
     period_ns: int
     refused: tuple[str, ...] = ()
+    act_times: tuple[float, ...] = ()
 
 
 def summarise(ticks: Ticks, warm_up_s: float = WARM_UP_S) -> dict[str, float]:
@@ -242,7 +244,7 @@ def drive(
     # A state says when the tick before it ended.
     times = np.stack((due[:-1], started[:-1], ended[1:]), axis=1)
     times = times[times[:, 0] - times[:1, 0] < seconds * 1e9]  # not what follows while a late brain ends its frame
-    return Ticks(times, 10**9 // simulation.config.control_hz, refused)
+    return Ticks(times, 10**9 // simulation.config.control_hz, refused, tuple(loop.act_times))
 
 
 @contextmanager

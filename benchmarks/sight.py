@@ -63,7 +63,6 @@ from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.config import RealtimeConfig
-from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.sim.camera import Camera
 
 WIDTH, HEIGHT = 320, 240
@@ -203,7 +202,6 @@ def block(name: str, cores: tuple[int, int], seconds: float, checkpoints: dict[s
         brain = LookingBrain(checkpoints[name])
     elif name == PIXELS:
         brain = LearnedBrain(LearnedBrainConfig(str(checkpoints[name]), n_action_steps=1))
-    timed: Any = TimedBrain(brain)
     config = UR5Config(
         id=f"bench-{os.getpid()}",
         clock="realtime",
@@ -217,9 +215,9 @@ def block(name: str, cores: tuple[int, int], seconds: float, checkpoints: dict[s
         task = make_task("ur5", config.fps, seconds)
         robot.start_rendering()  # before the first episode, as `bhd-record` and `bhd-eval` do
         used = time.process_time()
-        ticks = drive(robot, task, timed, seconds)
+        ticks = drive(robot, task, brain, seconds)
         used = time.process_time() - used
-    decisions = np.array(timed.times)
+    decisions = np.array(ticks.act_times)
     found = {
         **summarise(ticks),
         "frames_per_s": len(decisions) / seconds,

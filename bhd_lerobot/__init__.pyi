@@ -19,7 +19,6 @@ from bhd_lerobot.bodies.ur5 import ur5 as ur5
 from bhd_lerobot.control.commands import BrainCommand as BrainCommand
 from bhd_lerobot.control.commands import Chunk as Chunk
 from bhd_lerobot.control.commands import Goals as Goals
-from bhd_lerobot.control.commands import Mixed as Mixed
 from bhd_lerobot.control.commands import Pose as Pose
 from bhd_lerobot.control.messages import Mode as Mode
 from bhd_lerobot.control.plant import Plant as Plant

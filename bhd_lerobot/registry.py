@@ -21,8 +21,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.registry import Registry, with_article
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
-from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, ConfiguredBrain
+from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig, check_drivers
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
@@ -53,8 +53,9 @@ class _Dagger(DaggerBrain):
         """Return the robot that both drive.
 
         Raises:
-            ConfigError: they drive different ones.
+            ConfigError: they drive different ones, or one of them gives goals.
         """
+        check_drivers(BRAINS.of(config.learner), BRAINS.of(config.expert))
         learner, expert = robot_of_brain(config.learner), robot_of_brain(config.expert)
         for one, other in ((learner, expert), (expert, learner)):
             if is_for(one, other) or not other:
@@ -120,9 +121,18 @@ def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]
     """Return a decorator that registers a brain's class under a name, with its configuration.
 
     Raises:
-        ConfigError: another brain has this name.
+        ConfigError: another brain has this name, or the class is not derived from `ConfiguredBrain`.
     """
-    return _decorator(BRAINS, name, config)
+
+    def register(made: type[T]) -> type[T]:
+        if not issubclass(made, ConfiguredBrain):
+            raise ConfigError(
+                f"The class of the brain {name!r}, {made.__name__}, is not derived from bhd_lerobot.ConfiguredBrain, "
+                f"which defines what a brain may leave out: write class {made.__name__}(bhd.ConfiguredBrain)."
+            )
+        return _decorator(BRAINS, name, config)(made)
+
+    return register
 
 
 def _decorator[T](registry: Registry[Any], name: str, config: type) -> Callable[[type[T]], type[T]]:
@@ -209,8 +219,7 @@ def robot_of_task(config: TaskConfig) -> str:
 
 def robot_of_brain(config: BrainConfig) -> str:
     """Return the kind or type of robot that a brain is for, empty if it is for every robot."""
-    brain = BRAINS.of(config)
-    robot = str(brain.robot_of(config) if hasattr(brain, "robot_of") else brain.robot_kind)
+    robot = str(BRAINS.of(config).robot_of(config))
     return "" if robot == ANY_ROBOT else robot
 
 

@@ -1,13 +1,19 @@
-"""`bhd-replay`: replay recorded episodes in simulation, and measure how far they diverge from the recording."""
+"""`bhd-replay`: replay recorded episodes, and measure how far they diverge from the recording."""
 
 import sys
 from collections.abc import Sequence
 
+from rich.console import Console
+
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.rollout.replay import ReplayConfig, replay
+from bhd_lerobot.rollout.replay import ReplayConfig, replay, root_of
+from bhd_lerobot.rollout.replay_robot import replay_on_robot
 
 
 def _replay(config: ReplayConfig) -> int:
+    if config.robot is not None:
+        replay_on_robot(root_of(config), config.dataset.episode, config.robot, config.gate, Console(stderr=True))
+        return 0
     worst = max(float(result.position_m.max()) for result in replay(config))
     return int(config.tolerance_m is not None and worst > config.tolerance_m)
 

@@ -39,7 +39,6 @@ class Job:
         tolerance: of frames, see `EpisodeLoop`.
         fps: frames a second [Hz].
         video: how cameras are encoded; None if images are not recorded.
-        is_timed: whether the duration of the brain's calls is wanted.
         checkpoints: files of the trained policies in `brain`: by the path that it names, then by file name.
     """
 
@@ -51,7 +50,6 @@ class Job:
     n: int
     threads: int
     video: VideoSettings | None = None
-    is_timed: bool = False
     checkpoints: dict[str, dict[str, bytes]] = field(default_factory=dict)
 
     @property

@@ -89,8 +89,7 @@ class ClusterLoop(EpisodeLoop):
         job = self._job(min(self._config.n_envs, per_task), video)
         ours = fingerprint(job.robot, job.task, job.fps)
         for result in self._pool.run(job, ours, tasks, lambda: stop() or self._is_stopped()):
-            if job.is_timed:
-                self.brain.times.extend(result["times"])  # type: ignore[attr-defined]
+            self.act_times.extend(result["times"])
             for content in result["episodes"]:
                 episode, videos = unpack(content)
                 if open_images is not None and videos:
@@ -125,7 +124,6 @@ class ClusterLoop(EpisodeLoop):
             n=n,
             threads=config.threads or config.ray.cpus_per_worker,
             video=video,
-            is_timed=hasattr(self.brain, "times"),
             checkpoints=read_checkpoints(self._brain_config),
         )
 

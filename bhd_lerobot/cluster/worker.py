@@ -4,13 +4,11 @@ import pickle
 import time
 import traceback
 from contextlib import closing
-from typing import Any, cast
+from typing import Any
 
 from bhd_lerobot.cluster.job import Job, VideoSink, fingerprint, pack, unpacked
 from bhd_lerobot.cluster.remote import pack_error
-from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.registry import make_brain, make_simulation, make_task
-from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 
@@ -24,23 +22,22 @@ class EpisodeServer:
         self.fingerprint = fingerprint(job.robot, job.task, job.fps)
         self._simulation = make_simulation(job.robot, job.n, job.threads)
         with unpacked(job) as brain_config:
-            made = make_brain(brain_config)
-        self._brain = TimedBrain(made)
+            brain = make_brain(brain_config)
         task = make_task(job.task, job.n, job.fps, self._simulation.body)
-        self._loop = EpisodeLoop(self._simulation, task, cast(Brain, self._brain), job.tolerance)
-        if self._simulation.camera_names and (job.video is not None or made.uses_images):
+        self._loop = EpisodeLoop(self._simulation, task, brain, job.tolerance)
+        if self._simulation.camera_names and (job.video is not None or brain.uses_images):
             self._simulation.start_rendering()
 
     def run(self, specs: list[tuple[int, int]]) -> dict[str, Any]:
         """Run episodes.
 
         Returns:
-            `episodes`: those that were finished, in order, packed; `times`: durations of the brain's calls [s], if
-            wanted; `busy_s`: how long it took [s]; `error` and `traceback`: what ended the run early, if something did.
+            `episodes`: those that were finished, in order, packed; `times`: durations of the brain's calls [s];
+            `busy_s`: how long it took [s]; `error` and `traceback`: what ended the run early, if something did.
         """
         started = time.perf_counter()
         episodes: list[bytes] = []
-        self._brain.times.clear()
+        self._loop.act_times.clear()
         sink = None if self._job.video is None else self._make_sink
         failure: dict[str, Any] = {}
         try:
@@ -49,8 +46,8 @@ class EpisodeServer:
                     episodes.append(pack(episode, {} if episode.writer is None else episode.writer.finish()))
         except Exception as error:  # the episodes before it are good
             failure = {"error": pack_error(error), "traceback": traceback.format_exc()}
-        times = list(self._brain.times) if self._job.is_timed else []
-        return {"episodes": episodes, "times": times, "busy_s": time.perf_counter() - started, **failure}
+        times, busy_s = list(self._loop.act_times), time.perf_counter() - started
+        return {"episodes": episodes, "times": times, "busy_s": busy_s, **failure}
 
     def _make_sink(self) -> VideoSink:
         job = self._job

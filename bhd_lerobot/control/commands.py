@@ -198,21 +198,6 @@ class Goals:
     commands: Mapping[int, Sequence[BrainCommand]]
 
 
-@dataclass(frozen=True)
-class Mixed:
-    """Setpoints for some robots and goals for the others.
-
-    Attributes:
-        actions: setpoints for this frame, shape (n, actions); rows of robots that follow goals are ignored.
-        by_goals: which robots follow goals in this frame, shape (n,).
-        commands: new goals, by simulation; goals of robots that follow setpoints are ignored.
-    """
-
-    actions: NDArray[np.float64]
-    by_goals: NDArray[np.bool_]
-    commands: Mapping[int, Sequence[BrainCommand]]
-
-
-Command = NDArray[np.float64] | Chunk | Goals | Mixed | None
+Command = NDArray[np.float64] | Chunk | Goals | None
 """What n robots are to do: setpoints of shape (n, actions), in the order of the action features; a `Chunk` of them;
-`Goals`; both (`Mixed`); or None, to continue with the last chunk or goal."""
+`Goals`; or None, to continue with the last chunk or goal."""

@@ -166,7 +166,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         if (
             pool is None
             and robots.camera_shapes
-            and (config.record.repo_id or any(brain_run.timed.uses_images for brain_run in runs))
+            and (config.record.repo_id or any(brain_run.loop.brain.uses_images for brain_run in runs))
         ):
             robots.start_rendering()  # a machine without OpenGL fails here, before the first episode
         if robots.clock is not None:
@@ -198,7 +198,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         "made": datetime.now().astimezone().isoformat(timespec="seconds"),
         "n_envs": n,
         "clock": "realtime" if config.is_live else "lockstep",
-        "brains": {brain_run.label: brain_run.timing() for brain_run in runs if brain_run.timed.times},
+        "brains": {brain_run.label: brain_run.timing() for brain_run in runs if brain_run.loop.act_times},
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
     result.fault, result.has_quit = fault, person.has_quit
@@ -306,7 +306,7 @@ def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict
     return {
         "robot": describe(robots.config),
         "task": runs[0].loop.task.parameters(),
-        "brains": {brain_run.label: brain_run.timed.parameters() for brain_run in runs},
+        "brains": {brain_run.label: brain_run.loop.brain.parameters() for brain_run in runs},
         "baseline": config.reference,
         "seed": config.seed,
         "split": config.split,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,10 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, DatasetMismatchError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
-from bhd_lerobot.policies.brain import Brain, is_privileged
+from bhd_lerobot.policies.brain import is_privileged
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.robots import Robots
-from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.rollout.provenance import episode_metadata, recorded_episode, versions
@@ -44,7 +44,6 @@ class BrainRun:
     Attributes:
         label: the brain's name in the evaluation.
         loop: what runs it.
-        timed: its clock.
         episodes: the numbers of its episodes.
         trajectories: its episodes from above, by number.
         videos: of what videos are to be made: episode, scene and recorded physics states.
@@ -56,7 +55,6 @@ class BrainRun:
 
     label: str
     loop: EpisodeLoop
-    timed: TimedBrain
     episodes: list[EpisodeMetrics] = field(default_factory=list)
     trajectories: dict[int, Trajectory] = field(default_factory=dict)
     videos: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
@@ -72,12 +70,12 @@ class BrainRun:
 
     def close(self) -> None:
         """Disconnect a teleoperator."""
-        if (close := getattr(self.timed, "close", None)) is not None:  # `isinstance` does not see through `TimedBrain`
-            close()
+        if isinstance(self.loop.brain, TeleopBrain):
+            self.loop.brain.close()
 
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""
-        calls = np.array(self.timed.times)
+        calls = np.array(self.loop.act_times)
         ran = [episode for episode in self.episodes if episode.episode not in self.recorded]
         simulated = sum(episode.length_s for episode in ran)
         quantiles = dict(zip(("p50_s", "p99_s", "max_s"), np.quantile(calls, (0.5, 0.99, 1.0)).tolist(), strict=True))
@@ -95,14 +93,13 @@ def prepare(config: EvalConfig, label: str, robots: Robots, pool: WorkerPool | N
     """Make a brain and what runs it: one that does not fit fails here, before any episode."""
     fps = robots.rates.fps
     try:
-        timed = TimedBrain(make_brain(config.brains[label]))
+        brain = make_brain(config.brains[label])
         task = make_task(config.task, robots.n, fps, robots.body)
         task = judged(task, robots.knows, robots.n, fps)
-        brain = cast(Brain, timed)
         if pool is None:
-            return BrainRun(label, EpisodeLoop(robots, task, brain), timed)
+            return BrainRun(label, EpisodeLoop(robots, task, brain))
         loop = ClusterLoop(robots, task, brain, pool=pool, config=config, brain_config=config.brains[label])
-        return BrainRun(label, loop, timed)
+        return BrainRun(label, loop)
     except BhdError as error:
         raise type(error)(f"brains.{label}: {error}") from error
 

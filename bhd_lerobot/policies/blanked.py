@@ -6,7 +6,7 @@ another episode only.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,10 @@ from bhd_lerobot.policies.brain import (
     ANY_ROBOT,
     Brain,
     BrainConfig,
+    ConfiguredBrain,
     DriverConfig,
-    Looking,
     Observation,
     RobotFeatures,
-    uses_privileged_state,
 )
 
 
@@ -56,28 +55,18 @@ class BlankedConfig(BrainConfig):
             )
 
 
-class BlankedBrain:
+class BlankedBrain(ConfiguredBrain):
     """Passes everything on to a brain but its instruction or its images."""
 
     name = "blanked"
     robot_kind = ANY_ROBOT
 
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
-        self.config, self._brain = config, brain
-        self.has_plan = brain.has_plan
+        super().__init__(config)
+        self._brain = brain
+        self.has_plan, self.uses_images = brain.has_plan, brain.uses_images
+        self.uses_privileged_state = brain.uses_privileged_state
         self._instructions: list[str] = []
-        if hasattr(brain, "looks"):
-            self.looks = self._looks if config.images and config.exchange else brain.looks
-
-    @property
-    def uses_images(self) -> bool:
-        """Whether the brain uses images."""
-        return self._brain.uses_images
-
-    @property
-    def uses_privileged_state(self) -> bool:
-        """Whether the brain uses what no sensor measures."""
-        return uses_privileged_state(self._brain)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Bind the brain."""
@@ -102,10 +91,10 @@ class BlankedBrain:
             self._instructions[sim] = instruction
         return [self._instructions[(sim + 1) % n] for sim in ids]
 
-    def _looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
-        """Return in which simulations images are needed, shape (n,): in all if the brain looks at those of any."""
-        looks = cast(Looking, self._brain).looks(results)
-        return np.full_like(looks, looks.any())
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return where the brain looks; with exchanged images, in all simulations if it looks at those of any."""
+        looks = self._brain.looks(results)
+        return np.array(looks.any()) if self.config.images and self.config.exchange else looks
 
     def subtasks(self) -> Sequence[str]:
         """Return what the brain is doing."""

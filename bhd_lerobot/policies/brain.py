@@ -103,7 +103,7 @@ class Brain(Protocol):
     """A rule or a network that drives n robots.
 
     A brain learns once which features it will see and which it must command; it finds its inputs by name and fails at
-    once, with the names it misses, if they are not there.
+    once, with the names it misses, if they are not there. `ConfiguredBrain` has all of it but `bind` and `act`.
     """
 
     name: str
@@ -111,6 +111,10 @@ class Brain(Protocol):
     """The robots that it is for: ``"base"``, ``"arm"``, or `ANY_ROBOT` if it finds out when it is bound."""
     has_plan: bool
     """Whether it works step by step, and `subtasks` and `plan` say what it does."""
+
+    @classmethod
+    def robot_of(cls, config: Any) -> str:
+        """Return the kind or the type of robot that a brain of this configuration is for, before the brain is made."""
 
     @property
     def uses_images(self) -> bool:
@@ -144,33 +148,51 @@ class Brain(Protocol):
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
 
     def act(self, observation: Observation) -> Command:
-        """Return the command of n robots for this frame.
+        """Return the command of n robots for this frame; a brain returns goals always or never."""
 
-        A brain returns goals always or never, unless what it returns is `Mixed`.
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return in which simulations the next `act` uses images; in the others it may get black ones.
+
+        Args:
+            results: what the next observation will have as its results.
+
+        Returns:
+            Shape (n,), or () for all of them.
+        """
+
+    def advice(self) -> NDArray[np.float64] | None:
+        """Return what an expert would do in the frame that `act` decided last, shape (n, actions); None without one."""
+
+    def interventions(self) -> NDArray[np.bool_] | None:
+        """Return which robots an expert drives in the frame that `act` decided last, shape (n,); None without one."""
+
+    def causes(self) -> Sequence[str]:
+        """Return why the expert took over last, as text, of each simulation; empty without a takeover in this episode.
+
+        Called only where `interventions` is true of a robot.
         """
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""
 
 
-def uses_privileged_state(brain: Brain) -> bool:
-    """Return whether a brain uses the environment state; of one that does not say it is taken for granted."""
-    return bool(getattr(brain, "uses_privileged_state", True))
-
-
 def is_privileged(brain: Brain, environment_names: Sequence[str]) -> bool:
     """Return whether a brain acts on what no sensor tells: it uses the environment state, and the task reports one."""
-    return bool(environment_names) and uses_privileged_state(brain)
+    return bool(environment_names) and brain.uses_privileged_state
 
 
 class ConfiguredBrain:
-    """What brains have in common that are defined by their configuration; without images and without a plan.
+    """Base class of brains: one that uses no images, has no plan and no expert, and depends on the observation alone.
+
+    A subclass sets `robot_kind` and defines `bind` and `act`.
 
     Attributes:
         config: the parameters.
+        robot_kind: the robots that it is for: ``"base"``, ``"arm"`` or ``"any"``.
     """
 
     name: str
+    robot_kind: str
     uses_images = False
     uses_privileged_state: bool = True
     """Of a brain that does not say, it is taken for granted that it uses what the task reports, if that is anything."""
@@ -178,6 +200,11 @@ class ConfiguredBrain:
 
     def __init__(self, config: Any) -> None:
         self.config = config
+
+    @classmethod
+    def robot_of(cls, config: Any) -> str:
+        """Return the kind of robot that the brain is for, whatever its configuration."""
+        return cls.robot_kind
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget nothing: what it does depends on the observation alone."""
@@ -190,30 +217,25 @@ class ConfiguredBrain:
         """Return nothing: there is no plan."""
         return {}
 
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return whether it uses images, in every frame and simulation."""
+        return np.array(self.uses_images)
+
+    def advice(self) -> NDArray[np.float64] | None:
+        """Return nothing: there is no expert."""
+        return None
+
+    def interventions(self) -> NDArray[np.bool_] | None:
+        """Return nothing: nobody takes over."""
+        return None
+
+    def causes(self) -> Sequence[str]:
+        """Return nothing: nobody takes over."""
+        return ()
+
     def parameters(self) -> dict[str, Any]:
         """Return the type and the parameters."""
         return {"type": self.name, **asdict(self.config)}
-
-
-class Looking(Protocol):
-    """A brain that does not look in every frame, nor in all simulations at a time."""
-
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
-        """Return in which simulations the next `act` uses images, shape (n,); in the others it may get black ones.
-
-        Args:
-            results: what the next observation will have as its results.
-        """
-
-
-class Intervening(Protocol):
-    """A brain in which someone sometimes takes over; what it says is about the frame that `act` decided last."""
-
-    def interventions(self) -> NDArray[np.bool_]:
-        """Return which robots are driven by the one who takes over, shape (n,)."""
-
-    def causes(self) -> Sequence[str]:
-        """Return why, as text, of each simulation; empty without a takeover in this episode."""
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:

@@ -39,7 +39,7 @@ class DatasetConfig:
             brains with a plan. Off by default, because PyTorch's collating and `lerobot-dataset-viz` fail on that
             column; LeRobot's training supports it.
         expert_action: also record the expert's action in every frame, `expert.action`: with the brain `dagger`, that
-            of its expert, if it gives setpoints; with another rule, the rule's own action.
+            of its expert; with another rule, the rule's own action.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.

@@ -11,6 +11,7 @@ __all__ = [
     "provenance",
     "recorder",
     "replay",
+    "replay_robot",
     "run_folder",
     "signals",
     "types",

@@ -3,18 +3,18 @@
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import BrainStoppedError
-from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures, is_privileged
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
@@ -45,6 +45,7 @@ class EpisodeLoop:
         fault: whether a real robot's fault has, or a brain that has stopped.
         problem: why the brain has stopped, as text; empty if it has not.
         marks: takes the marks of a person for the running episodes.
+        act_times: how long each call of the brain's `act` took [s].
     """
 
     observer: Observer | None = None
@@ -68,6 +69,8 @@ class EpisodeLoop:
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(robots.n, np.int64)
         self.frames = 0
+        self.act_times: list[float] = []
+        self._gives_goals = False
         self._drivers = DriverLog(brain, robots.n, self._frames)
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
@@ -98,7 +101,6 @@ class EpisodeLoop:
             open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
         self._open_images = open_images
-        self._advice: Callable[[], NDArray[np.float64] | None] | None = getattr(self.brain, "advice", None)
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]
@@ -178,19 +180,12 @@ class EpisodeLoop:
         self.marks.begin(ids)
         self._truth = None
 
-    def _looks(self) -> NDArray[np.bool_]:
-        """Return in which simulations the brain is about to use images, shape (n,)."""
-        looks = getattr(self.brain, "looks", None)  # `isinstance` does not see through a `TimedBrain`
-        if self.brain.uses_images and looks is not None:
-            return cast(Looking, self.brain).looks(self._results)
-        return np.full(self.robots.n, self.brain.uses_images)
-
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
         robots, task, brain = self.robots, self.task, self.brain
         frame = robots.observe()
         state = frame.state.astype(np.float32)
-        images = self._images.order_all(self.observer, self._looks())
+        images = self._images.order_all(self.observer, np.broadcast_to(brain.looks(self._results), robots.n))
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:
@@ -212,8 +207,9 @@ class EpisodeLoop:
             command = in_single_precision(brain.act(seen))
         except BrainStoppedError as error:
             command, self.problem = None, str(error)
+        self.act_times.append(time.perf_counter() - started)
         # On the lockstep clock time stands still during inference.
-        inference_time = np.full(robots.n, time.perf_counter() - started if robots.clock is not None else 0.0)
+        inference_time = np.full(robots.n, 0.0 if robots.clock is None else self.act_times[-1])
         report = robots.step(command)
         self._log(command, report)
         if brain.has_plan:
@@ -226,7 +222,7 @@ class EpisodeLoop:
             keys.INFERENCE_TIME: inference_time,
             **frame.columns,
         }
-        if self._advice is not None and (advised := self._advice()) is not None:
+        if (advised := brain.advice()) is not None:
             values[keys.EXPERT_ACTION] = advised.astype(np.float32)
         finished: list[tuple[int, Event]] = []
         for number, frame_report in enumerate((*report.missed, report)):
@@ -250,7 +246,7 @@ class EpisodeLoop:
         event, driven = self.marks.frame(event, robots.running)
         if self.problem:
             event = np.where(robots.running & (event == Event.NOTHING), int(Event.FAULT), event)
-        taken, _ = self._drivers.frame(running, self._length, is_missed=is_missed)
+        taken = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
             keys.ACTION: report.requested.astype(np.float32),
             keys.APPLIED_ACTION: report.applied,
@@ -288,8 +284,9 @@ class EpisodeLoop:
 
     def _log(self, command: Command, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
-        self._drivers.decided(command)
-        if isinstance(command, Goals | Mixed):
+        self._drivers.decided()
+        self._gives_goals = isinstance(command, Goals)
+        if isinstance(command, Goals):
             for sim, goals in command.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), goal) for goal in goals]
         for sim, results in report.results.items():
@@ -352,12 +349,11 @@ class EpisodeLoop:
             outcome=outcome,
             timing=timing,
             writer=writer,
-            commands=self._commands[sim] if self._drivers.gives_goals else None,
+            commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,
             realtime=None if self.robots.clock is None else self.robots.clock.grants,
             interventions=self._drivers.interventions(sim, length),
-            goal_frames=self._drivers.goal_frames(sim, length),
         )
 
 
@@ -366,7 +362,7 @@ def in_single_precision(command: Command) -> Command:
     match command:
         case None | Goals():
             return command
-        case Chunk() | Mixed():
+        case Chunk():
             return replace(command, actions=_rounded(command.actions))
         case _:
             return _rounded(command)

@@ -63,7 +63,7 @@ _OF_AN_EPISODE = frozenset(
         *("intervened_frames", "interventions"),
     }
 )
-"""What `episode_metadata` writes besides the task's own details."""
+"""What `episode_metadata` writes besides the task's own details; version 0.3 wrote `goal_frames`, too."""
 
 
 def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], instruction: str) -> Episode:
@@ -96,8 +96,6 @@ def _goals(episode: Episode) -> dict[str, Any]:
         columns["results"] = _json(
             [[frame, end.task_id, end.success, end.code.name.lower(), end.message] for frame, end in episode.results]
         )
-    if episode.goal_frames is not None:
-        columns["goal_frames"] = _json(episode.goal_frames)
     return columns
 
 

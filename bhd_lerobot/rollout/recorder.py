@@ -174,12 +174,8 @@ def info_of(root: Path) -> DatasetSummary | None:
 
 def _check_expert(brain: Any) -> None:
     """Raise if nobody states what an expert would do."""
-    advice = getattr(brain, "gives_advice", None)
-    if advice is None and brain.name != "learned":
-        return  # a rule is its own expert
-    if not advice:
-        what = "a policy, and no expert" if advice is None else "with an expert that gives goals"
+    if brain.name == "learned":  # a rule is its own expert
         raise ConfigError(
-            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, {what}. Use a rule, "
-            "or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
+            f"dataset.expert_action records an expert's actions, but brain.type is {brain.name!r}, a policy, and no "
+            "expert. Use a rule, or brain.type=dagger with a rule as its expert, such as gap_follower."
         )

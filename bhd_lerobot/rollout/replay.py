@@ -22,6 +22,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.registry import make_simulation
+from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.plots import draw_divergence
 from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
@@ -46,19 +47,24 @@ class ReplayDatasetConfig:
 
 @dataclass
 class ReplayConfig:
-    """Replay a recorded episode in simulation, and report how far it diverges from the recording.
+    """Replay a recorded episode, in simulation or on a robot, and report how far it diverges from the recording.
 
     Attributes:
         dataset: which episode.
         mode: `open_loop`, `state`, or `both`.
         output_dir: where the plots go; `outputs/replay` if nothing.
         tolerance_m: largest position difference that counts as the same [m]; beyond it the exit status is 1.
+        robot: a robot that the recorded actions are sent to, of LeRobot or of a plug-in, or one of ours on the wall
+            clock; by default the episode is simulated.
+        gate: limits of what is sent to a robot of another package.
     """
 
     dataset: ReplayDatasetConfig = field(default_factory=ReplayDatasetConfig)
     mode: str = "both"
     output_dir: str | None = None
     tolerance_m: float | None = None
+    robot: RobotConfig | None = None
+    gate: GateConfig = field(default_factory=GateConfig)
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -111,14 +117,14 @@ class Replay:
         if plant := summary.recording.get("robot", {}).get("plant"):
             raise DatasetError(
                 f"{root} was recorded on a robot that is not simulated, by the plant {plant}: there is no world to "
-                "replay it in. Send its actions to the robot with lerobot-replay."
+                "replay it in. Send its actions to the robot: add --robot.type=…."
             )
         missing = [key for key in (keys.PHYSICS_STATE, keys.ACTION, keys.AGE) if key not in self.columns]
         missing += [key for key in ("scene", "initial_state", "seed") if key not in metadata]
         if missing or "robot" not in summary.recording:
             raise DatasetError(
                 f"{root} was not recorded by bhd-record: it lacks {', '.join(missing) or 'the robot parameters'}. "
-                "Replay its actions on a robot with lerobot-replay."
+                "Send its actions to a robot: add --robot.type=…."
             )
         self.metadata = metadata
         self.scene = scene_from_json(metadata["scene"])
@@ -130,7 +136,7 @@ class Replay:
             self.goals = {}
             for frame, fields_ in json.loads(metadata["goals"]):
                 self.goals.setdefault(frame, []).append(command_from_json(fields_))
-        # Frames in which goals were followed; in the others, the recorded actions were the setpoints.
+        # Version 0.3 had episodes that followed goals in some frames, and in the others the recorded actions.
         self._by_goals = np.full(len(self.columns[keys.ACTION]), self.goals is not None)
         if metadata.get("goal_frames"):
             self._by_goals[:] = False
@@ -213,15 +219,19 @@ class Replay:
         )
 
 
-def replay(config: ReplayConfig, console: Console | None = None) -> list[Divergence]:
-    """Replay an episode, print how far it diverges, and draw it."""
-    console = console or Console(stderr=True)
+def root_of(config: ReplayConfig) -> Path:
+    """Return the folder of the dataset."""
     if config.dataset.root:
-        root = Path(config.dataset.root).expanduser()
-    elif config.dataset.repo_id:
-        root = default_root(config.dataset.repo_id)
-    else:
-        raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
+        return Path(config.dataset.root).expanduser()
+    if config.dataset.repo_id:
+        return default_root(config.dataset.repo_id)
+    raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
+
+
+def replay(config: ReplayConfig, console: Console | None = None) -> list[Divergence]:
+    """Replay an episode in simulation, print how far it diverges, and draw it."""
+    console = console or Console(stderr=True)
+    root = root_of(config)
     episode = Replay(root, config.dataset.episode)
     folder = Path(config.output_dir or "outputs/replay").expanduser()
     try:

@@ -38,8 +38,6 @@ class Episode:
         plan: the brain's plan, as plain values, if it has one.
         realtime: what the real-time process was granted and refused; None on the lockstep clock.
         interventions: when an expert or a person drove, in order; None if none could take over.
-        goal_frames: in which frames goals were followed, as first frames and those after the last; None if always, or
-            never.
     """
 
     spec: EpisodeSpec
@@ -55,7 +53,6 @@ class Episode:
     plan: dict[str, Any] = field(default_factory=dict)
     realtime: list[dict[str, Any]] | None = None
     interventions: list[Intervention] | None = None
-    goal_frames: list[tuple[int, int]] | None = None
 
     @property
     def frames(self) -> int:

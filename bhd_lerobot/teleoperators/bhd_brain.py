@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Rates
 from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
@@ -165,11 +165,6 @@ class BhdBrain(Teleoperator):
         environment = reported[None] if is_privileged(self._brain, names) else None
         observation = Observation(robot.observation_names, state, images, environment, {0: self._results})
         wanted = self._brain.act(observation)
-        if isinstance(wanted, Mixed):
-            raise ConfigError(
-                f"The brain {self._brain_name!r} gives goals in some frames and setpoints in others, which "
-                "`lerobot-teleoperate` and `lerobot-record` cannot do. Use bhd-record."
-            )
         if isinstance(wanted, Goals):
             action, self._results = self._stream(robot, wanted)
         else:

@@ -102,8 +102,11 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
-        rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
-        return ["Run it on the robot for a minute with:", f"  {rollout}"]
+        options = f"--robot.type={contract.robot_type} --brain.path={quoted(path)} --task.instruction='…'"
+        return [
+            "Run it on the robot, with the robot's own options, with:",
+            f"  bhd-record {options} --dataset.root=data/rollout",
+        ]
     text, usual = "Evaluate it with:", {}
     if task is None:
         task, found = tasks_for(contract.robot_type)[0], {}

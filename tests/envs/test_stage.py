@@ -10,6 +10,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.stage import Stage
+from bhd_lerobot.policies.brain import ConfiguredBrain
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
@@ -20,10 +21,10 @@ from tests.envs.support import NAMES, short, some_actions
 ONE = np.zeros(1, np.intp)
 
 
-class Script:
+class Script(ConfiguredBrain):
     """Plays rows of actions, the same in every simulation, from each episode's start."""
 
-    name, robot_type, uses_images, has_plan = "script", "any", False, False
+    name, robot_kind = "script", "any"
 
     def __init__(self, rows: np.ndarray) -> None:
         self.rows = rows

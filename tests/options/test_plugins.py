@@ -93,6 +93,16 @@ def test_a_name_that_is_taken_is_refused_and_the_first_stays(installer) -> None:
     assert BrainConfig.get_choice_class("twice").__module__ == "lerobot_robot_first"
 
 
+def test_a_brain_that_is_not_derived_from_the_base_class_is_refused(installer) -> None:
+    installer.install("lerobot_robot_plain", BRAIN.format(name="plain").replace("Mine(bhd.ConfiguredBrain)", "Mine"))
+    reported: list[str] = []
+    plugins.load_plugins(reported.append)
+    [text] = reported
+    assert "brain 'plain', Mine, is not derived from bhd_lerobot.ConfiguredBrain" in text
+    assert "write class Mine(bhd.ConfiguredBrain)" in text
+    assert "plain" not in registry.brains_for("turtlebot3")
+
+
 def test_a_configuration_without_its_class_is_refused(installer, tmp_path) -> None:
     installer.install(
         "lerobot_robot_half",

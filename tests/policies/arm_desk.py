@@ -1,7 +1,7 @@
 """A table without a simulator: observations for brains that give goals, and results for their goals."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -43,20 +43,15 @@ class Bench:
         self.brain.bind(RobotFeatures(self.observed, self.observed, 25, self.names))
         self.brain.reset(np.arange(self.n), [0] * self.n, self.n, instructions or [""] * self.n)
 
-    def commands(self, observation: Observation) -> Mapping[int, Sequence[BrainCommand]]:
-        goals = self.brain.act(observation)
-        assert isinstance(goals, Goals)
-        return goals.commands
-
     def look(
         self, results: dict[int, list[CommandResult]] | None = None, running: np.ndarray | None = None
     ) -> dict[int, BrainCommand]:
         """Let the brain see the simulations; return the new goals."""
         environment = self.environment.reshape(self.n, -1)
+        goals = self.brain.act(Observation(self.observed, self.state, {}, environment, results or {}, running))
+        assert isinstance(goals, Goals)
         new = {}
-        for sim, commands in self.commands(
-            Observation(self.observed, self.state, {}, environment, results or {}, running)
-        ).items():
+        for sim, commands in goals.commands.items():
             (new[sim],) = commands
             assert new[sim].task_id not in [one.task_id for one in self.given[sim]]
             self.given[sim].append(new[sim])

@@ -1,6 +1,5 @@
 """A brain without a sense: what the brain in it gets."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,14 +7,21 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 
 
-class Spy(SimpleNamespace):
+class Spy(ConfiguredBrain):
     """Notes what it gets."""
 
     has_plan, uses_images, uses_privileged_state = True, True, False
+
+    def __init__(self, looks: list[bool] | None = None) -> None:
+        super().__init__(None)
+        self.where = looks
+
+    def looks(self, results: Any) -> np.ndarray:
+        return super().looks(results) if self.where is None else np.array(self.where)
 
     def parameters(self) -> dict[str, Any]:
         return {}
@@ -44,18 +50,21 @@ def test_what_is_blanked_does_not_arrive_and_all_else_does(deaf: bool, blind: bo
     assert spy.seen.state is state
     assert (brain.has_plan, brain.uses_images, brain.uses_privileged_state) == (True, True, False)
     assert images["scene"].min() == 200, "nobody else's images are changed"
+    assert brain.looks({}).tolist() is True
+    spy.where = [True, False]
+    assert brain.looks({}).tolist() == [True, False]
 
 
 def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> None:
-    spy: Any = Spy(looks=lambda _: np.array([False, True, False]))
+    spy: Any = Spy(looks=[False, True, False])
     brain = BlankedBrain(BlankedConfig(brain=None, instruction=True, images=True, exchange=True), spy)  # type: ignore[arg-type]
     brain.reset(np.arange(3), [1, 2, 3], 3, ["a", "b", "c"])
     assert spy.instructions == ["b", "c", "a"]
     brain.reset(np.array([0, 2]), [4, 5], 3, ["d", "e"])
     assert spy.instructions == ["b", "d"]
     # Where it looks in one simulation, the images of the others are needed.
-    assert brain.looks({}).tolist() == [True, True, True]
-    spy.looks = lambda _: np.zeros(3, np.bool_)
+    assert brain.looks({}).all()
+    spy.where = [False, False, False]
     assert not brain.looks({}).any()
     images = np.arange(1, 4, dtype=np.uint8)[:, None, None, None] * np.ones((3, 4, 6, 3), np.uint8)
     state = np.zeros((3, 1))
@@ -70,7 +79,7 @@ def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> N
 
 
 def test_of_a_brain_that_does_not_say_it_is_taken_for_granted_that_it_is_told_the_truth() -> None:
-    inner: Any = SimpleNamespace(has_plan=False)
+    inner: Any = ConfiguredBrain(None)
     brain = BlankedBrain(BlankedConfig(brain=None, images=True), inner)  # type: ignore[arg-type]
     assert brain.uses_privileged_state
 

@@ -7,22 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.commands import Goals, Mixed
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
-from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
-from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.manipulation.servo import PickServoConfig, ReachServoConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.rollout.drivers import DriverLog, flagged, spans
+from bhd_lerobot.rollout.drivers import DriverLog, Intervention, flagged, spans
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.replay import Replay
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
@@ -30,7 +27,7 @@ from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import Event
-from tests.recording.support import data_columns, episode_rows, run_record
+from tests.recording.support import data_columns, episode_rows, run_record, save_lidar_policy
 
 SECONDS = 2.0
 NOBODY: dict[str, Any] = {"collision_s": None, "stall_s": None}
@@ -38,7 +35,7 @@ NOBODY: dict[str, Any] = {"collision_s": None, "stall_s": None}
 
 def run(kind: str, brain: Any, n: int = 2, episodes: int = 3, seconds: float = SECONDS) -> list[Episode]:
     if kind == "ur5":
-        simulation = make_simulation(UR5Config(), n)
+        simulation = make_simulation(UR5Config(action_space="tool", tool_pose=True), n)
         task = make_task(ReachConfig(duration_s=seconds), n, 25)
     else:
         simulation = make_simulation(TurtleBot3Config(beams=36), n)
@@ -52,36 +49,10 @@ def assert_same(first: Episode, second: Episode, but: tuple[str, ...] = ()) -> N
             np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
 
 
-class Wave:
-    """An arm that swings around where it began, each joint in its own way."""
-
-    name, robot_type, uses_images, has_plan = "wave", "any", False, False
-
-    def bind(self, *_: Any) -> None: ...
-
-    def reset(self, ids: np.ndarray, seeds: Any, n: int, instructions: Any = ()) -> None:
-        if not hasattr(self, "frame") or len(self.frame) != n:
-            self.frame, self.start = np.zeros(n, int), np.zeros((n, 7))
-        self.frame[ids] = 0
-
-    def act(self, seen: Any) -> np.ndarray:
-        new = (self.frame == 0) & seen.running
-        self.start[new] = seen.state[new, :7]
-        swing = 0.5 * np.sin(self.frame / 20)[:, None] * np.array([1, -0.6, -0.5, 1, -1, 1, 0])
-        self.frame[seen.running] += 1
-        return self.start + swing
-
-    def parameters(self) -> dict[str, Any]:
-        return {"type": "wave"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "expert"), [("turtlebot3", GapFollowerConfig()), ("ur5", ReachBrainConfig())], ids=["setpoints", "goals"]
-)
-def test_a_learner_that_nobody_corrects_drives_as_if_alone(kind: str, expert: Any) -> None:
+def test_a_learner_that_nobody_corrects_drives_as_if_alone() -> None:
     random = RandomConfig(scale=0.1)
-    dagger = make_brain(DaggerConfig(random, expert, **NOBODY))
-    alone, together = run(kind, RandomBrain(random)), run(kind, dagger)
+    dagger = make_brain(DaggerConfig(random, GapFollowerConfig(), **NOBODY))
+    alone, together = run("turtlebot3", RandomBrain(random)), run("turtlebot3", dagger)
     for first, second in zip(alone, together, strict=True):
         assert_same(first, second)
         assert first.interventions is None
@@ -103,7 +74,6 @@ def test_exactly_the_frames_that_the_expert_drove_are_flagged_and_its_actions_ar
         assert [(intervention.first, intervention.end) for intervention in episode.interventions] == [(5, 8), (13, 16)]
         assert {intervention.cause for intervention in episode.interventions} == {"time is up"}
         assert episode.commands is None
-        assert episode.goal_frames is None
 
 
 class Spy(GapFollowerBrain):
@@ -131,65 +101,25 @@ def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_m
     np.testing.assert_array_equal(episode.columns[keys.ACTION][10:], np.array(advised, np.float32)[10:])
 
 
-def dagger_wave(**values: Any) -> DaggerBrain:
-    settings = DaggerConfig(NoopConfig(), ReachBrainConfig(), **{**NOBODY, **values})
-    return DaggerBrain(settings, Wave(), ReachBrain())
-
-
-@pytest.mark.parametrize("hold_s", [None, 0.4])
-def test_goals_take_over_an_arm_in_motion_without_a_jump_and_give_it_back(hold_s: float | None) -> None:
-    limits = ur5().limits
-    episodes = run("ur5", dagger_wave(patience_s=0.6, hold_s=hold_s), seconds=2.4)
-    for episode in episodes:
-        columns = episode.columns
-        assert episode.goal_frames is not None
-        by_goals = np.zeros(episode.frames, np.bool_)
-        for first, end in episode.goal_frames:
-            by_goals[first:end] = True
-        assert not by_goals[:15].any()
-        assert by_goals[15:25].all()
-        assert episode.interventions is not None
-        assert [(intervention.first, intervention.end) for intervention in episode.interventions] == episode.goal_frames
-        assert episode.commands
-        assert {frame for frame, _ in episode.commands} <= set(np.flatnonzero(by_goals).tolist())
-        speed = np.diff(columns[keys.APPLIED_ACTION][:, :6], axis=0) * 25
-        assert np.abs(speed[13]).max() > 0.1  # it was in motion when it was taken over
-        assert (np.abs(speed) <= np.array(limits.velocity[:6]) * 1.001).all()
-        # Between two frames the speed changes by no more than the limit of acceleration allows.
-        change = np.abs(np.diff(speed, axis=0)) * 25
-        assert (change <= np.array(limits.acceleration[:6]) * 1.01).all()
-        # While goals are followed, what is learned is where the reference was.
-        applied = columns[keys.APPLIED_ACTION].astype(np.float32)
-        np.testing.assert_array_equal(columns[keys.ACTION][by_goals], applied[by_goals])
-        assert (columns[keys.ACTION][~by_goals] != applied[~by_goals]).any()
-        assert columns[keys.SUBTASK][0] == "the learner drives"
-        assert columns[keys.SUBTASK][15] == "move the tool to the target"
-
-
 def test_an_episode_does_not_depend_on_those_beside_it() -> None:
     for kind, brain in (
-        ("ur5", lambda: dagger_wave(patience_s=0.4, hold_s=0.5)),
-        (
-            "turtlebot3",
-            lambda: make_brain(DaggerConfig(RandomConfig(), GapFollowerConfig(), patience_s=0.5, hold_s=0.4)),
-        ),
+        ("ur5", DaggerConfig(NoopConfig(), ReachServoConfig(), patience_s=0.4, hold_s=0.5)),
+        ("turtlebot3", DaggerConfig(RandomConfig(), GapFollowerConfig(), patience_s=0.5, hold_s=0.4)),
     ):
-        for one, other in zip(run(kind, brain(), n=1), run(kind, brain(), n=3), strict=True):
+        for one, other in zip(run(kind, make_brain(brain), n=1), run(kind, make_brain(brain), n=3), strict=True):
             assert_same(one, other)
             assert one.interventions == other.interventions
-            assert one.commands == other.commands
 
 
 AVOID = {"brain__type": "dagger", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}
 TURNS = {"brain__patience_s": 1, "brain__hold_s": 1}
+ARM = {"robot__type": "ur5", "robot__beams": None, "robot__action_space": "tool", "robot__tool_pose": True}
 REACH = {
-    "robot__type": "ur5",
-    "robot__beams": None,
+    **ARM,
     "task__type": "reach",
     "brain__type": "dagger",
-    "brain__learner__type": "random",
-    "brain__learner__scale": 0.05,
-    "brain__expert__type": "reach",
+    "brain__learner__type": "noop",
+    "brain__expert__type": "reach_servo",
     "brain__patience_s": 0.4,
     "brain__hold_s": 1.0,
 }
@@ -219,7 +149,7 @@ def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_e
         wanted[-1] = False
         assert ((event == Event.INTERVENTION) == wanted).all()
         brain = json.loads(row["bhd/brain"])
-        assert (brain["type"], brain["learner"]["type"]) == ("dagger", "random")
+        assert (brain["type"], brain["learner"]["type"]) == ("dagger", robot["brain__learner__type"])
         assert Replay(one, index).open_loop().identical
 
 
@@ -248,17 +178,16 @@ def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
 
 
 def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
-    simulation = make_simulation(UR5Config(), 4)
-    brain = make_brain(DaggerConfig(NoopConfig(), PickBrainConfig(), stall_s=0.5))
+    simulation = make_simulation(UR5Config(action_space="tool", tool_pose=True), 4)
+    brain = make_brain(DaggerConfig(NoopConfig(), PickServoConfig(), collision_s=None, stall_s=0.5))
     loop = EpisodeLoop(simulation, make_task(PickConfig(), 4, 25), brain)
     for episode in loop.run([EpisodeSpec(i, 2 * i) for i in range(4)]):
         assert episode.outcome.success
         assert episode.interventions is not None
         assert [intervention.cause for intervention in episode.interventions] == ["no progress"]
-        assert episode.plan["attempts"] >= 1
 
 
-class Stub:
+class Stub(ConfiguredBrain):
     """Says who drives."""
 
     def __init__(self) -> None:
@@ -276,26 +205,24 @@ def test_frames_that_went_by_while_the_brain_thought_belong_to_who_drove_before(
     log = DriverLog(stub, 1, 10)
     first, length = np.zeros(1, np.intp), np.zeros(1, np.int64)
     log.start(first)
-    log.decided(Mixed(np.zeros((1, 2)), np.array([False]), {}))
+    log.decided()
     log.frame(first, length, is_missed=False)
     stub.taken[:] = True
-    log.decided(Mixed(np.zeros((1, 2)), np.array([True]), {}))
+    log.decided()
     for frame, is_missed in ((1, True), (2, True), (3, False)):
-        taken, by_goals = log.frame(first, length + frame, is_missed=is_missed)
-        assert bool(taken[0]) is bool(by_goals[0]) is (not is_missed)
+        assert log.frame(first, length + frame, is_missed=is_missed).tolist() == [not is_missed]
     (only,) = log.interventions(0, 4) or []
     assert (only.first, only.end, only.cause) == (3, 4, "late")
-    assert log.goal_frames(0, 4) == [(3, 4)]
 
 
 def test_frames_that_went_by_before_the_first_decision_belong_to_the_first() -> None:
-    log = DriverLog(object(), 1, 4)
+    stub = Stub()
+    stub.taken[:] = True
+    log = DriverLog(stub, 1, 4)
     log.start(np.zeros(1, np.intp))
-    log.decided(Goals({}))
-    taken, by_goals = log.frame(np.zeros(1, np.intp), np.zeros(1, np.int64), is_missed=True)
-    assert (bool(taken[0]), bool(by_goals[0])) == (False, True)
-    assert log.interventions(0, 1) is None
-    assert log.goal_frames(0, 1) is None  # always
+    log.decided()
+    assert log.frame(np.zeros(1, np.intp), np.zeros(1, np.int64), is_missed=True).tolist() == [True]
+    assert log.interventions(0, 1) == [Intervention(0, 1, "late")]
 
 
 def test_what_ends_an_episode_is_not_overwritten() -> None:
@@ -341,7 +268,6 @@ def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in
         assert np.allclose(stats["mean"], wanted.mean(axis=0), atol=1e-5)
 
 
-ARM = {"robot__type": "ur5", "robot__beams": None, "robot__action_space": "tool", "robot__tool_pose": True}
 EXPERTS = {
     "navigator": {"task__type": "navigate"},
     "reach_servo": {**ARM, "task__type": "reach"},
@@ -373,8 +299,12 @@ def test_every_rule_that_gives_setpoints_says_what_it_would_do_where_it_did_not_
 
 
 def test_who_is_no_expert_gives_no_advice(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"brain.type is 'dagger', with an expert that gives goals\. Use a rule"):
-        run_record(tmp_path / "goals", **REACH, dataset__expert_action=True)
+    with pytest.raises(ConfigError, match=r"brain\.expert\.type is 'reach', which gives goals.*use reach_servo"):
+        run_record(tmp_path / "goals", **{**REACH, "brain__expert__type": "reach"})
+    save_lidar_policy(tmp_path / "policy")
+    policy = {"brain__type": "learned", "brain__path": tmp_path / "policy", "dataset__expert_action": True}
+    with pytest.raises(ConfigError, match=r"brain\.type is 'learned', a policy, and no expert\. Use a rule"):
+        run_record(tmp_path / "policy_alone", **policy)
     run_record(tmp_path / "without", **AVOID, brain__patience_s=1, dataset__num_episodes=1)
     with pytest.raises(DatasetError, match=r"has no column 'expert.action'.*--dataset.expert_action=true"):
         make_loader("t/t", LoaderConfig(batch_size=7, expert_action=True), root=tmp_path / "without")

@@ -10,7 +10,7 @@ import pytest
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import is_privileged
+from bhd_lerobot.policies.brain import ConfiguredBrain, is_privileged
 from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -24,10 +24,10 @@ from tests.robots.host.support import relaxed, unique
 FRAMES = 20
 
 
-class Script:
+class Script(ConfiguredBrain):
     """Plays the rows of a script: one by one, or `length` of them at a time, every `every` frames."""
 
-    name, robot_kind, uses_images, has_plan = "script", "any", False, False
+    name, robot_kind = "script", "any"
 
     def __init__(self, rows: np.ndarray, length: int = 0, every: int = 1) -> None:
         self.rows, self.length, self.every = rows, length, every
@@ -75,7 +75,7 @@ def test_what_no_sensor_tells_is_for_brains_that_say_that_they_use_it(declared: 
 
     brain = Spy(script("ur5"))
     if declared is not None:
-        brain.uses_privileged_state = declared  # type: ignore[attr-defined]
+        brain.uses_privileged_state = declared
     assert is_privileged(brain, ["target.x"]) == told  # type: ignore[arg-type]
     episodes = run("ur5", brain)
     assert {one is not None for one in seen} == {told}

@@ -1,5 +1,6 @@
 """bhd-replay: bit-exact on its own recordings, and a number where it is not."""
 
+import json
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from bhd_lerobot.cli.replay import main
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.options.parse import parse
+from bhd_lerobot.policies.manipulation.reach import ReachBrain
 from bhd_lerobot.rollout.replay import Replay, ReplayConfig
 from tests.recording.support import run_record
 
@@ -119,8 +121,26 @@ def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_pat
         dataset.add_frame({"action": np.zeros(2, np.float32), "task": "none"})
     dataset.save_episode()
     dataset.finalize()
-    with pytest.raises(DatasetError, match="lerobot-replay"):
+    with pytest.raises(DatasetError, match=r"--robot.type"):
         Replay(tmp_path / "other", 0)
+
+
+def test_an_episode_of_setpoints_and_goals_as_version_0_3_recorded_it_is_repeated(tmp_path, monkeypatch):
+    root, held, give_goals = tmp_path / "d", [], ReachBrain.act
+
+    def hold_first(self, observation):
+        held.append(observation.state[:, :7])
+        return held[0] if len(held) <= 10 else give_goals(self, observation)
+
+    monkeypatch.setattr(ReachBrain, "act", hold_first)
+    arm = {"robot__type": "ur5", "robot__beams": None, "task__type": "reach", "brain__type": "reach"}
+    run_record(root, **arm, dataset__num_episodes=1)
+    frames = len(Replay(root, 0).columns["action"])
+    assert not Replay(root, 0).open_loop().identical
+    (file,) = (root / "meta/episodes").rglob("*.parquet")
+    pq.write_table(pq.read_table(file).append_column("bhd/goal_frames", [[json.dumps([[10, frames]])]]), file)
+    assert Replay(root, 0).metadata["goal_frames"] == f"[[10, {frames}]]"
+    assert Replay(root, 0).open_loop().identical
 
 
 def test_other_versions_are_named(recorded):

@@ -81,15 +81,13 @@ def test_the_stages_of_aggregation_fit_together(path: Path, monkeypatch: pytest.
     monkeypatch.chdir(FOLDER.parents[1])
     config = parse_aggregation([f"--config_path={path}"])
     stages = read_stages(config)
-    assert stages.has_advice == (stages.expert != "reach")
+    assert stages.has_advice
     robots, tasks = set(), set()
     for stage, kind in ((config.expert, RecordConfig), (config.learner, RecordConfig), (config.evaluation, EvalConfig)):
         parsed = configuration.parse(kind, command(stage, {}))
         robots.add(str(parsed.robot))
-        if stages.has_advice:  # otherwise the learner gets more time, for what the expert has to make good
-            tasks.add(str(parsed.task))
-    assert len(robots) == 1
-    assert len(tasks) <= 1
+        tasks.add(str(parsed.task))
+    assert len(robots) == len(tasks) == 1
 
 
 def test_no_configuration_for_a_cpu_counts_on_a_second_processor() -> None:

@@ -57,10 +57,13 @@ def test_options_at_their_defaults_are_not_repeated() -> None:
     )
 
 
-def test_a_robot_that_is_not_simulated_is_driven_by_lerobot() -> None:
+def test_a_robot_of_another_package_is_driven_by_its_own_options() -> None:
     said, command = how_to_evaluate(PolicyContract(robot_type="so101_follower"), "c")
-    assert "on the robot for a minute" in said
-    assert command == "  lerobot-rollout --robot.type=so101_follower --policy.path=c/pretrained_model --duration=60"
+    assert "the robot's own options" in said
+    assert command == (
+        "  bhd-record --robot.type=so101_follower --brain.type=learned --brain.path=c/pretrained_model "
+        "--task.instruction='…' --dataset.root=data/rollout"
+    )
 
 
 def test_a_task_of_a_plug_in_that_is_not_installed_is_named_with_its_options() -> None:

@@ -1,3 +1,3 @@
 """Takeovers of a learner by a rule."""
 
-__all__ = ["brain", "goal_expert", "takeover"]
+__all__ = ["brain", "takeover"]

@@ -13,18 +13,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Mixed
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import (
     ANY_ROBOT,
     Brain,
     BrainConfig,
+    ConfiguredBrain,
     DriverConfig,
     Observation,
     RobotFeatures,
-    uses_privileged_state,
 )
-from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 
@@ -40,12 +38,11 @@ class DaggerConfig(BrainConfig):
 
     Attributes:
         learner: what drives; it gives setpoints. Normally `learned`.
-        expert: what takes over: a rule.
+        expert: what takes over: a rule that gives setpoints.
         collision_s: the learner is about to collide: a base within this time [s], with what its lidar sees; an arm, if
             it could not come to rest any more, with the table or with itself.
         stall_s: the robot has got nowhere for so long [s].
-        disagreement: the learner's action is farther from the expert's than this share of its range; not for experts
-            that give goals.
+        disagreement: the learner's action is farther from the expert's than this share of its range.
         disagreement_s: it has been so for so long [s].
         patience_s: the learner has driven for so long [s].
         hold_s: how long the expert drives before the learner has another turn [s]; to the episode's end if nothing.
@@ -76,28 +73,23 @@ class DaggerConfig(BrainConfig):
             )
 
 
-class DaggerBrain:
+class DaggerBrain(ConfiguredBrain):
     """Drives with a learner, and with an expert where the learner needs help.
 
-    The learner acts in every frame of its turns, and between them if it gets another; a rule that gives setpoints
-    sees every frame, so that it knows where the robot has been. An expert that gives goals starts afresh whenever it
-    takes over.
+    The learner acts in every frame of its turns, and between them if it gets another; the expert acts in every frame,
+    so that it knows where the robot has been.
     """
 
     name = "dagger"
     robot_kind = ANY_ROBOT
 
     def __init__(self, config: DaggerConfig, learner: Brain, expert: Brain) -> None:
-        self.config, self.learner, self.expert = config, learner, expert
-        if isinstance(learner, GoalBrain):
-            raise ConfigError(f"brain.learner.type is {learner.name!r}, which gives goals; a learner gives setpoints.")
-        self._goals = GoalExpert(expert) if isinstance(expert, GoalBrain) else None
-        if self._goals is not None and config.disagreement is not None:
-            raise ConfigError(
-                f"brain.disagreement compares setpoints, and the expert {expert.name!r} gives goals. Leave it out; "
-                "brain.collision_s, brain.stall_s and brain.patience_s define when it takes over."
-            )
+        super().__init__(config)
+        check_drivers(type(learner), type(expert))
+        self.learner, self.expert = learner, expert
         self.has_plan = expert.has_plan
+        self.uses_images = learner.uses_images or expert.uses_images
+        self.uses_privileged_state = learner.uses_privileged_state or expert.uses_privileged_state
         self._advised: Array | None = None
         self._watches: list[Watch] = []
         self._collision: Watch | None = None
@@ -108,21 +100,11 @@ class DaggerBrain:
         self._causes: list[str] = []
         self._shown: NDArray[np.bool_] = np.zeros(0, np.bool_)
 
-    @property
-    def uses_images(self) -> bool:
-        """Whether learner or expert uses images."""
-        return self.learner.uses_images or self.expert.uses_images
-
-    @property
-    def uses_privileged_state(self) -> bool:
-        """Whether learner or expert uses what no sensor measures."""
-        return uses_privileged_state(self.learner) or uses_privileged_state(self.expert)
-
     def bind(self, robot: RobotFeatures) -> None:
         """Bind learner and expert, and find what is to be watched."""
         config = self.config
         self.learner.bind(robot)
-        (self._goals or self.expert).bind(robot)
+        self.expert.bind(robot)
         self._width = len(robot.action_names)
 
         def frames(time_s: float) -> int:
@@ -155,32 +137,19 @@ class DaggerBrain:
         # The learner's numbers are those that it would have alone.
         self.learner.reset(ids, seeds, n, instructions)
         own = [int(np.random.SeedSequence([_EXPERT_STREAM, seed]).generate_state(1)[0]) for seed in seeds]
-        (self._goals or self.expert).reset(ids, own, n, instructions)
+        self.expert.reset(ids, own, n, instructions)
 
-    def act(self, observation: Observation) -> "Array | Mixed":
-        """Return what the robots are to do; `Mixed` if the expert gives goals."""
+    def act(self, observation: Observation) -> Array:
+        """Return what the robots are to do, shape (n, actions)."""
         running = np.ones(len(self._driving), np.bool_) if observation.running is None else observation.running
         wanted = self._ask_learner(observation, running)
-        advised = None if self._goals else _setpoints(self.expert.act(observation), self.expert.name, "expert")
-        self._advised = advised
+        self._advised = advised = _setpoints(self.expert.act(observation), self.expert.name, "expert")
         self._decide(observation, wanted, advised, running)
         self._shown = self._driving & running
-        if self._goals is not None:
-            return Mixed(wanted, self._shown.copy(), self._goals.act(observation, self._shown))
-        if advised is None:
-            raise AssertionError("An expert that gives no goals gives setpoints.")
         return np.where(self._driving[:, None], advised, wanted)
 
-    @property
-    def gives_advice(self) -> bool:
-        """Whether `advice` knows what the expert would do."""
-        return self._goals is None
-
     def advice(self) -> Array | None:
-        """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whatever drives.
-
-        None for an expert that gives goals.
-        """
+        """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whatever drives."""
         return self._advised
 
     def interventions(self) -> NDArray[np.bool_]:
@@ -193,8 +162,8 @@ class DaggerBrain:
 
     def subtasks(self) -> Sequence[str]:
         """Return what the expert is doing, as text, where it drives."""
-        texts = self._goals.subtasks() if self._goals else self.expert.subtasks()
-        return [text if taken else LEARNER_DRIVES for text, taken in zip(texts, self._shown, strict=True)]
+        pairs = zip(self.expert.subtasks(), self._shown, strict=True)
+        return [text if taken else LEARNER_DRIVES for text, taken in pairs]
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the expert's plan for one simulation."""
@@ -220,9 +189,7 @@ class DaggerBrain:
         wanted = _setpoints(self.learner.act(replace(observation, running=needed)), self.learner.name, "learner")
         return np.where(needed[:, None], wanted, 0.0)
 
-    def _decide(
-        self, observation: Observation, wanted: Array, advised: Array | None, running: NDArray[np.bool_]
-    ) -> None:
+    def _decide(self, observation: Observation, wanted: Array, advised: Array, running: NDArray[np.bool_]) -> None:
         """Settle who drives in this frame."""
         n = len(running)
         self._driven += self._driving
@@ -240,8 +207,17 @@ class DaggerBrain:
             mask = danger if watch is self._collision else watch.check(observation, wanted, advised)
             for sim in np.flatnonzero(mask & running & ~self._driving).tolist():
                 self._driving[sim], self._driven[sim], self._causes[sim] = True, 0, watch.cause
-                if self._goals is not None:
-                    self._goals.take_over(sim)
+
+
+def check_drivers(learner: type, expert: type) -> None:
+    """Refuse a learner or an expert whose class gives goals."""
+    for who, brain in (("learner", learner), ("expert", expert)):
+        if issubclass(brain, GoalBrain):
+            raise ConfigError(
+                f"brain.{who}.type is {brain.name!r}, which gives goals; learner and expert give setpoints in every "
+                "frame. In place of pick or language use pick_servo, and in place of reach use reach_servo, with "
+                "--robot.action_space=tool --robot.tool_pose=true."
+            )
 
 
 def _setpoints(decision: Any, name: str, who: str) -> Array:

@@ -35,7 +35,7 @@ class Watch(Protocol):
         """Begin the learner's turn in some of n simulations; what remembers nothing does nothing."""
         return None
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Return where the learner needs help, shape (n,).
 
         To be called once a frame; where the learner does not drive, the answer means nothing.
@@ -43,7 +43,7 @@ class Watch(Protocol):
         Args:
             seen: what the robots see.
             wanted: what the learner wants, shape (n, actions).
-            advised: what the expert would do, shape (n, actions); None if the expert gives goals.
+            advised: what the expert would do, shape (n, actions).
         """
 
 
@@ -69,7 +69,7 @@ class PatienceWatch(_FrameCounter):
         super().__init__()
         self._most = frames
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Count the frames."""
         self._frames += 1
         return np.asarray(self._frames > self._most)
@@ -97,7 +97,7 @@ class StallWatch:
             self._past = np.zeros((n, self._window, self._width))
         self._frames[ids] = 0
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Compare where the robot was within the window."""
         values = seen.state[:, self._columns]
         if self._is_base:
@@ -133,10 +133,8 @@ class DisagreementWatch(_FrameCounter):
         else:
             self._range = 2 * np.array(limits.velocity)
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Count the frames of disagreement."""
-        if advised is None:
-            raise AssertionError("It is not used with an expert that gives goals.")
         apart = (np.abs(wanted - advised) / self._range).max(axis=1) > self._share
         self._frames = (self._frames + 1) * apart
         return np.asarray(self._frames >= self._most)
@@ -155,7 +153,7 @@ class BaseCollisionWatch(Watch):
         self._footprint, self._no_return = Footprint.of(body), body.lidar.range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Compare the robot's outline on its way with what the scan shows."""
         ranges = seen.state[:, self._scan]
         is_hit = (ranges > 0) & (ranges < self._no_return)
@@ -197,7 +195,7 @@ class ArmCollisionWatch(Watch):
         self._delay = self._change / np.array(limits.jerk[:dof])
         self._least = body.chain.min_distance
 
-    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Compare the postures on the way to rest with the table and with each other."""
         position, velocity = seen.state[:, self._position], seen.state[:, self._velocity]
         after = velocity

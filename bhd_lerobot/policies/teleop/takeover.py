@@ -1,21 +1,21 @@
 """A brain from which a person takes over, and to which they give back."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Command
+from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 
 CAUSE = "person"
 
 
-class TakeoverBrain:
+class TakeoverBrain(ConfiguredBrain):
     """Drives with a brain, and with a person while they have taken over.
 
     Args:
@@ -30,13 +30,12 @@ class TakeoverBrain:
                 f"brain.type is {brain.name!r}, which gives goals; a person can take over from a brain that gives "
                 "actions, such as a trained policy."
             )
+        super().__init__(None)
         self._brain, self._person, self._is_taken = brain, person, is_taken
         self.name, self.robot_kind, self.has_plan = brain.name, brain.robot_kind, brain.has_plan
+        self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
         self._was_taken = False
         self._start: tuple[Any, ...] = ()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._brain, name)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot both drive."""
@@ -62,6 +61,22 @@ class TakeoverBrain:
             self._was_taken = False
             self._brain.reset(*self._start)  # what it planned is of another time
         return self._brain.act(observation)
+
+    def subtasks(self) -> Sequence[str]:
+        """Return what the brain is doing."""
+        return self._brain.subtasks()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the brain's plan."""
+        return self._brain.plan(sim)
+
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return where the brain looks."""
+        return self._brain.looks(results)
+
+    def advice(self) -> NDArray[np.float64] | None:
+        """Return what the brain's expert would do."""
+        return self._brain.advice()
 
     def interventions(self) -> NDArray[np.bool_]:
         """Return whether the person drove in the frame that `act` decided last, shape (1,)."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
@@ -245,8 +245,6 @@ class Host(ABC):
                 return applied
             case None | Chunk():
                 return self.to_action(self.cerebellum.requested)  # of a chunk its row for this frame, or its last
-            case Mixed(actions, by_goals, _):
-                return np.where(by_goals[:, None], applied, actions)
             case _:
                 return command
 

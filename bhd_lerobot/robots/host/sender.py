@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.bridge import Bridge
-from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals, Mixed
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.messages import Reason, SendResult
 from bhd_lerobot.robots.host.robots import Receipt
 
@@ -43,9 +43,6 @@ class CommandSender:
                 self._send_chunk(actions, running, start_ns, receipt)
             case Goals(commands):
                 self._submit(commands, receipt)
-            case Mixed(actions, by_goals, commands):
-                self._submit({sim: goals for sim, goals in commands.items() if by_goals[sim]}, receipt)
-                self._send_setpoint(actions, running & ~by_goals, receipt)
             case _:
                 self._send_setpoint(command, running, receipt)
         return receipt

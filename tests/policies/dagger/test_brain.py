@@ -1,21 +1,19 @@
-"""The brain `dagger`: who drives when, what learner and expert see, and how an expert that gives goals begins."""
+"""The brain `dagger`: who drives when, and what learner and expert see."""
 
 import json
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.commands import Chunk, CommandResult, Mixed, ResultCode
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
-from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.baselines import NoopConfig, RandomConfig
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
-from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import (
     ArmCollisionWatch,
     BaseCollisionWatch,
@@ -23,14 +21,15 @@ from bhd_lerobot.policies.dagger.takeover import (
     StallWatch,
     collision_watch,
 )
+from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
-from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
+from bhd_lerobot.policies.manipulation.servo import PickServoConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import make_brain, robot_of_brain
-from bhd_lerobot.tasks.pick import ENVIRONMENT
-from tests.policies.arm_desk import BOX, CUP, Desk, scene
+from tests.cases import each_case
 
 BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
 TWIST = ("x.vel", "theta.vel")
@@ -40,12 +39,13 @@ HOME = np.array(ur5().home)
 BURGER = turtlebot3_burger()
 DRIVEN = RobotFeatures(BASE, TWIST, 10, (), BURGER)
 UR = RobotFeatures(ARM, JOINTS, 25, (), ur5())
+NO_ADVICE = np.zeros((1, 2))
 
 
-class Fake:
+class Fake(ConfiguredBrain):
     """Always wants the same, and remembers what it received."""
 
-    robot_kind, uses_images, has_plan = "any", False, False
+    robot_kind = "any"
 
     def __init__(self, name: str, value: float) -> None:
         self.name, self.value = name, value
@@ -130,6 +130,24 @@ def test_the_learner_gets_the_seed_that_it_would_have_alone_and_the_expert_anoth
     assert not set(expert.seeds) & {0, 1}
 
 
+def test_an_expert_with_a_plan_says_what_it_does_where_it_drives() -> None:
+    class Planner(Fake):
+        has_plan = True
+
+        def subtasks(self) -> list[str]:
+            return ["go left"]
+
+    brain = DaggerBrain(config(patience_s=0.1), Fake("learner", 0.1), Planner("expert", 0.2))
+    brain.bind(DRIVEN)
+    brain.reset(np.arange(1), [0], 1)
+    said = []
+    for _ in range(2):
+        brain.act(base())
+        said += brain.subtasks()
+    assert brain.has_plan
+    assert said == [LEARNER_DRIVES, "go left"]
+
+
 def test_a_simulation_that_is_not_running_is_not_flagged() -> None:
     brain, _, _ = made(n=2, patience_s=0.1)
     seen = base(2)
@@ -151,13 +169,29 @@ def test_what_does_not_fit_together_is_refused() -> None:
         DaggerConfig(config(), GapFollowerConfig())
     with pytest.raises(ConfigError, match=r"brain\.learner\.stream is true"):
         DaggerConfig(LearnedBrainConfig("x", stream=True), GapFollowerConfig())
-    with pytest.raises(ConfigError, match="'reach', which gives goals; a learner gives setpoints"):
-        make_brain(DaggerConfig(ReachBrainConfig(), PickBrainConfig()))
-    with pytest.raises(ConfigError, match="disagreement compares setpoints, and the expert 'pick' gives goals"):
-        make_brain(DaggerConfig(NoopConfig(), PickBrainConfig(), disagreement=0.3))
     with pytest.raises(ConfigError, match=r"brain\.learner drives a base, but brain\.expert drives an arm"):
-        robot_of_brain(DaggerConfig(AvoidanceConfig(), PickBrainConfig()))
-    assert robot_of_brain(DaggerConfig(NoopConfig(), PickBrainConfig())) == "arm"
+        robot_of_brain(DaggerConfig(AvoidanceConfig(), PickServoConfig()))
+    assert robot_of_brain(DaggerConfig(NoopConfig(), PickServoConfig())) == "arm"
+
+
+@each_case(
+    ("who", "settings"),
+    [
+        ("learner.type is 'reach'", DaggerConfig(ReachBrainConfig(), PickServoConfig())),
+        *(
+            (f"expert.type is '{name}'", DaggerConfig(NoopConfig(), goals()))
+            for name, goals in (
+                *(("pick", PickBrainConfig), ("reach", ReachBrainConfig), ("language", LanguageBrainConfig)),
+            )
+        ),
+    ],
+)
+def test_a_brain_that_gives_goals_is_refused_when_the_options_are_read_and_when_it_is_made(
+    who: str, settings: DaggerConfig
+) -> None:
+    for use in (robot_of_brain, make_brain):
+        with pytest.raises(ConfigError, match=rf"brain\.{who}, which gives goals.*pick_servo.*reach_servo.*tool_pose"):
+            use(settings)
 
 
 def test_a_learner_that_gives_chunks_is_refused_by_name() -> None:
@@ -188,8 +222,8 @@ def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or
     seen = base()
     seen.state[0, 2] = 0.15  # straight ahead, 0.08 m before the robot's front
     for speed, turn, expected in [(0.22, 0.0, True), (0.0, 0.0, False), (-0.1, 0.0, False), (0.05, 0.0, False)]:
-        assert watch.check(seen, np.array([[speed, turn]]), None).tolist() == [expected], (speed, turn)
-    assert not watch.check(base(), np.array([[0.22, 0.0]]), None).any()
+        assert watch.check(seen, np.array([[speed, turn]]), NO_ADVICE).tolist() == [expected], (speed, turn)
+    assert not watch.check(base(), np.array([[0.22, 0.0]]), NO_ADVICE).any()
 
 
 def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:
@@ -197,30 +231,30 @@ def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_i
     down = np.zeros(7)
     down[1] = 1.0  # the shoulder leans forward
     low = HOME + np.array([0, 0.40, 0, 0, 0, 0, 0])
-    assert not watch.check(arm(HOME), HOME[None], None).any()
+    assert not watch.check(arm(HOME), HOME[None], NO_ADVICE).any()
     # The same posture: what counts is where it can come to rest.
     fast, slow = 2.5 * down, 0.02 * down
-    assert watch.check(arm(low, fast), low[None] + 0.1 * down, None).all()
-    assert not watch.check(arm(low, slow), low[None] + 0.0008 * down, None).any()
-    assert not watch.check(arm(low, -fast), low[None] - 0.1 * down, None).any()
+    assert watch.check(arm(low, fast), low[None] + 0.1 * down, NO_ADVICE).all()
+    assert not watch.check(arm(low, slow), low[None] + 0.0008 * down, NO_ADVICE).any()
+    assert not watch.check(arm(low, -fast), low[None] - 0.1 * down, NO_ADVICE).any()
 
 
 @pytest.mark.parametrize(("speed", "stalls"), [(0.0, True), (0.005, True), (0.2, False)])
 def test_a_base_that_gets_nowhere_stalls(speed: float, stalls: bool) -> None:
     watch = StallWatch(20, DRIVEN)
     watch.restart(np.arange(1), 1)
-    looks = [bool(watch.check(base(speed=speed), np.zeros((1, 2)), None)[0]) for _ in range(30)]
+    looks = [bool(watch.check(base(speed=speed), np.zeros((1, 2)), NO_ADVICE)[0]) for _ in range(30)]
     assert not any(looks[:20])
     assert looks[20] == stalls
     watch.restart(np.arange(1), 1)
-    assert not watch.check(base(speed=speed), np.zeros((1, 2)), None)[0]
+    assert not watch.check(base(speed=speed), np.zeros((1, 2)), NO_ADVICE)[0]
 
 
 def test_an_arm_that_turns_one_joint_does_not_stall() -> None:
     watch = StallWatch(10, UR)
     for turning, stalls in [(0.02, False), (0.0, True)]:
         watch.restart(np.arange(1), 1)
-        looks = [watch.check(arm(HOME + turning * k), HOME[None], None)[0] for k in range(12)]
+        looks = [watch.check(arm(HOME + turning * k), HOME[None], NO_ADVICE)[0] for k in range(12)]
         assert bool(looks[-1]) == stalls
 
 
@@ -232,134 +266,3 @@ def test_disagreement_counts_only_if_it_lasts() -> None:
     for turn in (wide, wide, 0.0, wide, wide, wide, wide):
         looks.append(bool(watch.check(base(), np.zeros((1, 2)), np.array([[0.0, turn]]))[0]))
     assert looks == [False, False, False, False, False, True, True]
-
-
-class Table(Desk):
-    """A desk with an arm of all joints, on which an expert takes over."""
-
-    def __init__(self, q: np.ndarray = HOME, patience_s: float = 0.04) -> None:
-        expert = PickBrain()
-        super().__init__(expert, [scene(CUP, BOX)])
-        settings = DaggerConfig(
-            NoopConfig(), PickBrainConfig(), collision_s=None, stall_s=None, patience_s=patience_s, hold_s=None
-        )
-        self.dagger = DaggerBrain(settings, NoopBrain(), expert)
-        self.observed, self.state = ARM, np.concatenate([q, np.zeros(7)])[None]
-        self.dagger.bind(replace(UR, environment_names=ENVIRONMENT))
-        self.dagger.reset(np.arange(1), [0], 1, [""])
-
-    def commands(self, observation: Observation) -> Any:
-        mixed = self.dagger.act(replace(observation, running=np.ones(1, np.bool_)))
-        assert isinstance(mixed, Mixed)
-        assert all(mixed.by_goals[sim] for sim in mixed.commands)
-        return mixed.commands
-
-
-def taken_over(q: np.ndarray = HOME, **changes: Any) -> Table:
-    """Return a desk in which the expert has just taken over."""
-    table = Table(q)
-    for name, value in changes.items():
-        getattr(table, name)(**value)
-    assert table.look() == {}
-    assert table.dagger.subtasks() == [LEARNER_DRIVES]
-    table.look()
-    assert table.dagger.interventions().all()
-    return table
-
-
-def test_from_home_the_expert_begins_at_once() -> None:
-    table = taken_over()
-    assert table.steps() == ["above"]
-    assert table.dagger.subtasks() == ["move the gripper to the red cup"]
-    for _ in range(2):
-        table.end()
-    assert table.steps() == ["above", "down", "close"]
-
-
-def low_posture() -> np.ndarray:
-    """Return a posture with the finger tips among the objects."""
-    return HOME + np.array([0, 0.35, 0.1, -0.45, 0, 0, 0])
-
-
-def test_an_arm_that_is_low_opens_and_rises_first() -> None:
-    table = taken_over(low_posture())
-    assert table.given[0][0].gripper == MAX_OPENING
-    up = table.end()
-    assert up is not None
-    assert up.motion == "line"
-    assert up.gripper is None
-    kinematics = GoalExpert(PickBrain())._kinematics
-    start = kinematics.tool(low_posture()[:6])[:3, 3]
-    assert up.target_pose.position[:2] == pytest.approx(start[:2])
-    assert up.target_pose.position[2] > start[2] + 0.05
-    table.state[0, :6] = HOME[:6]
-    table.end()
-    assert table.steps() == ["open", "up", "above"]
-
-
-def test_what_the_task_is_about_and_what_is_held_already_is_raised_and_not_let_go_of() -> None:
-    q = low_posture()
-    tip = GoalExpert(PickBrain())._kinematics.tool(q[:6])[:3, 3]
-    table = Table(q)
-    table.table[0, 0, 3:6] = tip + np.array([0, 0, 0.01])
-    table.look()
-    table.look()
-    assert table.steps() == ["raise"]
-    assert table.given[0][0].gripper is None
-    assert table.end() is None  # it holds, and waits for that to be enough
-    for _ in range(60):
-        assert table.look() == {}
-    assert table.dagger.subtasks() == ["raise what is held"]
-
-
-def test_from_an_odd_posture_and_where_there_is_no_way_the_arm_goes_home_first() -> None:
-    table = taken_over(HOME - np.array([0, 0, 1.2, 0, 0, 0, 0]))
-    assert table.steps() == ["upright"]
-    table.end(success=False)
-    assert table.steps() == ["upright", "home"]
-    assert table.given[0][1].joint_target == pytest.approx(HOME[:6])
-    table.end(success=False)  # no more can be done than to try
-    assert table.steps()[-1] == "above"
-    table = taken_over()
-    table.end(success=False, message="no way")
-    table.end()
-    table.end()
-    assert table.steps() == ["above", "upright", "home", "above"]
-
-
-def test_home_is_the_nearest_full_turn() -> None:
-    expert = GoalExpert(PickBrain())
-    turned = HOME[:6] + np.array([0, 0, 0, 2 * np.pi, 0, -2 * np.pi])
-    np.testing.assert_allclose(expert._home_near(turned), turned)
-    beyond = HOME[:6] + np.array([2 * np.pi, 0, 0, 0, 0, 0])  # out of the shoulder's range
-    np.testing.assert_allclose(expert._home_near(beyond), HOME[:6])
-
-
-def test_an_expert_that_gave_up_begins_again() -> None:
-    table = taken_over()
-    while not table.dagger.subtasks()[0].startswith("cannot"):
-        table.end(success=len(table.given[0]) % 3 != 2, message="blocked")
-    before = len(table.given[0])
-    for _ in range(70):
-        table.look()
-    assert table.steps()[before:] == ["upright"]
-
-
-def test_results_of_goals_of_an_earlier_turn_are_not_taken_for_those_of_this_one() -> None:
-    table = taken_over()
-    stray = CommandResult("0.0.1-above", True, ResultCode.SUCCEEDED, "")
-    assert table.look({0: [stray]}) == {}
-    assert table.steps() == ["above"]
-
-
-def test_an_arm_that_is_fast_comes_to_rest_first() -> None:
-    table = Table()
-    table.state[0, 7:13] = 1.0
-    table.look()
-    table.look()
-    assert table.steps() == ["stop"]
-    assert table.given[0][0].target_pose is table.given[0][0].joint_target is None
-    assert table.given[0][0].gripper == pytest.approx(HOME[6])  # nothing is let go of
-    table.state[0, 7:] = 0.0
-    table.end()
-    assert table.steps() == ["stop", "above"]

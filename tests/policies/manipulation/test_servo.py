@@ -154,7 +154,6 @@ def test_as_an_expert_it_says_in_every_frame_what_it_would_do() -> None:
     brain = DaggerBrain(DaggerConfig(learner=None, expert=None, collision_s=None, stall_s=None), NoopBrain(), pick())  # type: ignore[arg-type]
     brain.bind(features(ENVIRONMENT))
     brain.reset(np.arange(3), [1, 2, 3], 3)
-    assert brain.gives_advice
     state, told = tools(3, np.random.default_rng(4)), tables(3)
     seen = Observation(TOOL_NAMES, state, {}, told)
     driven = brain.act(seen)

@@ -22,7 +22,9 @@ from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
+from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.rollout.progress import FAULT_STATUS
+from bhd_lerobot.rollout.replay_robot import replay_on_robot
 from tests.forks import Fork
 from tests.recording.support import saved
 from tests.robots.external import mock_devices  # noqa: F401  registers them
@@ -187,3 +189,16 @@ def test_a_signal_costs_at_most_the_running_episode(tmp_path: Path, number: sign
     assert result.exit_status == 0
     assert check_dataset(root).is_valid
     assert math.isfinite(result.wall_s)
+
+
+def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1)
+    recorded = np.stack(read_episode(tmp_path / "d", 0)["action"])
+    config = parse(RecordConfig, options(tmp_path / "other", robot__log=tmp_path / "log"))
+    console = Console(file=io.StringIO(), width=120)
+    replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
+    sent = np.loadtxt(tmp_path / "log")
+    np.testing.assert_array_equal(sent, recorded)
+    assert "elbow.pos" in console.file.getvalue()
+    with pytest.raises(ConfigError, match=r"gate.max_change is not set"):
+        replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(), console)

@@ -294,14 +294,23 @@ def test_every_round_learns_from_data_that_was_recorded_before_as_well(
     assert "with 5 frames a second; the expert of" in " ".join(capsys.readouterr().err.split())
 
 
-def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
+def without_advice(folder: Path) -> dict[str, Any]:
+    """Write a learner's configuration that does not record what the expert would do; return it as a stage."""
+    values = yaml.safe_load((CONFIGS / "record/ur5_pick_servo.yaml").read_text())
+    values["dataset"]["expert_action"] = False
+    file = folder / "without_advice.yaml"
+    file.write_text(yaml.safe_dump(values))
+    return {"config": str(file), "options": []}
+
+
+def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda given: called.append(given) or 1))
     stages = {
         "expert": stage("record/ur5_pick"),
-        "learner": stage("record/ur5_pick_dagger"),
+        "learner": without_advice(tmp_path),
         "policy": stage("train/bc_ur5_pick_servo"),
         "evaluation": stage("eval/ur5_pick"),
     }
@@ -351,8 +360,8 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             "task.type is 'navigate' in evaluation.config, .* and 'avoid' in that of the expert",
         ),
         (
-            {"learner": stage("record/ur5_pick_dagger")},
-            "robot.type is 'ur5' in learner.config, .*ur5_pick_dagger.yaml', and 'turtlebot3' in that of the expert",
+            {"learner": stage("record/ur5_pick_servo")},
+            "robot.type is 'ur5' in learner.config, .*ur5_pick_servo.yaml', and 'turtlebot3' in that of the expert",
         ),
         (
             {"learner": stage("record/turtlebot3_avoid_dagger", *BRIEF, "--dataset.fps=5")},
@@ -362,10 +371,14 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             {
                 "expert": stage("record/ur5_pick"),
                 "evaluation": stage("eval/ur5_pick"),
-                "learner": stage("record/ur5_pick_dagger"),
+                "learner": {"config": "without_advice.yaml", "options": []},
                 "policy": stage("train/bc_ur5_pick_servo", "--selection.learner_weight=2"),
             },
             "--selection.learner_weight of .* they are not used for training",
+        ),
+        (
+            {"learner": stage("record/ur5_pick_servo", "--brain.expert.type=pick")},
+            "brain.expert.type is 'pick', which gives goals",
         ),
     ],
 )
@@ -379,6 +392,7 @@ def test_what_cannot_be_is_said_before_the_first_round(
     monkeypatch.chdir(tmp_path)
     held_out = yaml.safe_load((CONFIGS / "record/turtlebot3_avoid.yaml").read_text())
     Path("held_out.yaml").write_text(yaml.safe_dump({**held_out, "split": "held_out"}))
+    without_advice(tmp_path)
     if changed == {"data": ["without"]}:
         run_record(tmp_path / "without", dataset__episode_time_s=0.5, n_envs=1, dataset__num_episodes=1)
     assert main([f"--config_path={settings(tmp_path, **changed)}"]) == 2

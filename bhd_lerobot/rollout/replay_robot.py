@@ -1,0 +1,83 @@
+"""Sends the recorded actions of an episode to a robot, and reports how its observations differ from the recording."""
+
+import os
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bhd_lerobot.control.estop import EstopInputs, estop_signal
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError
+from bhd_lerobot.registry import is_ours, make_robot
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.rollout.progress import print_notes
+
+
+def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, console: Console) -> float:
+    """Replay an episode.
+
+    Args:
+        root: the dataset.
+        episode: its number.
+        robot: the robot's configuration.
+        gate: what is let through to it, of a robot of another package.
+        console: where differences are printed.
+
+    Returns:
+        The largest difference of an observed value from the recorded one, in its own unit.
+
+    Raises:
+        DatasetError: the dataset's actions are not those of the robot.
+        RealtimeError: the robot was stopped.
+    """
+    if not is_ours(robot.type) and gate.max_change is None:
+        raise ConfigError(
+            "gate.max_change is not set: the robot would jump from where it is to where the episode began. Set it to "
+            "the largest change of a position in a frame, --gate.max_change=5 for example, in the action's unit."
+        )
+    if is_ours(robot.type) and robot.clock != "realtime":
+        raise ConfigError("robot is given, and robot.clock is 'lockstep'; leave robot out to replay in simulation.")
+    summary, columns = dataset_info(root), read_episode(root, episode)
+    actions = np.asarray(columns[keys.ACTION], np.float64)
+    recorded = np.asarray(columns[keys.OBSERVATION_STATE], np.float64)
+    robots = make_robot(robot, fps=summary.fps, gate=gate)
+    names = tuple(summary.features[keys.ACTION]["names"])
+    pressed = EstopInputs(robots.estop)
+    with closing(robots), pressed:
+        if names != robots.action_names:
+            own = ", ".join(robots.action_names)
+            raise DatasetError(f"The actions of {root} are {', '.join(names)}; those of {robot.type} are {own}.")
+        print_notes(robots, console)
+        pressed.add_signal(estop_signal("SIGUSR1"))
+        key = "space or e, or " if pressed.add_key() else ""
+        console.print(f"Emergency stop: {key}kill -USR1 {os.getpid()}")
+        only = np.zeros(1, np.intp)
+        robots.reset(only, [None], [0])
+        seen = []
+        for action in actions:
+            seen.append(robots.observe().state[0])
+            report = robots.step(action[None])
+            mode = Mode(int(report.mode[0]))
+            if mode in (Mode.ESTOP, Mode.FAULT):
+                why = robots.problem or ", ".join(pressed.causes) or mode.name
+                raise RealtimeError(f"The robot was stopped after {len(seen)} of {len(actions)} frames: {why}.")
+        robots.stop(only)
+    return _print_differences(np.array(seen), recorded, robots.observation_names, console)
+
+
+def _print_differences(seen: Any, recorded: Any, names: tuple[str, ...], console: Console) -> float:
+    table = Table(title="Difference from the recording", title_justify="left")
+    for heading in ("observed", "mean", "largest", "at the end"):
+        table.add_column(heading, justify="left" if heading == "observed" else "right")
+    difference = np.abs(seen - recorded)
+    for name, column in zip(names, difference.T, strict=True):
+        table.add_row(name, *(f"{value:.4g}" for value in (column.mean(), column.max(), column[-1])))
+    console.print(table)
+    return float(difference.max())
