@@ -102,14 +102,12 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
-        options = f"--robot.type={contract.robot_type} --brain.path={quoted(path)} --task.instruction='…'"
-        return [
-            "Run it on the robot, with the robot's own options, with:",
-            f"  bhd-record {options} --dataset.root=data/rollout",
-        ]
+        options = f"--robot.type={contract.robot_type} --brain.type=learned --brain.path={quoted(path)}"
+        command = f"bhd-record {options} --task.instruction='…' --dataset.root=data/rollout"
+        return ["Run it on the robot, with the robot's own options added, with:", f"  {command}"]
     text, usual = "Evaluate it with:", {}
     if task is None:
-        task, found = tasks_for(contract.robot_type)[0], {}
+        task, found = next(name for name in tasks_for(contract.robot_type) if name != "free"), {}
         text = f"The dataset does not record its task. Evaluate it in simulation at {task!r}, for example, with:"
     elif task in TaskConfig.get_known_choices():
         chosen = TaskConfig.get_choice_class(task)

@@ -133,6 +133,8 @@ def quoted_commands(path: Path) -> Iterator[str]:
         blocks = "\n".join(block for language, block in fences if language in ("", "bash", "sh", "text"))
         lines = blocks.replace("\\\n", " ").splitlines()
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
+    variables = dict(re.findall(r'^([A-Z]+)="(.*)"$', text, re.MULTILINE))
+    lines = [re.sub(r"\$([A-Z]+)", lambda found: variables.get(found[1], found[0]), line) for line in lines]
     # "…" stands for the options of an earlier command.
     yield from (line for line in lines if re.match(r"bhd-\w+ ", line) and "…" not in line)
 
