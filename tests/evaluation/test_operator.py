@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.cli.evaluate import main
+from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.evaluation.operator import random_order
 from tests.forks import Fork
 from tests.waiting import until
@@ -130,7 +131,7 @@ def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tm
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, "q"], ids=["kill", "term", "q"])
 def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_path, end):
-    recorded = {"record__repo_id": "me/real", "record__root": tmp_path / "data"}
+    recorded = {"record__repo_id": "me/real", "record__root": tmp_path / "data", "robot__cameras": CAMERAS}
     run = Judged(tmp_path, **recorded)
     keys = "sfsffs"
     run.judge(keys[:3])
@@ -151,6 +152,7 @@ def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_p
     run.judge(keys[3:], first=4)
     assert run.end() == 0, run.text()
     assert outcomes(tmp_path) == expected(keys)
+    assert all(check_dataset(tmp_path / "data" / label).is_valid for label in LABELS)
 
 
 def test_without_a_terminal_nobody_is_waited_for_and_that_is_said(tmp_path):
