@@ -34,7 +34,7 @@ class TakeoverBrain(ConfiguredBrain):
         self._brain, self._person, self._is_taken = brain, person, is_taken
         self.name, self.robot_kind, self.has_plan = brain.name, brain.robot_kind, brain.has_plan
         self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
-        self._was_taken = False
+        self._was_taken = self._is_settled = False
         self._start: tuple[Any, ...] = ()
 
     def bind(self, robot: RobotFeatures) -> None:
@@ -45,22 +45,33 @@ class TakeoverBrain(ConfiguredBrain):
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start an episode."""
         self._start = ids, seeds, n, instructions
-        self._was_taken = False
+        self._was_taken = self._is_settled = False
         self._brain.reset(*self._start)
         self._person.reset(*self._start)
 
+    def _settle(self) -> bool:
+        """Settle, once a frame, whether the person drives in it; return that."""
+        if self._is_settled:
+            return self._was_taken
+        self._is_settled = True
+        is_taken = self._is_taken()
+        if is_taken and not self._was_taken:
+            self._person.reset(*self._start)
+        elif self._was_taken and not is_taken:
+            self._brain.reset(*self._start)  # what it planned is of another time
+        self._was_taken = is_taken
+        return is_taken
+
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return where the one who drives looks."""
+        driver = self._person if self._settle() else self._brain
+        return driver.looks(results)
+
     def act(self, observation: Observation) -> Command:
         """Return the action of the one who drives."""
-        is_taken = self._is_taken()
-        if is_taken:
-            if not self._was_taken:
-                self._person.reset(*self._start)
-            self._was_taken = True
-            return self._person.act(observation)
-        if self._was_taken:
-            self._was_taken = False
-            self._brain.reset(*self._start)  # what it planned is of another time
-        return self._brain.act(observation)
+        is_taken = self._settle()
+        self._is_settled = False
+        return self._person.act(observation) if is_taken else self._brain.act(observation)
 
     def subtasks(self) -> Sequence[str]:
         """Return what the brain is doing."""
@@ -69,10 +80,6 @@ class TakeoverBrain(ConfiguredBrain):
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the brain's plan."""
         return self._brain.plan(sim)
-
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
-        """Return where the brain looks."""
-        return self._brain.looks(results)
 
     def advice(self) -> NDArray[np.float64] | None:
         """Return what the brain's expert would do."""

@@ -111,10 +111,11 @@ def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert trained.poll() == 0, (tmp_path / "train.log").read_text()[-2000:]
 
     # A person takes over from the policy, and gives back.
-    person = Terminal(record.main, arguments_of(corrected), tmp_path / "corrected.log")
+    longer = [one.replace("duration_s=1", "duration_s=6") for one in arguments_of(corrected)]
+    person = Terminal(record.main, longer, tmp_path / "corrected.log")
     while person.process.poll() is None:
-        person.press(b"i", "recording")
-        time.sleep(0.3)
+        person.press(b"i", "not promised")
+        time.sleep(0.7)
     assert person.wait() == 0, (tmp_path / "corrected.log").read_text()
     (episode,) = dataset_info(tmp_path / "data" / "cup_corrected").episodes
     assert {span[2] for span in json.loads(episode.metadata["interventions"])} == {"person"}

@@ -1,0 +1,70 @@
+"""A brain from which a person takes over, and to which they give back."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
+
+SEEN = Observation(("a.pos",), np.zeros((1, 1)))
+
+
+class Counting(ConfiguredBrain):
+    """Says which action it is, since its last reset; looks in the first alone."""
+
+    robot_kind = ANY_ROBOT
+    uses_images = True
+
+    def __init__(self, name: str, value: float) -> None:
+        super().__init__(None)
+        self.name, self._value, self.resets, self._count = name, value, 0, 0
+
+    def bind(self, robot: RobotFeatures) -> None:
+        self.bound = robot
+
+    def reset(self, ids: Any, seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        self.resets, self._count = self.resets + 1, 0
+
+    def looks(self, results: Any) -> Any:
+        return np.array([self._count == 0])
+
+    def act(self, observation: Observation) -> Any:
+        self._count += 1
+        return np.array([[self._value + self._count]])
+
+    def parameters(self) -> dict[str, Any]:
+        return {"type": self.name}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afresh() -> None:
+    brain, person = Counting("policy", 0.0), Counting("teleop", 100.0)
+    taken = [False, False, True, True, False, False]
+    turns = iter(taken)
+    both: Any = TakeoverBrain(brain, person, lambda: next(turns))  # type: ignore[arg-type]
+    both.bind(RobotFeatures(("a.pos",), ("a.pos",), 10))
+    both.reset(np.zeros(1, np.intp), [0], 1)
+    looked, actions, interventions = [], [], []
+    for _ in taken:
+        # Who drives is settled once a frame: a key between the two calls takes effect in the next.
+        looked.append(bool(both.looks({})[0]))
+        actions.append(float(both.act(SEEN)[0, 0]))
+        interventions.append(bool(both.interventions()[0]))
+    assert actions == [1.0, 2.0, 101.0, 102.0, 1.0, 2.0]
+    assert interventions == taken
+    assert looked == [True, False, True, False, True, False]
+    assert both.parameters() == {"type": "policy", "takeover": {"type": "teleop"}}
+    both.close()
+    assert person.closed
+
+
+def test_nobody_takes_over_from_goals() -> None:
+    with pytest.raises(ConfigError, match="gives goals"):
+        TakeoverBrain(ReachBrain(ReachBrainConfig()), Counting("teleop", 0.0), lambda: False)  # type: ignore[arg-type]
