@@ -3,8 +3,11 @@
 import sys
 from collections.abc import Sequence
 
+from rich.console import Console
+
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.evaluation.plan import print_plan
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import CommandLine
 
@@ -15,7 +18,14 @@ def program_of(line: CommandLine) -> Program:
         from bhd_lerobot.evaluation.environment import PROGRAM
 
         return PROGRAM
-    return Program(EvalConfig, lambda config: evaluate(config).exit_status)
+    return Program(EvalConfig, _compare)
+
+
+def _compare(config: EvalConfig) -> int:
+    if config.plan:
+        print_plan(config, Console())
+        return 0
+    return evaluate(config).exit_status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -69,7 +69,8 @@ class EnvironmentEvalConfig(Comparison):
     n_envs: int = 16
     fail_below: float | None = None
     output_dir: str | None = None
-    record = EvalDatasetConfig()  # not an option: nothing is recorded
+    record = EvalDatasetConfig()  # not options: nothing is recorded, and all episodes are run
+    sequential = False
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
