@@ -166,6 +166,7 @@ def test_lerobots_own_robots_and_teleoperators_are_imported_when_they_are_asked_
     arguments = [
         "--robot.type=so101_follower",
         "--robot.port=/dev/null",
+        "--task.instruction=wave",
         "--teleop.type=so101_leader",
         "--teleop.port=/dev/null",
     ]
