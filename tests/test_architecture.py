@@ -82,7 +82,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("rollout", "teleoperators", "hub", "cluster"),
     ),
     "evaluation": (
-        *("tasks", "control", "robots.host", "policies", "policies.perception"),
+        *("tasks", "control", "robots.external", "robots.host"),
+        *("policies", "policies.perception", "policies.teleop"),
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster"),
     ),

@@ -20,7 +20,7 @@ from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults
 from bhd_lerobot.evaluation.statistics import Estimate, unseen_share
-from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.evaluation.text import number, percent, sentences, sequential_sentence
 from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
@@ -95,6 +95,8 @@ def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str
     ]
     if config.record.repo_id is not None:
         options += ["--record.repo_id=null", "--record.root=null"]
+    if config.sequential:
+        options.append("--sequential=false")
     if config.fail_below is not None:
         options.append("--fail_below=null")  # one episode proves no rate
     return shlex.join(["bhd-eval", *options])
@@ -106,9 +108,11 @@ def _lead(given: ReportInput) -> str:
     count = len(results.brains)
     lead = (
         f"<p>{count} brain{'s' * (count != 1)} on the same {results.requested} {facts['split'].replace('_', '-')} "
-        f"episodes, {clock}: the same scenes, the same sensor noise, the same initial states. "
+        f"episodes, {clock}{_sameness(given)} "
         f"Robot {escape(facts['robot']['type'])}, {facts['fps']} decisions a second, run seed {facts['seed']}.</p>"
     )
+    if given.config.sequential:
+        lead += f"<p>{escape(sequential_sentence(results))}</p>"
     if results.is_partial:
         ran = ", ".join(f"{escape(label)} {one.episodes}" for label, one in results.brains.items())
         lead += f'<p class="warn"><b>Partial:</b> the run was stopped early. Episodes finished: {ran}.</p>'
@@ -117,6 +121,16 @@ def _lead(given: ReportInput) -> str:
         + "<ul class='found'>"
         + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
         + "</ul>"
+    )
+
+
+def _sameness(given: ReportInput) -> str:
+    """Return what the brains had in common."""
+    if not given.config.by_person:
+        return ": the same scenes, the same sensor noise, the same initial states."
+    return (
+        ". A person set up the scenes. Every brain ran in a scene before the next was set up, in an order drawn at "
+        "random for each scene, and no prompt said which one ran."
     )
 
 
@@ -189,15 +203,20 @@ def _paired(given: ReportInput) -> str:
     head = [
         "success, difference",
         "episodes that differ",
-        "McNemar p",
+        "p" if given.config.sequential else "McNemar p",
         "score, difference ¹",
         "score, ratio ¹",
         "episodes",
     ]
+    rates, p = (
+        ("the confidence sequence of bets", "1 / e-value of the sequential test")
+        if given.config.sequential
+        else ("Newcombe's method 10", "that of McNemar's exact test, two-sided")
+    )
     note = (
-        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
+        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: {rates} for paired rates, "
         "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also "
-        "hold what rare episodes would do, see ¹ above. p is that of McNemar's exact test, two-sided; where it finds "
+        f"hold what rare episodes would do, see ¹ above. p is {p}; where it finds "
         "no difference, the interval of the rates holds 0. An interval that excludes the dashed line shows a "
         "difference beyond chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
