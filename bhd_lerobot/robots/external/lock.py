@@ -16,6 +16,8 @@ from bhd_lerobot.errors import RealtimeError
 class RobotLock:
     """Held while a program uses a robot; the system frees it when the program ends, however it does.
 
+    A robot of which nothing says where it is is not locked.
+
     Args:
         config: the robot's configuration: type, id and where it is connected say which robot it is.
 
@@ -24,12 +26,11 @@ class RobotLock:
     """
 
     def __init__(self, config: Any) -> None:
-        values = {
-            key: value for key, value in draccus.encode(config).items() if key not in ("cameras", "calibration_dir")
-        }
-        places = {
-            key: value for key, value in values.items() if "port" in key or key in ("id", "ip", "host", "address")
-        }
+        self._file = -1
+        where = ("id", "ip", "host", "address")
+        places = {key: value for key, value in draccus.encode(config).items() if "port" in key or key in where}
+        if not any(places.values()):
+            return  # nothing says which robot it is
         name = hashlib.sha256(json.dumps([config.type, places], sort_keys=True, default=str).encode()).hexdigest()[:16]
         self._path = Path(tempfile.gettempdir()) / f"bhd-robot-{os.getuid()}-{name}.lock"
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

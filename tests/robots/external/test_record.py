@@ -39,6 +39,7 @@ def options(root: Path, **overrides: object) -> list[str]:
     values: dict[str, object] = {
         "robot.type": "mock_arm",
         "robot.cameras": CAMERAS,
+        "robot.port": root,
         "robot.calibration_dir": root.parent / "calibration",
         "teleop.type": "mock_leader",
         "teleop.calibration_dir": root.parent / "calibration",
@@ -155,7 +156,7 @@ def test_a_teleoperator_that_gives_nan_moves_nothing(tmp_path: Path) -> None:
         ({"gate__range__wrist": "[0, 1]"}, "wrist.*elbow.pos"),
         ({"engine": "ray"}, "engine is 'ray'"),
         ({"dataset__reset_time_s": -1}, "reset_time_s is -1"),
-        ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__calibration_dir": None}, "robot.clock=realtime"),
+        ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__port": None}, "robot.clock=realtime"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_remedy(tmp_path: Path, overrides: dict[str, Any], message: str) -> None:
