@@ -33,6 +33,7 @@ from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.names import names_of_robot
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import TASKS, Task, TaskConfig
 
@@ -192,13 +193,14 @@ def is_ours(robot_type: str) -> bool:
     return robot_type in ROBOTS
 
 
-def check_brain(key: str, brain: BrainConfig, robot_type: str) -> None:
+def check_brain(key: str, brain: BrainConfig, robot: RobotConfig) -> None:
     """Refuse a brain that is for another robot; `key` is the option that it comes from."""
     try:
         driven = robot_of_brain(brain)
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from error
-    if not is_for(driven, robot_type):
+    robot_type = robot.type
+    if not is_for(driven, robot_type) and driven not in names_of_robot(robot):
         path = getattr(brain, "path", None)
         name = f"{key}.path is {str(path)!r}" if path else f"{key}.type is {brain.get_choice_name(type(brain))!r}"
         raise ConfigError(

@@ -153,7 +153,7 @@ class EvalConfig(Comparison):
         check_robot_and_task(self.robot, self.task, "bhd-eval")
         self._name_brains()
         for label, brain in self.brains.items():
-            check_brain(f"brains.{label}", brain, self.robot.type)
+            check_brain(f"brains.{label}", brain, self.robot)
         check_engine(self)
         if isinstance(self.task, FreeConfig) and not self.is_live:
             raise ConfigError(

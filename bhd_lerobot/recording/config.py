@@ -178,7 +178,7 @@ class RecordConfig:
             if person is None:
                 raise ConfigError("Nothing drives the robot; set --brain.type, or --teleop.type for a person.")
             self.brain, self.teleop, self.map, self.processor = person, None, {}, ""
-        check_brain("brain", self.brain, self.robot.type)
+        check_brain("brain", self.brain, self.robot)
         if (self.teleop is not None or isinstance(self.brain, TeleopConfig)) and not self.is_live:
             raise ConfigError(
                 "A person drives on the wall clock, and robot.clock is 'lockstep', on which time advances as fast as "

@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.external.names import name_of_robot
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.types import Episode
@@ -78,7 +79,7 @@ def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain
         about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
     recorder = make(
-        recording.repo_id, recording.fps, features, robot_type=robots.config.type, root=root, recording=about
+        recording.repo_id, recording.fps, features, robot_type=name_of_robot(robots.config), root=root, recording=about
     )
     if robots.clock is not None and robots.camera_shapes:
         recorder.encode_in_process()  # on the wall clock the loop waits for no encoder

@@ -102,7 +102,8 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
-        options = f"--robot.type={contract.robot_type} --brain.type=learned --brain.path={quoted(path)}"
+        robot_type = (contract.robot or {}).get("type", contract.robot_type)  # a robot's name may be no type
+        options = f"--robot.type={robot_type} --brain.type=learned --brain.path={quoted(path)}"
         command = f"bhd-record {options} --task.instruction='…' --dataset.root=data/rollout"
         return ["Run it on the robot, with the robot's own options added, with:", f"  {command}"]
     text, usual = "Evaluate it with:", {}

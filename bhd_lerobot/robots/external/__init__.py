@@ -8,4 +8,5 @@ __all__ = [
     "host",
     "lock",
     "make",
+    "names",
 ]

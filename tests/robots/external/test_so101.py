@@ -8,6 +8,7 @@ from lerobot.motors import MotorCalibration
 from lerobot.robots.so_follower import SO101Follower
 
 from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
 from tests.robots.external import mock_devices  # noqa: F401  registers them
 from tests.robots.external.test_record import run
 from tests.robots.fake_feetech import HIGH, LOW, so101
@@ -29,6 +30,7 @@ def test_it_is_recorded_within_its_calibrated_range(tmp_path: Path, monkeypatch:
     result, text = run(tmp_path / "d", robot__type="so101_follower", dataset__num_episodes=1, **options, **mapped)
     assert result.exit_status == 0
     assert "range: 6 of 6 actions limited" in text
+    assert dataset_info(tmp_path / "d").robot_type == SO101Follower.name  # as LeRobot's own recorder writes it
     columns = read_episode(tmp_path / "d", 0)
     asked, applied = np.stack(columns["action"]), np.stack(columns["control.applied_action"])
     assert np.abs(asked).max() > 100
