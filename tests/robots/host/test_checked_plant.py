@@ -15,7 +15,7 @@ from bhd_lerobot.robots.arm_host import ArmHost
 from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.host.hardware import Hardware, plant_class
+from bhd_lerobot.robots.host.checked_plant import CheckedPlant, plant_class
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
@@ -86,17 +86,17 @@ class Rig:
     def __init__(self, plant: Perfect | None = None) -> None:
         self.plant = plant or Perfect()
         self.slept = 0.0
-        self.hardware = Hardware(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
-        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.hardware)
+        self.checked = CheckedPlant(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
+        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.checked)
         self.plant.time = lambda: self.host.bridge.now_ns
-        self.hardware.open()
+        self.checked.open()
 
     def _sleep(self, seconds: float) -> None:
         self.slept += seconds
         self.plant.offset += round(seconds * NANOSECONDS)
 
     def start(self) -> None:
-        self.hardware.prepare(self.host.cerebellum.reading)
+        self.checked.prepare(self.host.cerebellum.reading)
         self.host.cerebellum.stamp_origin_ns = self.plant.offset
         self.host.reset(FIRST, [None], [0])
 
@@ -176,7 +176,7 @@ def test_a_plant_that_fails_is_a_fault_that_stays_until_a_reset(call: str, how: 
     written = np.array(rig.plant.written[before - 1 :])
     assert np.isfinite(written).all()
     assert np.abs(np.diff(written, axis=0)).max(initial=0.0) < 0.05
-    assert rig.hardware.not_ready(rig.host.cerebellum.reading)
+    assert rig.checked.not_ready(rig.host.cerebellum.reading)
     rig.plant.broken.clear()
     for _ in range(25):
         rig.host.step(None)
@@ -243,7 +243,7 @@ def test_a_robot_that_fails_for_a_moment_before_it_starts_is_waited_for() -> Non
 
     rig.plant.broken["read"] = flaky
     rig.start()
-    assert rig.hardware.problem == ""
+    assert rig.checked.problem == ""
     assert rig.drive(2) == Mode.TRACKING
 
 
@@ -308,7 +308,7 @@ def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], wh
 
 def test_a_plant_that_cannot_be_made_says_why() -> None:
     with pytest.raises(ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"):
-        Hardware.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
+        CheckedPlant.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
 
 
 class Refusing(Perfect):
@@ -319,9 +319,9 @@ class Refusing(Perfect):
 def test_a_base_observes_what_its_plant_measures() -> None:
     plant = Perfect(sensors=39, start=[0.0, 0.0])
     config = TurtleBot3Config(beams=36, imu=True, odometry=True)
-    hardware = Hardware(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
-    base = BaseHost(config, hardware)
-    hardware.prepare(base.cerebellum.reading)
+    checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(config, checked)
+    checked.prepare(base.cerebellum.reading)
     plant.time = lambda: base.bridge.now_ns
     base.reset(FIRST, [None], [0])
     base.step(None)

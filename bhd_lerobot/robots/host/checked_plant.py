@@ -55,7 +55,7 @@ def plant_class(name: str) -> Callable[[Any, Any], Plant]:
     return found
 
 
-class Hardware(Plant):
+class CheckedPlant(Plant):
     """Passes calls on to a plant, and takes what it raises or what is not a number for a fault of the robot.
 
     Attributes:
