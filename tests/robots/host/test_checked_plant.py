@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -338,6 +339,50 @@ def test_a_base_observes_what_its_plant_measures() -> None:
     plant.sensors[3] = np.inf
     base.step(None)
     assert base.modes[0] == Mode.FAULT
+
+
+class Twisted(Perfect):
+    """A base whose own controller turns twists into wheel speeds."""
+
+    takes = "twist"
+    drive = DiffDrive(TurtleBot3Config().body().drive, 1)
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        self.written.append(ctrl[0].copy())
+        self.position = self.position + self.drive.wheels_from_twist(ctrl, np.zeros((1, 2)))[0] / 200
+
+    def read(self, out: PlantReading) -> None:
+        super().read(out)
+        out.velocity[:] = self.drive.wheels_from_twist(np.array(self.written[-1:] or [[0.0, 0.0]]), np.zeros((1, 2)))
+
+
+def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> None:
+    plant = Twisted(sensors=36, start=[0.0, 0.0])
+    checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(TurtleBot3Config(beams=36), checked)
+    checked.prepare(base.cerebellum.reading)
+    plant.time = lambda: base.bridge.now_ns
+    base.reset(FIRST, [None], [0])
+    for action in ([0.1, 0.5], [9.0, 0.0], [-9.0, 9.0]):
+        for _ in range(20):
+            base.step(np.array([action]))
+            assert plant.written[-1].tolist() == base.cerebellum.command[0].tolist()
+    written, limits = np.array(plant.written), base.body.limits
+    assert (np.abs(written).max(axis=0) <= np.array(limits.velocity) + 1e-9).all()
+    most = np.array(limits.acceleration) / 200
+    assert (np.abs(np.diff(written, axis=0)).max(axis=0) <= most + 1e-12).all()
+    assert base.observe().state[0, :2].tolist() == pytest.approx(written[-1].tolist())
+    assert base.modes[0] == Mode.TRACKING
+
+
+def test_a_plant_that_takes_something_else_is_refused() -> None:
+    plant = Perfect()
+    plant.takes = "velocities"
+    with pytest.raises(ConfigError, match=r"The plant mine:Arm takes 'velocities'; .* 'actuators' or 'twist'"):
+        Rig(plant)
+    plant.takes = "twist"
+    with pytest.raises(ConfigError, match=r"takes twists .* 'ur5' is no base"):
+        Rig(plant)
 
 
 def test_what_a_robot_does_not_measure_a_person_judges() -> None:
