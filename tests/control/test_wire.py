@@ -19,7 +19,7 @@ from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Setpoint, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from tests.control import arm_rig, support
 from tests.control.arm.test_impedance import ARM as TORQUE_ARM
 from tests.control.arm.test_impedance import StuckRig
@@ -86,10 +86,10 @@ def torque_arm() -> StuckRig:
     return rig
 
 
-def planned_arm() -> tuple[arm_rig.Rig, PlanLink, PlanServer]:
+def planned_arm() -> tuple[arm_rig.Rig, PlanningLink, PlanServer]:
     """Return an arm in the middle of a motion that another process planned."""
-    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
-    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    block = bytearray(PlanningLink.nbytes(6, arm_rig.HZ))
+    link, server = PlanningLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
     rig = arm(planning=link)
     assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
     for _ in range(220):

@@ -35,7 +35,7 @@ from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.plant_link import PlantLink
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
-from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
+from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.state import StatePublisher
@@ -106,7 +106,7 @@ class LiveProcess:
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
         dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
-        planning = plan_link(self._block, dof, spec.rates.control_hz)
+        planning = planning_link(self._block, dof, spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
         self._host: Host
         link, sensed_ns = PlantLink.of(self._block), time.monotonic_ns
