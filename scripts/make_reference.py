@@ -23,6 +23,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.environment import EnvironmentEvalConfig
 from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
@@ -50,7 +51,7 @@ written `null`.
 | --- | --- |
 | [`bhd-record`](options/record.md) | of a recording |
 | [`bhd-replay`](options/replay.md) | of a replay |
-| [`bhd-eval`](options/eval.md) | of an evaluation |
+| [`bhd-eval`](options/eval.md) | of an evaluation, also with `env` |
 | [`bhd-train`](options/train.md) | of a training, also with `algorithm: ppo` and `algorithm: dagger` |
 | [`teleop`](options/teleop.md) | of each teleoperator of ours, for LeRobot's own commands, too |
 | [`robot`](options/robot.md), [`brain`](options/brain.md), [`task`](options/task.md) | of each type |
@@ -58,6 +59,10 @@ written `null`.
 _TRAIN = """\
 LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their names and
 meaning; they are not listed here.
+"""
+_ENVIRONMENT = """\
+`env.type` and LeRobot's own options of environments, `env.*`, keep their names and meaning; `--env.type=TYPE --help`
+lists them. Those of the type `bhd` are described [with the environments](../../how_to/environments.md).
 """
 _TELEOPERATORS = """\
 Besides these options each has LeRobot's own `teleop.id` and `teleop.calibration_dir`, which ours do not need.
@@ -80,7 +85,12 @@ def pages() -> dict[Path, str]:
             text += [f"## `{name}.type={chosen}`\n", *_options(one, f"{name}.", f"{name}.md", listed)]
     texts["record"] = ["# `bhd-record`\n", *_options(RecordConfig, "", "record.md", listed)]
     texts["replay"] = ["# `bhd-replay`\n", *_options(ReplayConfig, "", "replay.md", listed)]
-    texts["eval"] = ["# `bhd-eval`\n", *_options(EvalConfig, "", "eval.md", listed)]
+    names = [name for name, _, _ in options_of(EnvironmentEvalConfig) if name != "env"]
+    texts["eval"] = [
+        *("# `bhd-eval`\n", *_options(EvalConfig, "", "eval.md", listed)),
+        *("## `bhd-eval` with `env`\n", _ENVIRONMENT),
+        *_options(EnvironmentEvalConfig, "", "eval.md", listed, names),
+    ]
     texts["train"] = [
         *("# `bhd-train`\n", _TRAIN, *_options(BhdTrainConfig, "", "train.md", listed, own_fields())),
         *("## `bhd-train` with `algorithm: ppo`\n", *_options(RlConfig, "", "train.md", listed)),

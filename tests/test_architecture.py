@@ -82,7 +82,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("rollout", "teleoperators", "hub", "cluster"),
     ),
     "evaluation": (
-        *("tasks", "control", "robots.host", "policies", "policies.perception"),
+        *("tasks", "control", "robots.external", "robots.host"),
+        *("policies", "policies.learned", "policies.perception", "policies.teleop"),
+        "envs",  # registers our environments with LeRobot, for `--env.type`
         *("datasets.format", "datasets.timing", "datasets.writer"),
         *("options", "registry", "rollout", "cluster"),
     ),

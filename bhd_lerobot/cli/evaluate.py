@@ -3,9 +3,29 @@
 import sys
 from collections.abc import Sequence
 
+from rich.console import Console
+
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import evaluate
+from bhd_lerobot.evaluation.plan import print_plan
 from bhd_lerobot.options.command import Program, run
+from bhd_lerobot.options.parse import CommandLine
+
+
+def program_of(line: CommandLine) -> Program:
+    """Return what evaluates as a command line asks. Only that is imported: environments need LeRobot and torch."""
+    if any(name.partition(".")[0] == "env" for name in (*line.options, *line.file)):
+        from bhd_lerobot.evaluation.environment import PROGRAM
+
+        return PROGRAM
+    return Program(EvalConfig, _compare)
+
+
+def _compare(config: EvalConfig) -> int:
+    if config.plan:
+        print_plan(config, Console())
+        return 0
+    return evaluate(config).exit_status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -14,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keys = [argument.partition("=")[0] for argument in given]
     if "--brain.path" in keys and "--brain.type" not in keys:
         given.append("--brain.type=learned")  # nothing else is somewhere on the disk
-    return run(Program(EvalConfig, lambda config: evaluate(config).exit_status), given)
+    return run(program_of, given)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,17 @@
 
 __all__ = [
     "config",
+    "environment",
     "evaluate",
     "metrics",
+    "operator",
     "perception",
+    "plan",
     "plots",
     "report",
     "results",
     "run",
+    "sequential",
     "statistics",
     "text",
 ]

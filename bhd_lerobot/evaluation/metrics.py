@@ -7,7 +7,7 @@ bit, on any number of simulations.
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -42,12 +42,21 @@ class JerkMeasure:
     what: str
 
     @classmethod
-    def of(cls, action_names: Sequence[str]) -> "JerkMeasure":
+    def of(cls, action_names: Sequence[str], *, is_si: bool = True) -> "JerkMeasure":
         """Return the measure for commands of these names.
 
         A base's is that of its forward speed, a tool's that of its position, an arm's that of its joints without the
         gripper.
+
+        Args:
+            action_names: names of the commands.
+            is_si: whether they are in SI units and radians; LeRobot's robots use degrees and shares of a range, too.
         """
+        measure = cls._of(action_names)
+        return measure if is_si else replace(measure, unit="units/s³")
+
+    @classmethod
+    def _of(cls, action_names: Sequence[str]) -> "JerkMeasure":
         index = {name: column for column, name in enumerate(action_names)}
         if "x.vel" in index:
             return cls((index["x.vel"],), 2, "m/s³", "forward speed")
@@ -65,7 +74,7 @@ class JerkMeasure:
             fps: frames a second [Hz].
         """
         values = applied[:, self.columns].astype(np.float64)
-        if len(values) <= self.order:
+        if len(values) <= self.order or not self.columns:
             return np.zeros(0)
         return np.linalg.norm(np.diff(values, self.order, axis=0), axis=1) * float(fps) ** self.order
 
@@ -84,7 +93,7 @@ class EpisodeMetrics:
         reward: sum of the rewards: the return.
         frames: number of frames.
         length_s: duration [s].
-        path_m: length of the line that the base, or the tool, drew from frame to frame [m].
+        path_m: length of the line that the base, or the tool, drew from frame to frame [m]; NaN if it is not known.
         jerk_mean: mean jerk of the commanded motion, see `JerkMeasure`; NaN for an episode of a few frames.
         jerk_max: largest jerk of the commanded motion.
         limits: frames in which the safety filter changed the command, by kind of limit.
@@ -129,6 +138,36 @@ class EpisodeMetrics:
         return {**values, "seed": str(self.seed)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentMetrics(EpisodeMetrics):
+    """One episode of one policy in an environment of LeRobot: only what such an environment returns.
+
+    Attributes:
+        task: its task's group and number in LeRobot's evaluation.
+        max_reward: the largest reward.
+    """
+
+    task: str
+    max_reward: float
+    score: float = math.nan
+    path_m: float = math.nan
+    jerk_mean: float = math.nan
+    jerk_max: float = math.nan
+    limits: dict[str, int] = field(default_factory=dict)
+    watchdogs: dict[str, int] = field(default_factory=dict)
+    estops: int = 0
+    faults: int = 0
+    problem: str = ""
+    details: dict[str, float] = field(default_factory=dict)
+    initial_state: str = ""
+    digest: str = ""
+
+    def plain(self) -> dict[str, Any]:
+        """Return what the environment returned as plain values; the seed as text, as in the base class."""
+        own = ("brain", "episode", "seed", "success", "outcome", "reward", "frames", "length_s", "task", "max_reward")
+        return {name: value for name, value in super().plain().items() if name in own}
+
+
 # What is the same to the last bit when a simulated episode is run again.
 _REPEATED = (keys.ACTION, keys.APPLIED_ACTION, keys.PHYSICS_STATE, keys.REWARD)
 
@@ -139,7 +178,8 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
     Args:
         brain: the brain's name in the evaluation.
         episode: the episode.
-        track: where base or tool was at the start of each frame, x, y, z first [m], shape (frames, 3 or more).
+        track: where base or tool was at the start of each frame, x, y, z first [m], shape (frames, 3 or more);
+            no rows if it is not known.
         jerk: what jerk is measured of.
         fps: frames a second [Hz].
     """
@@ -156,7 +196,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         reward=float(columns[keys.REWARD].sum(dtype=np.float64)),
         frames=episode.frames,
         length_s=episode.frames / fps,
-        path_m=float(np.linalg.norm(np.diff(track[:, :3], axis=0), axis=1).sum()),
+        path_m=float(np.linalg.norm(np.diff(track[:, :3], axis=0), axis=1).sum()) if len(track) else math.nan,
         jerk_mean=float(lengths.mean()) if len(lengths) else math.nan,
         jerk_max=float(lengths.max()) if len(lengths) else math.nan,
         limits=_flagged(columns[keys.LIMITS], Limit),

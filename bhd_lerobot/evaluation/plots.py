@@ -53,10 +53,19 @@ _STYLE: Any = {
 
 
 def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
-    """Return success rates and mean scores with their intervals, a row for each brain; dashed: the baseline's."""
+    """Return success rates and mean scores, or returns, with their intervals, a row for each brain.
+
+    Dashed: the baseline's.
+    """
+    name = "score" if "score" in brains[baseline].means else "reward"
     columns = [
         ("success rate", {label: one.success for label, one in brains.items()}, baseline, (-0.03, 1.03)),
-        ("mean score", {label: one.means["score"] for label, one in brains.items()}, baseline, None),
+        (
+            f"mean {'score' if name == 'score' else 'return'}",
+            {label: one.means[name] for label, one in brains.items()},
+            baseline,
+            None,
+        ),
     ]
 
     def draw(figure: Figure) -> None:
@@ -76,11 +85,19 @@ def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
 def paired_forest(paired: Mapping[str, PairedSummary]) -> str:
     """Return differences from the baseline with their intervals, a row for each other brain; dashed: no difference."""
     points = {label: _scaled(one.success, 100) for label, one in paired.items()}
-    columns = [
-        ("success rate, difference [points]", points, 0.0, (-10.0, 10.0)),
-        ("mean score, difference", {label: one.score for label, one in paired.items()}, 0.0, (0.0,)),
-        ("mean score, ratio", {label: one.ratio for label, one in paired.items()}, 1.0, (0.0, 1.2)),
+    columns: list[tuple[str, dict[str, Estimate], float, tuple[float, ...]]] = [
+        ("success rate, difference [points]", points, 0.0, (-10.0, 10.0))
     ]
+    if any(one.rewards for one in paired.values()):
+        for name, title in (("reward", "return"), ("max_reward", "largest reward")):
+            columns.append(
+                (f"{title}, difference", {label: one.rewards[name] for label, one in paired.items()}, 0.0, (0.0,))
+            )
+    else:
+        columns += [
+            ("mean score, difference", {label: one.score for label, one in paired.items()}, 0.0, (0.0,)),
+            ("mean score, ratio", {label: one.ratio for label, one in paired.items()}, 1.0, (0.0, 1.2)),
+        ]
 
     def draw(figure: Figure) -> None:
         for axes, (title, estimates, reference, always) in zip(
@@ -123,14 +140,8 @@ def outcome_bars(brains: Mapping[str, BrainSummary]) -> str:
     return _svg(draw, (10.0, 1.2 + 0.5 * len(brains)))
 
 
-def distributions(episodes: Mapping[str, Sequence[EpisodeMetrics]], jerk_unit: str) -> str:
-    """Return how score, length, path and jerk spread over the episodes of each brain: a box, and a mark for each."""
-    columns = (
-        ("score", "score"),
-        ("length [s]", "length_s"),
-        ("path [m]", "path_m"),
-        (f"mean jerk [{jerk_unit}]", "jerk_mean"),
-    )
+def distributions(episodes: Mapping[str, Sequence[EpisodeMetrics]], columns: Sequence[tuple[str, str]]) -> str:
+    """Return how numbers spread over the episodes of each brain, by heading and name: a box, and a mark for each."""
 
     def draw(figure: Figure) -> None:
         for axes, (title, name) in zip(figure.subplots(1, len(columns), sharey=True), columns, strict=True):

@@ -16,15 +16,20 @@ import yaml
 
 from bhd_lerobot.datasets.timing.tables import ms
 from bhd_lerobot.evaluation import plots
-from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.config import Comparison
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, EvalResults
 from bhd_lerobot.evaluation.statistics import Estimate, unseen_share
-from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.evaluation.text import number, percent, sentences, sequential_sentence
 from bhd_lerobot.options.parse import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
 VIDEO_BYTES = 12_000_000  # videos in the page; those beyond stay files beside it
+NO_SUCCESS = (
+    "The environment does not report is_success, and LeRobot's evaluation counts such an episode as a success. Only "
+    "the rewards say anything."
+)
+"""What is reported of an environment of LeRobot whose episodes end without a judgement."""
 LISTED = 100  # failed episodes of a brain that are listed
 
 
@@ -41,7 +46,7 @@ class Video:
 class ReportInput:
     """What a report is made of; `no_videos` reports why there are none."""
 
-    config: EvalConfig
+    config: Comparison
     results: EvalResults
     timing: dict[str, Any]
     trajectories: Mapping[str, Mapping[int, Trajectory]]
@@ -57,7 +62,8 @@ def write_report(given: ReportInput, path: Path) -> None:
     shown.append(cite)
     links = "".join(f'<a href="#{key}">{title}</a>' for title, key, _ in shown)
     facts = given.results.config
-    title = f"{facts['task']['type'].capitalize()} with {facts['robot']['type']}: {_listed(list(given.results.brains))}"
+    where = _environment(facts) or f"{facts['task']['type'].capitalize()} with {facts['robot']['type']}"
+    title = f"{where}: {_listed(list(given.results.brains))}"
     template = Template(resources.files(__package__).joinpath("report.html").read_text(encoding="utf-8"))
     page = template.substitute(
         title=escape(title),
@@ -85,16 +91,18 @@ def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
     ]
 
 
-def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str:
+def replay_command(config: Comparison, folder: Path, one: EpisodeMetrics) -> str:
     """Return the command that runs a single episode again; it leaves a video where images can be rendered."""
     options = [
         f"--config_path={folder / 'config.yaml'}",
         f"--only=[{one.brain}]",
-        f"--episodes=[{one.episode}]",
+        *config.again(one.episode),
         f"--output_dir={folder / f'{one.brain}_{one.episode:04d}'}",
     ]
     if config.record.repo_id is not None:
         options += ["--record.repo_id=null", "--record.root=null"]
+    if config.sequential:
+        options.append("--sequential=false")
     if config.fail_below is not None:
         options.append("--fail_below=null")  # one episode proves no rate
     return shlex.join(["bhd-eval", *options])
@@ -102,13 +110,24 @@ def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str
 
 def _lead(given: ReportInput) -> str:
     results, facts = given.results, given.results.config
-    clock = "on the wall clock" if given.timing["clock"] == "realtime" else "in simulated time"
     count = len(results.brains)
-    lead = (
-        f"<p>{count} brain{'s' * (count != 1)} on the same {results.requested} {facts['split'].replace('_', '-')} "
-        f"episodes, {clock}: the same scenes, the same sensor noise, the same initial states. "
-        f"Robot {escape(facts['robot']['type'])}, {facts['fps']} decisions a second, run seed {facts['seed']}.</p>"
-    )
+    lead = f"<p>{count} brain{'s' * (count != 1)} on the same {results.requested} "
+    if where := _environment(facts):
+        lead += (
+            f"episodes of {escape(where)}: the same seeds, {facts['seed']} for the first. Rolled out by LeRobot, "
+            f"{facts['n_envs']} at a time.</p>"
+        )
+        if not facts["says_success"]:
+            lead += f'<p class="warn">{NO_SUCCESS}</p>'
+    else:
+        clock = "on the wall clock" if given.timing["clock"] == "realtime" else "in simulated time"
+        lead += (
+            f"{facts['split'].replace('_', '-')} "
+            f"episodes, {clock}{_sameness(given)} "
+            f"Robot {escape(facts['robot']['type'])}, {facts['fps']} decisions a second, run seed {facts['seed']}.</p>"
+        )
+    if given.config.sequential:
+        lead += f"<p>{escape(sequential_sentence(results))}</p>"
     if results.is_partial:
         ran = ", ".join(f"{escape(label)} {one.episodes}" for label, one in results.brains.items())
         lead += f'<p class="warn"><b>Partial:</b> the run was stopped early. Episodes finished: {ran}.</p>'
@@ -120,36 +139,54 @@ def _lead(given: ReportInput) -> str:
     )
 
 
+def _sameness(given: ReportInput) -> str:
+    """Return what the brains had in common."""
+    if not given.config.by_person:
+        return ": the same scenes, the same sensor noise, the same initial states."
+    return (
+        ". A person set up the scenes. Every brain ran in a scene before the next was set up, in an order drawn at "
+        "random for each scene, and no prompt said which one ran."
+    )
+
+
 def _summary(given: ReportInput) -> str:
     results = given.results
+    facts = results.config
+    unit, mark = facts.get("jerk_unit"), "²" if "jerk" in facts else "¹"
+    columns: list[tuple[str, str, int | None]] = [
+        ("score ¹", "score", 3),
+        ("length [s]", "length_s", 1),
+        ("path [m]", "path_m", 2),
+        (f"mean jerk [{unit}]", "jerk_mean", None),
+        (f"largest jerk [{unit}]", "jerk_max", None),
+        (f"return {mark}", "reward", 3),
+        ("largest reward", "max_reward", 3),
+    ]
+    columns = [column for column in columns if column[1] in results.brains[facts["baseline"]].means]
     rows = []
     for label, one in results.brains.items():
-        means = one.means
-        cells = [
-            cell(percent(one.success), f"{one.successes} of {one.episodes}"),
-            cell(number(means["score"], 3)),
-            cell(number(means["length_s"], 1)),
-            cell(number(means["path_m"], 2)),
-            cell(significant(means["jerk_mean"])),
-            cell(significant(means["jerk_max"])),
-            cell(number(means["reward"], 3)),
-        ]
+        cells = [cell(percent(one.success), f"{one.successes} of {one.episodes}")]
+        for _, name, digits in columns:
+            mean = one.means[name]
+            cells.append(cell(significant(mean) if digits is None else number(mean, digits)))
         rows.append((label, cells))
-    unit, what = results.config["jerk_unit"], results.config["jerk"]
-    head = ["success", "score ¹", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return ²"]
-    note = (
-        "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means. "
-        f"Jerk is that of the commanded motion ({what}), from frame to frame; “largest” is the mean over episodes of "
-        f"each one's largest.<br>{_score_note(results.brains)}<br>² Return: the sum of an episode's rewards, which the "
-        "task defines. Unlike a score it has no bounds, so that it, or its interval, can go below 0 or beyond 1."
-    )
+    head = ["success", *(heading for heading, _, _ in columns)]
+    note = "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means. "
+    if "jerk" in facts:
+        note += (
+            f"Jerk is that of the commanded motion ({facts['jerk']}), from frame to frame; “largest” is the mean over "
+            f"episodes of each one's largest.<br>{_score_note(results.brains)}"
+        )
+    note += f"<br>{mark} Return: the sum of an episode's rewards, which the task defines."
+    if "jerk" in facts:
+        note += " Unlike a score it has no bounds, so that it, or its interval, can go below 0 or beyond 1."
     privileged = {label for label, one in results.brains.items() if one.privileged}
     if privileged:
         note += (
             " Privileged state: the brain acts on what the task reports of the simulator's true state "
             "(<code>observation.environment_state</code>), which no sensor measures."
         )
-    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
+    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and means with intervals")
     return drawn + table(head, rows, results.config["baseline"], privileged) + f'<p class="note">{note}</p>'
 
 
@@ -181,23 +218,26 @@ def _paired(given: ReportInput) -> str:
             cell(percent(one.success, sign=True)),
             f"{one.differ.better} better, {one.differ.worse} worse",
             f"{one.differ.p:.2g}",
-            cell(number(one.score, 3, sign=True)),
-            cell(number(one.ratio, 3)),
+            *([] if one.rewards else [cell(number(one.score, 3, sign=True)), cell(number(one.ratio, 3))]),
+            *(cell(number(reward, 3, sign=True)) for reward in one.rewards.values()),
             str(one.episodes),
         ]
         rows.append((label, cells))
-    head = [
-        "success, difference",
-        "episodes that differ",
-        "McNemar p",
-        "score, difference ¹",
-        "score, ratio ¹",
-        "episodes",
-    ]
+    rewards = any(one.rewards for one in results.paired.values())
+    of_means, more = ["return, difference", "largest reward, difference"], ""
+    if not rewards:
+        of_means = ["score, difference ¹", "score, ratio ¹"]
+        more = ", Fieller's for ratios; those of scores also hold what rare episodes would do, see ¹ above"
+    p_name = "p" if given.config.sequential else "McNemar p"
+    head = ["success, difference", "episodes that differ", p_name, *of_means, "episodes"]
+    rates, p = (
+        ("the confidence sequence of bets", "1 / e-value of the sequential test")
+        if given.config.sequential
+        else ("Newcombe's method 10", "that of McNemar's exact test, two-sided")
+    )
     note = (
-        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
-        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios; those of scores also "
-        "hold what rare episodes would do, see ¹ above. p is that of McNemar's exact test, two-sided; where it finds "
+        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: {rates} for paired rates, "
+        f"Student's, corrected for skewness, for differences of means{more}. p is {p}; where it finds "
         "no difference, the interval of the rates holds 0. An interval that excludes the dashed line shows a "
         "difference beyond chance"
         + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
@@ -242,12 +282,18 @@ def _perception(given: ReportInput) -> str:
 
 def _distributions(given: ReportInput) -> str:
     note = "Each mark is an episode: a dot a success, a cross a failure. Box: the middle half, and the median."
-    drawn = plots.distributions(_by_brain(given), given.results.config["jerk_unit"])
-    return chart(drawn, "Distributions of score, length, path and jerk") + f'<p class="note">{note}</p>'
+    columns = [("return", "reward"), ("largest reward", "max_reward"), ("length [s]", "length_s")]
+    if "jerk_unit" in (facts := given.results.config):
+        columns = [("score", "score"), ("length [s]", "length_s"), ("path [m]", "path_m")]
+        columns.append((f"mean jerk [{facts['jerk_unit']}]", "jerk_mean"))
+    drawn = chart(plots.distributions(_by_brain(given), columns), f"Distributions: {', '.join(dict(columns))}")
+    return f'{drawn}<p class="note">{note}</p>'
 
 
 def _safety(given: ReportInput) -> str:
     brains = given.results.brains
+    if _environment(given.results.config):
+        return ""
 
     def occurring(kind: str) -> list[str]:
         return [name for name in getattr(next(iter(brains.values())), kind, {}) if any(
@@ -314,6 +360,7 @@ def _last_image(video: Path) -> str:
 
 
 def _failures(given: ReportInput) -> str:
+    what, heading = ("reward", "return") if _environment(given.results.config) else ("score", "score")
     parts = []
     for label, episodes in _by_brain(given).items():
         failed = [episode for episode in episodes if not episode.success]
@@ -321,12 +368,12 @@ def _failures(given: ReportInput) -> str:
             parts.append(f"<p><b>{escape(label)}</b>: none.</p>")
             continue
         rows = [
-            f"<tr><td>{one.episode}</td><td>{one.outcome.replace('_', ' ')}</td><td>{one.score:.3f}</td>"
+            f"<tr><td>{one.episode}</td><td>{one.outcome.replace('_', ' ')}</td><td>{getattr(one, what):.3f}</td>"
             f"<td>{one.length_s:.1f}</td><td><code>{one.seed}</code></td>"
             f"<td><code>{escape(replay_command(given.config, given.folder, one))}</code>{_why(one)}</td></tr>"
             for one in failed[:LISTED]
         ]
-        head = "<tr>" + "".join(f"<th>{h}</th>" for h in ("episode", "ended by", "score", "s", "seed", "run it again"))
+        head = "<tr>" + "".join(f"<th>{h}</th>" for h in ("episode", "ended by", heading, "s", "seed", "run it again"))
         more = "" if len(failed) <= LISTED else f'<p class="note">{len(failed) - LISTED} more in episodes.parquet.</p>'
         parts.append(
             f"<details{' open' if len(failed) <= 10 else ''}><summary>{escape(label)}: {len(failed)} of {len(episodes)}"
@@ -360,20 +407,40 @@ def _cite(given: ReportInput) -> str:
     digest = hashlib.sha256((given.folder / "results.json").read_bytes()).hexdigest()
     command = shlex.join(["bhd-eval", f"--config_path={given.folder / 'config.yaml'}"])
     versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
-    numbers = facts["episodes"]
-    which = f"{numbers[0]} to {numbers[-1]}" if len(numbers) == numbers[-1] - numbers[0] + 1 else str(numbers)
     shown = yaml.safe_dump(encode(given.config), sort_keys=False, allow_unicode=True)
     again = "gives" if given.timing["clock"] == "lockstep" else "measures again, on the wall clock, what is in"
     return (
         f"<pre>{escape(command)}</pre>"
-        f"<p>{escape(versions)}.<br>Episodes {which} of run seed {facts['seed']}, split {facts['split']}; episode i "
-        "has the seed <code>episode_seed(seed, i, split)</code> of <code>bhd_lerobot.tasks.task</code>.</p>"
+        f"<p>{escape(versions)}.<br>{_seeds(facts)}</p>"
         f"<p>The same command with the same versions {again} the same <code>results.json</code>, SHA-256 "
         f"<code>{digest}</code>. Beside this file: <code>results.json</code> (everything), "
-        "<code>episodes.parquet</code> (a row for each episode), <code>initial_states.npz</code>, "
+        "<code>episodes.parquet</code> (a row for each episode), "
+        f"{'' if 'env' in facts else '<code>initial_states.npz</code>, '}"
         "<code>timing.json</code> (wall clock), <code>config.yaml</code>.</p>"
         f"<details><summary>config.yaml</summary><pre>{escape(shown)}</pre></details>"
     )
+
+
+def _seeds(facts: Mapping[str, Any]) -> str:
+    """Return which episodes were run, and how their seeds follow."""
+    if "env" in facts:
+        return (
+            f"Episode i of a task has the seed {facts['seed']} + i, as with <code>lerobot-eval --seed={facts['seed']} "
+            f"--eval.n_episodes={facts['n_episodes']} --eval.batch_size={facts['n_envs']} "
+            "--eval.use_async_envs=false</code>."
+        )
+    numbers = facts["episodes"]
+    which = f"{numbers[0]} to {numbers[-1]}" if len(numbers) == numbers[-1] - numbers[0] + 1 else str(numbers)
+    return (
+        f"Episodes {which} of run seed {facts['seed']}, split {facts['split']}; episode i "
+        "has the seed <code>episode_seed(seed, i, split)</code> of <code>bhd_lerobot.tasks.task</code>."
+    )
+
+
+def _environment(facts: Mapping[str, Any]) -> str:
+    """Return which environment of LeRobot the episodes were run in; empty if they were run in none."""
+    env = facts.get("env")
+    return f"{env['type']} {env.get('task') or ''}".strip() if env else ""
 
 
 def _by_brain(given: ReportInput) -> dict[str, list[EpisodeMetrics]]:

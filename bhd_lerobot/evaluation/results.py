@@ -13,10 +13,14 @@ import numpy as np
 from bhd_lerobot.evaluation import statistics
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.perception import PerceptionSummary, summarise_perception
+from bhd_lerobot.evaluation.sequential import confidence_sequence, log_e_value
 from bhd_lerobot.evaluation.statistics import Discordance, Estimate
 
+RESULTS_NAME = "results.json"
 MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
 """Numbers of an episode whose mean and interval an evaluation reports."""
+ENVIRONMENT_MEANS = ("reward", "max_reward", "length_s")
+"""The same of an episode in an environment of LeRobot; there rewards are compared in place of scores."""
 SCORE_RANGE = (0.0, 1.0)
 """What no episode's score exceeds."""
 
@@ -33,7 +37,8 @@ class BrainSummary:
         success: its success rate with its Wilson interval.
         outcomes: how many ended how, the most frequent first.
         starts: how many different initial states these episodes had; those of the same one are not independent.
-        means: means with their intervals, by name, see `MEANS`; of the episodes in which they are defined.
+        means: means with their intervals, by name, see `MEANS` and `ENVIRONMENT_MEANS`; of the episodes in which they
+            are defined.
         limits: frames in which the safety filter changed the command, by kind of limit, of all episodes.
         watchdogs: frames in which a watchdog noticed something, by kind.
         estops: episodes with an emergency stop.
@@ -71,8 +76,12 @@ class PairedSummary:
         episodes: how many episodes both ran.
         success: difference of the success rates, with Newcombe's paired interval.
         differ: on how many episodes they differed in success, with McNemar's exact test.
-        score: difference of the mean scores, with its interval.
-        ratio: ratio of the mean scores, with its interval.
+        score: difference of the mean scores, with its interval; NaN where there are no scores.
+        ratio: ratio of the mean scores, with its interval, likewise.
+        rewards: differences of `reward` and `max_reward` with their intervals, in an environment of LeRobot.
+        e_value: of a sequential test, the e-value against the hypothesis that both are equally good, see
+            `bhd_lerobot.evaluation.sequential`; None without one. With it, the interval of `success` and `differ.p`
+            hold whenever the run was stopped; those of the scores do not.
     """
 
     brain: str
@@ -82,6 +91,8 @@ class PairedSummary:
     differ: Discordance
     score: Estimate
     ratio: Estimate
+    e_value: float | None = None
+    rewards: dict[str, Estimate] = field(default_factory=dict)
 
 
 @dataclass
@@ -104,8 +115,14 @@ class EvalResults:
 
     @property
     def is_partial(self) -> bool:
-        """Whether a brain ran fewer episodes than were requested."""
-        return any(brain.episodes < self.requested for brain in self.brains.values())
+        """Whether a brain ran fewer episodes than were requested, and not because the test ended the run."""
+        return not self.is_decided and any(brain.episodes < self.requested for brain in self.brains.values())
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether a sequential test has shown a difference from the baseline for every other brain."""
+        enough = len(self.paired) / (1 - statistics.CONFIDENCE)
+        return bool(self.paired) and all((pair.e_value or 0.0) >= enough for pair in self.paired.values())
 
     def plain(self) -> dict[str, Any]:
         """Return everything as plain values; what is not a number is nothing."""
@@ -117,7 +134,7 @@ class EvalResults:
             "versions": self.versions,
             "confidence": statistics.CONFIDENCE,
             "brains": {label: asdict(one) for label, one in self.brains.items()},
-            "paired": {label: asdict(one) for label, one in self.paired.items()},
+            "paired": {label: _without_nothing(asdict(one)) for label, one in self.paired.items()},
             "episodes": [episode.plain() for episode in self.episodes],
         }
 
@@ -130,22 +147,29 @@ def summarise(
     baseline: str,
     *,
     privileged: Collection[str] = (),
+    sequential: bool = False,
+    means: Sequence[str] = MEANS,
 ) -> EvalResults:
-    """Return the summaries of brains after some episodes."""
+    """Return the summaries of brains after some episodes, with the means of these numbers.
+
+    Those of a sequential test hold whenever it was stopped.
+    """
     results = EvalResults(config, versions, requested)
     compared = max(1, len(episodes) - 1)
     for label, ran in episodes.items():
         results.episodes += ran
-        results.brains[label] = _brain(label, ran, label in privileged)
+        results.brains[label] = _brain(label, ran, label in privileged, means)
         if label != baseline:
-            results.paired[label] = _pair(ran, episodes[baseline], label, baseline, compared)
+            results.paired[label] = _pair(ran, episodes[baseline], label, baseline, compared, is_sequential=sequential)
+            if "score" not in means:
+                results.paired[label] = _with_rewards(results.paired[label], ran, episodes[baseline], compared)
     return results
 
 
-def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool) -> BrainSummary:
+def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool, names: Sequence[str]) -> BrainSummary:
     successes = sum(episode.success for episode in episodes)
     means = {}
-    for name in MEANS:
+    for name in names:
         values = np.array([getattr(episode, name) for episode in episodes], np.float64)
         within = SCORE_RANGE if name == "score" else (-math.inf, math.inf)
         means[name] = statistics.mean(values[np.isfinite(values)], within=within)
@@ -168,7 +192,13 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics], privileged: bool) -> 
 
 
 def _pair(
-    episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], label: str, baseline: str, compared: int
+    episodes: Sequence[EpisodeMetrics],
+    others: Sequence[EpisodeMetrics],
+    label: str,
+    baseline: str,
+    compared: int,
+    *,
+    is_sequential: bool,
 ) -> PairedSummary:
     confidence = 1 - (1 - statistics.CONFIDENCE) / compared
     by_number = {metrics.episode: metrics for metrics in others}
@@ -176,15 +206,42 @@ def _pair(
     success = [one.success for one, _ in pairs], [other.success for _, other in pairs]
     score = [one.score for one, _ in pairs], [other.score for _, other in pairs]
     differ = statistics.discordance(*success)
+    rate, e_value = statistics.rate_difference(*success, confidence), None
+    if is_sequential:
+        better, worse = differ.better, differ.worse
+        e_value = math.exp(min(700.0, float(log_e_value(better, worse))))
+        rate = confidence_sequence(better, worse, len(pairs) - better - worse, confidence)
+        differ = replace(differ, p=min(1.0, 1 / e_value))
     return PairedSummary(
         brain=label,
         baseline=baseline,
         episodes=len(pairs),
-        success=statistics.rate_difference(*success, confidence),
+        success=rate,
         differ=replace(differ, p=min(1.0, compared * differ.p)),
         score=statistics.mean_difference(*score, confidence, within=SCORE_RANGE),
         ratio=statistics.ratio_of_means(*score, confidence, within=SCORE_RANGE),
+        e_value=e_value,
     )
+
+
+def _with_rewards(
+    pair: PairedSummary, episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], compared: int
+) -> PairedSummary:
+    """Return a pair with rewards, which may be any numbers, in place of scores."""
+    confidence = 1 - (1 - statistics.CONFIDENCE) / compared
+    by_number = {metrics.episode: metrics for metrics in others}
+    rewards = {}
+    for name in ("reward", "max_reward"):
+        values = [
+            (getattr(one, name), getattr(by_number[one.episode], name)) for one in episodes if one.episode in by_number
+        ]
+        rewards[name] = statistics.mean_difference([a for a, _ in values], [b for _, b in values], confidence)
+    undefined = Estimate(math.nan, math.nan, math.nan)
+    return replace(pair, score=undefined, ratio=undefined, rewards=rewards)
+
+
+def _without_nothing(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _sum(counts: Any) -> dict[str, int]:

@@ -3,7 +3,7 @@
 import heapq
 import json
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,7 @@ from bhd_lerobot.errors import BhdError, DatasetMismatchError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.policies.brain import is_privileged
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
@@ -47,7 +48,8 @@ class BrainRun:
         trajectories: its episodes from above, by number.
         videos: of what videos are to be made: episode, scene and recorded physics states.
         initial_states: the simulator's complete states at the episodes' starts.
-        recorded: numbers of the episodes that had been recorded before, and were not run again.
+        recorder: fills its dataset; None if none is wanted.
+        recorded: episodes that had been recorded before, and are not run again, by number.
         wall_s: duration of the run [s].
     """
 
@@ -57,13 +59,19 @@ class BrainRun:
     trajectories: dict[int, Trajectory] = field(default_factory=dict)
     videos: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
     initial_states: list[NDArray[np.float64]] = field(default_factory=list)
-    recorded: Collection[int] = ()
+    recorder: DatasetRecorder | None = None
+    recorded: Mapping[int, EpisodeSummary] = field(default_factory=dict)
     wall_s: float = 0.0
 
     @property
     def is_privileged(self) -> bool:
         """Whether the brain acts on what no sensor measures."""
         return is_privileged(self.loop.brain, self.loop.task.environment_names)
+
+    def close(self) -> None:
+        """Disconnect a teleoperator."""
+        if isinstance(self.loop.brain, TeleopBrain):
+            self.loop.brain.close()
 
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""
@@ -83,11 +91,11 @@ class BrainRun:
 
 def prepare(config: EvalConfig, label: str, robots: Robots, pool: WorkerPool | None = None) -> BrainRun:
     """Make a brain and what runs it: one that does not fit fails here, before any episode."""
-    robot: Any = config.robot
+    fps = robots.rates.fps
     try:
         brain = make_brain(config.brains[label])
-        task = make_task(config.task, robots.n, robot.fps, robots.body)
-        task = judged(task, robots.knows, robots.n, robot.fps)
+        task = make_task(config.task, robots.n, fps, robots.body)
+        task = judged(task, robots.knows, robots.n, fps)
         if pool is None:
             return BrainRun(label, EpisodeLoop(robots, task, brain))
         loop = ClusterLoop(robots, task, brain, pool=pool, config=config, brain_config=config.brains[label])
@@ -96,30 +104,47 @@ def prepare(config: EvalConfig, label: str, robots: Robots, pool: WorkerPool | N
         raise type(error)(f"brains.{label}: {error}") from error
 
 
-def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], show: Callable[[], None]) -> None:
-    """Run a brain's episodes and store what results and report need of them."""
-    robots, loop = one.loop.robots, one.loop
-    jerk, fps = JerkMeasure.of(robots.action_names), robots.rates.fps
+def jerk_of(robots: Robots) -> JerkMeasure:
+    """Return what jerk is measured of; the units of a robot of another package are not known."""
+    return JerkMeasure.of(robots.action_names, is_si=robots.body is not None)
+
+
+def specs_of(config: EvalConfig) -> list[EpisodeSpec]:
+    """Return the episodes of each brain."""
     split: Any = config.split
-    specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
-    with _recorder(config, one.label, loop) as recorder:
-        rows = _rows_of(recorder, specs) if recorder else {}
-        one.recorded = set(rows)
-        missing = [spec for spec in specs if spec.index not in rows]
-        started = time.perf_counter()
-        run = loop.run(missing, stop, recorder.begin_episode if recorder else None)
-        known = _recorded_episodes(recorder, rows.values()) if recorder else iter(())
-        for episode in heapq.merge(known, run, key=lambda episode: episode.spec.index):
-            track = track_of(robots, episode.columns)
-            metrics = measure(one.label, episode, track, jerk, fps)
-            if recorder and metrics.episode not in rows:
-                task, brain = loop.task.parameters(), loop.brain.parameters()
-                save_episode(recorder, episode, episode_metadata(episode, split=split, task=task, brain=brain))
-            one.episodes.append(metrics)
-            one.initial_states.append(episode.initial_state)
-            _store(config, one, metrics, episode, track)
-            one.wall_s = time.perf_counter() - started
-            show()
+    return [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
+
+
+@contextmanager
+def open_dataset(config: EvalConfig, one: BrainRun) -> Iterator[None]:
+    """Open the dataset of a brain, if one is wanted, and find which episodes it holds already."""
+    with _recorder(config, one.label, one.loop) as one.recorder:
+        one.recorded = _rows_of(one.recorder, specs_of(config)) if one.recorder else {}
+        yield
+
+
+def run_episodes(
+    config: EvalConfig, one: BrainRun, specs: Sequence[EpisodeSpec], stop: Callable[[], bool], show: Callable[[], None]
+) -> None:
+    """Run some of a brain's episodes and store what results and report need of them."""
+    robots, loop, recorder = one.loop.robots, one.loop, one.recorder
+    jerk, fps = jerk_of(robots), robots.rates.fps
+    rows = [one.recorded[spec.index] for spec in specs if spec.index in one.recorded]
+    missing = [spec for spec in specs if spec.index not in one.recorded]
+    before, started = one.wall_s, time.perf_counter()
+    run = loop.run(missing, stop, recorder.begin_episode if recorder else None)
+    known = _recorded_episodes(recorder, rows) if recorder else iter(())
+    for episode in heapq.merge(known, run, key=lambda episode: episode.spec.index):
+        track = track_of(robots, episode.columns)
+        metrics = measure(one.label, episode, track, jerk, fps)
+        if recorder and metrics.episode not in one.recorded:
+            task, brain = loop.task.parameters(), loop.brain.parameters()
+            save_episode(recorder, episode, episode_metadata(episode, split=config.split, task=task, brain=brain))
+        one.episodes.append(metrics)
+        one.initial_states.append(episode.initial_state)
+        _store(config, one, metrics, episode, track)
+        one.wall_s = before + time.perf_counter() - started
+        show()
 
 
 def _rows_of(recorder: DatasetRecorder, specs: Sequence[EpisodeSpec]) -> dict[int, EpisodeSummary]:
@@ -154,8 +179,7 @@ def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[Dat
         return
     repo_id = f"{config.record.repo_id}_{label}"
     root = Path(config.record.root).expanduser() / label if config.record.root else default_root(repo_id)
-    robot: Any = config.robot
-    recording = Recording(repo_id, root, robot.fps, config.task, config.seed, config.split, resume=True)
+    recording = Recording(repo_id, root, loop.robots.rates.fps, config.task, config.seed, config.split, resume=True)
     with open_recorder(recording, loop.robots, loop.task, loop.brain) as recorder:
         yield recorder
         recorder.finalize()
@@ -164,10 +188,11 @@ def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[Dat
 def _store(
     config: EvalConfig, one: BrainRun, metrics: EpisodeMetrics, episode: Episode, track: NDArray[np.float64]
 ) -> None:
-    title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
-    one.trajectories[metrics.episode] = Trajectory(
-        title, episode.scene, track[:, :2].astype(np.float32), metrics.success, episode.instruction
-    )
+    if len(track):
+        title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
+        one.trajectories[metrics.episode] = Trajectory(
+            title, episode.scene, track[:, :2].astype(np.float32), metrics.success, episode.instruction
+        )
     failures = sum(not other.success for other in one.episodes)
     wanted = VIDEOS if config.videos is None else config.videos
     if not metrics.success and failures == 1:

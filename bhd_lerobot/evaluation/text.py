@@ -4,7 +4,7 @@ import math
 
 from bhd_lerobot.evaluation.perception import PerceptionSummary
 from bhd_lerobot.evaluation.results import EvalResults, PairedSummary
-from bhd_lerobot.evaluation.statistics import Estimate
+from bhd_lerobot.evaluation.statistics import CONFIDENCE, Estimate
 
 
 def percent(estimate: Estimate, *, sign: bool = False) -> str:
@@ -46,17 +46,36 @@ def sentences(results: EvalResults) -> list[str]:
 
 
 def verdict(pair: PairedSummary) -> str:
-    """Return whether a brain is better than the baseline, as text, by the intervals of success and of score."""
+    """Return whether a brain is better than the baseline, as text, by the intervals of success and score, or return."""
     rate = _direction(pair.success, "more often", "less often", "")
-    score = _direction(pair.score, "a higher score", "a lower score", "")
+    points = f" ({percent(pair.success, sign=True).split(' (')[0]})" if rate else ""
+    if pair.e_value is not None:  # what is known of the scores holds for a fixed number of episodes only
+        return f"it succeeds {rate}{points}" if rate else "no difference in success is certain"
+    what, estimate = ("return", pair.rewards["reward"]) if pair.rewards else ("score", pair.score)
+    score = _direction(estimate, f"a higher {what}", f"a lower {what}", "")
     times = "" if math.isnan(pair.ratio.value) else f", {pair.ratio.value:.2f} times the mean"
     clauses = [
-        f"it succeeds {rate} ({percent(pair.success, sign=True).split(' (')[0]})"
-        if rate
-        else "no difference in success is certain",
-        f"it has {score}{times}" if score else "none in score" if not rate else "no difference in score is certain",
+        f"it succeeds {rate}{points}" if rate else "no difference in success is certain",
+        f"it has {score}{times}" if score else f"none in {what}" if not rate else f"no difference in {what} is certain",
     ]
     return " and ".join(clauses)
+
+
+def sequential_sentence(results: EvalResults) -> str:
+    """Return what a sequential test has found, and which intervals are exact."""
+    needed = len(results.paired) / (1 - CONFIDENCE)
+    values = ", ".join(f"{label} {pair.e_value:.3g}" for label, pair in results.paired.items())
+    pairs = min(pair.episodes for pair in results.paired.values())
+    ended = (
+        f"The sequential test ended the run after {pairs} of {results.requested} pairs of episodes"
+        if results.is_decided
+        else f"The sequential test is not certain after {pairs} pairs of episodes"
+    )
+    return (
+        f"{ended}: e-value against equal success {values}; a difference is certain from {needed:g} on. The intervals "
+        "of differences in success hold whenever the run ends; all others are for a number of episodes that was fixed "
+        "before, and are not exact."
+    )
 
 
 def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:

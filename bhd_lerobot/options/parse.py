@@ -132,7 +132,8 @@ def _plain(value: Any) -> Any:
 
 def encode(config: Any) -> dict[str, Any]:
     """Return a configuration as plain values, with every default filled in: what `parse` would read back."""
-    return draccus.encode(config)
+    plain: dict[str, Any] = json.loads(json.dumps(draccus.encode(config)))  # draccus leaves enumerations inside
+    return plain
 
 
 def read_file(path: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.recording.live_view import check_options
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
-from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.config import FPS, GateConfig
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
@@ -56,9 +56,6 @@ class DatasetConfig:
     push_to_hub: bool = False
     private: bool = False
     tags: list[str] = field(default_factory=list)
-
-
-_FPS = 30  # frames a second of a robot whose configuration does not say it, as with LeRobot's recorder [Hz]
 
 
 @dataclass
@@ -153,7 +150,7 @@ class RecordConfig:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot
         if not is_ours(robot.type):
-            self.dataset.fps = self.dataset.fps or _FPS
+            self.dataset.fps = self.dataset.fps or FPS
             self._settle_duration()
             return
         if self.dataset.fps == 0:

@@ -15,6 +15,8 @@ from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.rollout.types import Episode
 
+_LEFT_OUT = 0.02  # share of an episode's frames from which on it is said that the robot does not keep the rate
+
 
 @dataclass
 class RecordResult:
@@ -33,6 +35,7 @@ class RecordResult:
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
+        kept_fps: frames a second that a robot kept which left some out [Hz]; None if it left out less than 2 %.
         fault: why a real robot's fault ended the run, as text; None if none did.
         estop: what pressed the emergency stop that ended the run, as text; None if there was none.
     """
@@ -51,6 +54,7 @@ class RecordResult:
     stopped_by: StopRequest | None = None
     estop: str | None = None
     fault: str | None = None
+    kept_fps: float | None = None
 
     @property
     def exit_status(self) -> int:
@@ -76,6 +80,10 @@ class RecordResult:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
         self.simulated_s += episode.frames / fps
+        timing = episode.timing
+        if timing.clock == "realtime" and timing.skipped > _LEFT_OUT * (timing.ticks + timing.skipped):
+            kept = timing.ticks / (timing.elapsed or 1.0) if timing.period * fps > 0.99 else None
+            self.kept_fps = kept if self.kept_fps is None or kept is None else min(self.kept_fps, kept)
 
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
@@ -115,6 +123,12 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         console.print(
             f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] The episode that was running is saved "
             "with the outcome 'fault', and no other was started. Clear the cause and continue with --resume=true."
+        )
+    if result.kept_fps is not None:
+        console.print(
+            f"The robot keeps about {result.kept_fps:.0f} of the {config.dataset.fps} frames a second that were asked "
+            f"for; the others were left out. Record with --dataset.fps={result.kept_fps:.0f}, or use fewer or smaller "
+            "images."
         )
     if result.stopped_by:
         console.print(

@@ -13,17 +13,18 @@ from bhd_lerobot.options.parse import RUN_CONFIG, encode
 
 
 @contextlib.contextmanager
-def run_folder(config: Any, kind: str) -> Iterator[Path]:
+def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
     """Make the folder of a run, with its resolved configuration; if the block fails, the run was refused.
 
-    A run that was refused leaves no folder; what was there before stays. The default place is in ``outputs/<kind>``.
+    A run that was refused leaves no folder; what was there before stays. The default place is in ``outputs/<kind>``, by
+    default with a name of robot and task.
     """
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()
     else:
         now = datetime.now()
-        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
-        folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / name
+        name = name or f"{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
+        folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{name}"
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         before = (folder / RUN_CONFIG).read_bytes() if (folder / RUN_CONFIG).is_file() else None

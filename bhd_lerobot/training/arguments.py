@@ -20,7 +20,7 @@ from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.policies.learned.contract import find_checkpoint
-from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig, plain
+from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig
 
 
 @dataclass(frozen=True)
@@ -170,6 +170,6 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
 def _policy_values(source: str) -> dict[str, Any]:
     try:
         config = PreTrainedConfig.from_pretrained(source)
-        return {"type": config.type, **plain(config)}
+        return {"type": config.type, **configuration.encode(config)}
     except Exception as error:  # draccus, for a type that is not installed or a field that does not exist
         raise ConfigError(f"The configuration of the checkpoint {source} cannot be used: {error}") from error

@@ -3,18 +3,18 @@
 import copy
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.selection import EpisodeFilter
 from bhd_lerobot.errors import ConfigError, quoted, unknown_name
+from bhd_lerobot.options.parse import encode
 
 OWN_CONFIG_NAME = "bhd_train.json"
 """The fields that LeRobot's `train_config.json` has no place for; beside it in every checkpoint."""
@@ -191,7 +191,7 @@ class BhdTrainConfig(TrainPipelineConfig):
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Write LeRobot's fields into the file that LeRobot reads, and ours beside it."""
-        values = plain(self)
+        values = encode(self)
         own = {name: values.pop(name) for name in own_fields()}
         (save_directory / TRAIN_CONFIG_NAME).write_text(json.dumps(values, indent=4), encoding="utf-8")
         (save_directory / OWN_CONFIG_NAME).write_text(json.dumps(own, indent=4), encoding="utf-8")
@@ -213,12 +213,6 @@ def own_fields() -> list[str]:
 def policy_types() -> Sequence[str]:
     """Return the policies that can be trained, by the name of their type."""
     return sorted(PreTrainedConfig.get_known_choices())
-
-
-def plain(config: Any) -> dict[str, Any]:
-    """Return a configuration as JSON values, with every default filled in: what `parse_train` would read back."""
-    encoded: Mapping[str, Any] = draccus.encode(config)
-    return json.loads(json.dumps(encoded))
 
 
 def without_places(value: Any) -> Any:

@@ -15,11 +15,12 @@ from bhd_lerobot.datasets.remote.hub_errors import hub_errors
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
+from bhd_lerobot.options.parse import encode
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.checkpoint import TrainingParts
-from bhd_lerobot.training.config import BhdTrainConfig, plain, without_places
+from bhd_lerobot.training.config import BhdTrainConfig, without_places
 from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, draw_loss, read_metrics
 
 
@@ -130,7 +131,7 @@ class RunOutput:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             checkpoint.clean(folder)
-            text = yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
+            text = yaml.safe_dump(encode(config), sort_keys=False, default_flow_style=None, width=110)
             (folder / "config.yaml").write_text(text, encoding="utf-8")
             config._save_pretrained(folder)
             return MetricsFile(folder / METRICS_NAME, read_metrics(source / METRICS_NAME, step))

@@ -7,17 +7,17 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies
-from bhd_lerobot.cli import monitor
+from bhd_lerobot.cli import evaluate, monitor
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.parse import parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
@@ -148,7 +148,8 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if program == "bhd-train":
         parse_training(arguments)
     elif program == "bhd-eval":
-        parse(EvalConfig, arguments)
+        chosen = evaluate.program_of(read_line(arguments))
+        (chosen.read or partial(parse, chosen.config_class))(read_line(arguments))
     elif program == "bhd-record":
         parse(RecordConfig, arguments)
     elif program == "bhd-replay":

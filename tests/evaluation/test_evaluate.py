@@ -251,6 +251,35 @@ def test_a_failed_episode_is_run_again_by_the_command_in_the_report(whole, tmp_p
     assert again == failed.plain()
 
 
+def test_a_sequential_test_ends_a_run_that_is_certain_and_says_so(tmp_path):
+    """The rule `noop` never drives the distance that a success needs; after 8 such pairs the e-value is 2^8 / 9."""
+    brains = {"brains__old__type": "noop", "n_episodes": 40, "n_envs": 4, "sequential": "true"}
+    result, printed = run_eval(tmp_path / "e", **brains)
+    written = results(tmp_path / "e")
+    assert [written["brains"][label]["episodes"] for label in ("old", "new")] == [8, 8]
+    assert written["partial"] is False
+    pair = written["paired"]["new"]
+    assert pair["e_value"] == pytest.approx(2**8 / 9)
+    assert pair["differ"]["p"] == pytest.approx(9 / 2**8)
+    assert pair["success"]["low"] > 0
+    sentence = (
+        "The sequential test ended the run after 8 of 40 pairs of episodes: e-value against equal success new 28.4"
+    )
+    for text in (printed, result.report.read_text(encoding="utf-8")):
+        assert sentence in text
+        assert "are not exact" in text
+    assert "Stopped" not in printed
+    assert "Newcombe" not in result.report.read_text(encoding="utf-8")
+
+
+def test_a_sequential_test_of_equal_brains_runs_all_episodes_and_is_not_certain(tmp_path):
+    brains = {"brains__new__type": "avoidance", "n_episodes": 5, "n_envs": 2, "sequential": "true"}
+    result, printed = run_eval(tmp_path / "e", **brains)
+    assert [one.episodes for one in result.results.brains.values()] == [5, 5]
+    assert "The sequential test is not certain after 5 pairs of episodes" in printed
+    assert result.results.paired["new"].success.low < 0 < result.results.paired["new"].success.high
+
+
 def test_a_brain_that_does_not_fit_fails_before_any_episode_and_is_named(tmp_path, monkeypatch):
     def bind(self, *arguments):
         raise ConfigError("The brain 'gap_follower' needs the observation feature(s) sonar.pos.")

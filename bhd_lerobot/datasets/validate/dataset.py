@@ -104,6 +104,8 @@ def _check_videos(files: Files, findings: Findings) -> None:
                 continue
             if found != lengths.sum():
                 what = f"it has {found} frames; its episodes have {lengths.sum()}"
+                if found > lengths.sum():
+                    what += ": of a discarded take, for example; images behind them are of other rows"
                 findings.error("video", name, what, RESTORE)
             begin = np.array([files.episodes[f"videos/{key}/from_timestamp"][i] for i in positions])
             end = np.array([files.episodes[f"videos/{key}/to_timestamp"][i] for i in positions])

@@ -49,12 +49,18 @@ class EncoderProcess:
         self._next = 0  # where the next image goes in shared memory
         self._spans: queue.SimpleQueue[int] = queue.SimpleQueue()  # bytes of the images on their way, in order
         self.problem = ""
+        self._is_closed = False
         self._threads = [
             threading.Thread(target=run, name=f"bhd-images-{name}", daemon=True)
             for name, run in (("out", self._feed), ("in", self._listen))
         ]
         for thread in self._threads:
             thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
 
     def encoder(self, path: Path, fps: int, size: tuple[int, int], settings: VideoSettings) -> "RemoteEncoder":
         """Return an encoder of one camera and one episode; the arguments are those of `CameraEncoder`."""
@@ -125,6 +131,9 @@ class EncoderProcess:
 
     def close(self) -> None:
         """End the process. May be called twice."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         self._wanted.put(None)
         self._threads[0].join()
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -65,13 +65,16 @@ class LoadedPolicy:
         return int(features[key].shape[0]) if key in features else None
 
 
-def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = None) -> LoadedPolicy:
+def load_policy(
+    folder: Path, device: str = "cpu", n_action_steps: int | None = None, *, for_robot: bool = True
+) -> LoadedPolicy:
     """Return the policy of a checkpoint.
 
     Args:
         folder: a checkpoint's folder `pretrained_model`.
         device: where it runs: `cpu`, `cuda`, `cuda:1`, …
         n_action_steps: how many actions of a chunk are carried out; the checkpoint's own number if None.
+        for_robot: refuse inputs that no robot gives; environments of LeRobot may return others.
     """
     _check_device("brain.device", device)
     config = _config(folder, device)
@@ -85,7 +88,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
             )
     check_checkpoint(folder)
     policy, before, after = _load(folder, config, device)
-    return LoadedPolicy(folder, policy, before, after, *_inputs(config, before))
+    return LoadedPolicy(folder, policy, before, after, *_inputs(config, before, for_robot=for_robot))
 
 
 def load_perception(folder: Path, device: str = "cpu", option: str = "brain.perception.path") -> Any:
@@ -181,7 +184,9 @@ def _set_action_steps(config: Any, steps: int) -> None:
     config.n_action_steps = steps
 
 
-def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str], dict[str, tuple[int, ...]]]:
+def _inputs(
+    config: Any, before: Any, *, for_robot: bool
+) -> tuple[tuple[str, ...], dict[str, str], dict[str, tuple[int, ...]]]:
     """Return the inputs under the robot's names, which are cameras, and the shapes of their images."""
     renamed: dict[str, str] = {}
     for step in before.steps:
@@ -193,7 +198,7 @@ def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str], 
         inputs.append(own)
         if feature.type == FeatureType.VISUAL:
             cameras[own], shapes[own] = camera_name(own), tuple(feature.shape)
-        elif own not in (OBS_STATE, OBS_ENV_STATE):
+        elif for_robot and own not in (OBS_STATE, OBS_ENV_STATE):
             raise ConfigError(
                 f"The policy reads {own!r}, which no robot here gives. There is {OBS_STATE}, {OBS_ENV_STATE} and "
                 "images."

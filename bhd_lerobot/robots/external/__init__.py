@@ -6,5 +6,6 @@ __all__ = [
     "frames",
     "gate",
     "host",
+    "lock",
     "make",
 ]

@@ -7,6 +7,9 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.dotted import flattened
 
+FPS = 30
+"""Frames a second of a robot whose configuration does not say it, as with LeRobot's recorder [Hz]."""
+
 
 @dataclass
 class GateConfig:

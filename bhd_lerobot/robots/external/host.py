@@ -20,6 +20,7 @@ from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.device import Device
 from bhd_lerobot.robots.external.frames import DeviceFrame, FrameThread
 from bhd_lerobot.robots.external.gate import Gate
+from bhd_lerobot.robots.external.lock import RobotLock
 from bhd_lerobot.robots.host.robots import Deliver, Frame, FrameReport
 
 
@@ -46,6 +47,7 @@ class LeRobotHost:
         robot: a LeRobot robot, connected.
         fps: frames a second [Hz].
         config: what is let through to it.
+        lock: let go of when it is closed.
     """
 
     robot_kind = "any"
@@ -54,7 +56,8 @@ class LeRobotHost:
     world = None
     knows: frozenset[str] = frozenset()
 
-    def __init__(self, robot: Any, fps: int, config: GateConfig) -> None:
+    def __init__(self, robot: Any, fps: int, config: GateConfig, lock: RobotLock | None = None) -> None:
+        self._lock = lock
         self.robot, self.config, self._gate_config = robot, robot.config, config
         self.device = Device(robot)
         self.rates = Rates(fps, fps, fps)
@@ -230,3 +233,5 @@ class LeRobotHost:
         """Disconnect the robot. May be called twice; a call that does not return is not waited for."""
         if self._frames.close() and self.robot.is_connected:
             self.robot.disconnect()
+        if self._lock is not None:
+            self._lock.close()

@@ -5,6 +5,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.host import LeRobotHost
+from bhd_lerobot.robots.external.lock import RobotLock
 
 
 def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
@@ -22,12 +23,15 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         raise ConfigError(
             f"robot.type is {config.type!r}, which cannot be made: {_words(error.__cause__ or error)}."
         ) from error
+    lock = RobotLock(config)
     try:
-        host = LeRobotHost(robot, fps, gate)  # what cannot be recorded is found out before the robot is touched
+        host = LeRobotHost(robot, fps, gate, lock)  # what cannot be recorded is found out before the robot is touched
         robot.connect()
     except (ConfigError, RealtimeError):
+        lock.close()
         raise
     except Exception as error:  # of another package's code
+        lock.close()
         raise RealtimeError(
             f"The robot {config.type!r} cannot be connected: {_words(error)}. Check its power, its cable and "
             "robot.port, and that no other program uses it."

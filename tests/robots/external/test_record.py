@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.lock import RobotLock
 from bhd_lerobot.rollout.progress import FAULT_STATUS
 from bhd_lerobot.rollout.replay_robot import replay_on_robot
 from tests.forks import Fork
@@ -37,6 +39,7 @@ def options(root: Path, **overrides: object) -> list[str]:
     values: dict[str, object] = {
         "robot.type": "mock_arm",
         "robot.cameras": CAMERAS,
+        "robot.port": root,
         "robot.calibration_dir": root.parent / "calibration",
         "teleop.type": "mock_leader",
         "teleop.calibration_dir": root.parent / "calibration",
@@ -153,7 +156,7 @@ def test_a_teleoperator_that_gives_nan_moves_nothing(tmp_path: Path) -> None:
         ({"gate__range__wrist": "[0, 1]"}, "wrist.*elbow.pos"),
         ({"engine": "ray"}, "engine is 'ray'"),
         ({"dataset__reset_time_s": -1}, "reset_time_s is -1"),
-        ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__calibration_dir": None}, "robot.clock=realtime"),
+        ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__port": None}, "robot.clock=realtime"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_remedy(tmp_path: Path, overrides: dict[str, Any], message: str) -> None:
@@ -166,6 +169,7 @@ def test_lerobots_own_robots_and_teleoperators_are_imported_when_they_are_asked_
     arguments = [
         "--robot.type=so101_follower",
         "--robot.port=/dev/null",
+        "--task.instruction=wave",
         "--teleop.type=so101_leader",
         "--teleop.port=/dev/null",
     ]
@@ -202,3 +206,20 @@ def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) ->
     assert "elbow.pos" in console.file.getvalue()
     with pytest.raises(ConfigError, match=r"gate.max_change is not set"):
         replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(), console)
+
+
+def test_two_programs_do_not_use_one_robot(tmp_path: Path) -> None:
+    config: Any = parse(RecordConfig, options(tmp_path / "d", robot__id="shared")).robot
+    with RobotLock(config):
+        with pytest.raises(RealtimeError, match=rf"mock_arm .*is used by process {os.getpid()}"):
+            run(tmp_path / "d", robot__id="shared")
+        run(tmp_path / "other", robot__id="another", dataset__num_episodes=1)
+    run(tmp_path / "again", robot__id="shared", dataset__num_episodes=1)
+
+
+def test_a_rate_that_the_robot_does_not_keep_is_said_with_the_one_that_it_does(tmp_path: Path) -> None:
+    _, text = run(tmp_path / "d", dataset__num_episodes=1, robot__read_s=0.05, task__duration_s=2)
+    found = re.search(r"keeps about (\d+) of the 30 frames a second", text)
+    assert found, text
+    assert 8 <= int(found[1]) <= 20
+    assert not re.search("keeps about", run(tmp_path / "slow", robot__read_s=0.05, dataset__fps=5)[1])

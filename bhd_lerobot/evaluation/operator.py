@@ -1,0 +1,74 @@
+"""A person beside a real robot who sets up scenes and judges, and the order in which the brains run."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+
+from bhd_lerobot.rollout.marks import KEYS, Marks
+from bhd_lerobot.rollout.types import EpisodeSpec
+
+_ORDER_STREAM = 3  # beside the scenes' and the brains' random numbers
+_POLL_S = 0.05
+_JUDGING = tuple(key for key in KEYS if key.meaning in ("success", "failure"))
+
+
+def random_order(labels: Sequence[str], index: int, seed: int) -> list[str]:
+    """Return in which order the brains run an episode: at random, by the run's seed and the episode's number."""
+    rng = np.random.default_rng(np.random.SeedSequence([_ORDER_STREAM, seed, index]))
+    return [labels[place] for place in rng.permutation(len(labels))]
+
+
+class Operator(Marks):
+    """A person at the terminal, who is not told which brain runs.
+
+    Args:
+        console: where the prompts are printed.
+        total: number of episodes of all brains.
+        outcomes: what an episode can end with, by name.
+
+    Attributes:
+        is_there: whether a terminal gives keys.
+        has_quit: whether the key q was pressed.
+    """
+
+    def __init__(self, console: Console, total: int, outcomes: Sequence[str]) -> None:
+        super().__init__(1, outcomes, _JUDGING)
+        self._console, self._total = console, total
+        self.is_there = self.has_quit = False
+        self._title = ""
+
+    def on_key(self, keys: bytes) -> None:
+        """Take keys of a terminal: q, and those of `Marks`."""
+        self.has_quit |= b"q" in keys.lower()
+        super().on_key(keys)
+
+    def set_up(self, number: int, spec: EpisodeSpec, instruction: str, stop: Callable[[], bool]) -> None:
+        """Wait until the person has set up a scene.
+
+        Args:
+            number: of the episode among those of all brains, from 1.
+            spec: the episode.
+            instruction: what the robot is to do.
+            stop: whether the run is to end: then it is not waited for.
+        """
+        self._title = f"Episode {number} of {self._total}"
+        if not self.is_there:
+            return
+        words = f" ({escape(instruction)})" if instruction else ""
+        with self.waiting() as is_pressed:
+            self._say(f"{self._title}, scene {spec.index}{words}: set up the scene, then press Enter")
+            while not (is_pressed() or stop()):
+                time.sleep(_POLL_S)
+
+    def begin(self, simulations: NDArray[np.intp]) -> None:
+        """Begin an episode: from now on keys judge it."""
+        super().begin(simulations)
+        if self.is_there:
+            self._say(f"{self._title} runs: s success, f failure, q end the evaluation")
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True, highlight=False)  # a script looks for whole lines

@@ -1,0 +1,194 @@
+"""Real runs: brains in turns, in an order that nothing shows, judged by a person's keys, continued after any end."""
+
+import json
+import os
+import pty
+import re
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.cli.evaluate import main
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.evaluation.operator import random_order
+from tests.forks import Fork
+from tests.waiting import until
+
+LABELS = ("quixote", "zeppelin")
+CAMERAS = "{front: {type: mock_camera}}"
+
+
+def options(folder: Path, **overrides: object) -> list[str]:
+    values: dict[str, object] = {
+        "robot.discover_packages_path": "tests.robots.external.mock_devices",
+        "robot.type": "mock_arm",
+        "robot.calibration_dir": folder / "calibration",
+        "task.type": "free",
+        "task.instruction": "wave",
+        "task.duration_s": 60,
+        "brains.quixote.type": "noop",
+        "brains.zeppelin.type": "teleop",
+        "brains.zeppelin.teleop.type": "mock_leader",
+        "brains.zeppelin.teleop.calibration_dir": folder / "calibration",
+        "n_episodes": 3,
+        "seed": 5,
+        "output_dir": folder / "e",
+        **{key.replace("__", "."): value for key, value in overrides.items()},
+    }
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+
+
+class Judged:
+    """bhd-eval as a program of its own, with a terminal at which a script sits."""
+
+    def __init__(self, folder: Path, **overrides: object) -> None:
+        self.person, device = pty.openpty()
+        self.log = folder / "log"
+        self.process = Fork(main, options(folder, **overrides), output=self.log, terminal=device)
+        os.close(device)
+
+    def text(self) -> str:
+        return self.log.read_text(encoding="utf-8")
+
+    def prompted(self, number: int) -> str:
+        """Wait for the prompt before an episode, and return it."""
+        self._wait_for(rf"Episode {number} of \d+, scene .*press Enter")
+        (prompt,) = re.findall(rf"Episode {number} of \d+, scene .*press Enter", self.text())
+        return prompt
+
+    def begin(self, number: int) -> None:
+        """Set up a scene: Enter, and wait until the episode runs."""
+        self.prompted(number)
+        os.write(self.person, b"\r")
+        self._wait_for(rf"Episode {number} of \d+ runs")
+
+    def judge(self, keys: str, first: int = 1) -> None:
+        """Judge episodes, from a number on, by a key each."""
+        for number, key in enumerate(keys, first):
+            self.begin(number)
+            os.write(self.person, key.encode())
+
+    def _wait_for(self, pattern: str) -> None:
+        until(lambda: re.search(pattern, self.text()) or self.process.poll() is not None, pattern)
+        assert re.search(pattern, self.text()), self.text()
+
+    def end(self) -> int:
+        status = self.process.wait()
+        os.close(self.person)
+        return status
+
+
+def outcomes(folder: Path) -> dict[str, list[str]]:
+    """Return how the episodes of each brain ended, in the order of their numbers."""
+    episodes = json.loads((folder / "e" / "results.json").read_text())["episodes"]
+    return {label: [one["outcome"] for one in episodes if one["brain"] == label] for label in LABELS}
+
+
+def expected(keys: str, seed: int = 5) -> dict[str, list[str]]:
+    """Return what keys mean, that come in the order in which the brains run."""
+    found: dict[str, list[str]] = {label: [] for label in LABELS}
+    for index in range(-(-len(keys) // 2)):
+        for label, key in zip(random_order(LABELS, index, seed), keys[2 * index : 2 * index + 2], strict=False):
+            found[label].append({"s": "success", "f": "failure"}[key])
+    return found
+
+
+def test_the_order_is_a_permutation_for_each_episode_that_follows_from_the_seed():
+    labels = ["a", "b", "c"]
+    orders = [random_order(labels, index, seed=1) for index in range(600)]
+    assert all(sorted(order) == labels for order in orders)
+    assert orders == [random_order(labels, index, seed=1) for index in range(600)]
+    assert orders != [random_order(labels, index, seed=2) for index in range(600)]
+    # Each brain is as often the first as any other: 200 of 600, with a standard deviation of 11.5.
+    assert all(abs(sum(order[0] == label for order in orders) - 200) < 46 for label in labels)
+    assert np.unique([", ".join(order) for order in orders]).size == 6
+
+
+def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tmp_path):
+    run = Judged(tmp_path, robot__cameras=CAMERAS)
+    keys = "sfffss"
+    run.judge(keys)
+    assert run.end() == 0, run.text()
+    text = run.text()
+    assert "Episode 1 of 6, scene 0 (wave): set up the scene, then press Enter" in text
+    before, _, after = text.partition("6/6")
+    assert "Episode 6 of 6 runs" in before
+    for label in LABELS:
+        assert label not in before
+        assert label in after
+    assert outcomes(tmp_path) == expected(keys)
+    written = json.loads((tmp_path / "e" / "results.json").read_text())
+    assert written["partial"] is False
+    assert written["config"]["order"] == {str(index): random_order(LABELS, index, 5) for index in range(3)}
+    assert all(one["path_m"] is None for one in written["episodes"])  # nobody knows where the tool was
+    page = (tmp_path / "e" / "report.html").read_text(encoding="utf-8")
+    assert "no prompt said which one ran" in page
+    assert "there is no simulator to render" in page
+    assert "rad/s" not in page  # LeRobot's robots say no units
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, "q"], ids=["kill", "term", "q"])
+def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_path, end):
+    recorded = {"record__repo_id": "me/real", "record__root": tmp_path / "data", "robot__cameras": CAMERAS}
+    run = Judged(tmp_path, **recorded)
+    keys = "sfsffs"
+    run.judge(keys[:3])
+    run.begin(4)
+    if end == "q":
+        os.write(run.person, b"q")
+    else:
+        run.process.send_signal(end)
+    assert run.end() == {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 128 + signal.SIGTERM, "q": 0}[end]
+    if end != signal.SIGKILL:
+        assert "The same command runs the missing episodes." in " ".join(run.text().split())
+        assert outcomes(tmp_path) == expected(keys[:3])
+    prompt = run.prompted(4)
+
+    run = Judged(tmp_path, **recorded)
+    assert run.prompted(4) == prompt
+    assert "Episode 3 of" not in run.text()
+    run.judge(keys[3:], first=4)
+    assert run.end() == 0, run.text()
+    assert outcomes(tmp_path) == expected(keys)
+    assert all(check_dataset(tmp_path / "data" / label).is_valid for label in LABELS)
+
+
+def test_without_a_terminal_nobody_is_waited_for_and_that_is_said(tmp_path):
+    run = Fork(main, options(tmp_path, task__duration_s=0.2, n_episodes=1), output=tmp_path / "log")
+    assert run.wait() == 0
+    text = (tmp_path / "log").read_text()
+    assert "Standard input is not a terminal" in text
+    assert "--record.repo_id=me/eval" in text
+    assert outcomes(tmp_path) == {label: ["timeout"] for label in LABELS}
+
+
+def test_an_emergency_stop_while_a_scene_is_set_up_ends_the_run(tmp_path):
+    run = Judged(tmp_path)
+    run.judge("s")
+    run.prompted(2)
+    os.write(run.person, b" ")
+    assert run.end() == 3
+    assert "Emergency stop (key)" in " ".join(run.text().split())
+    assert sum(map(len, outcomes(tmp_path).values())) == 1
+
+
+def test_a_fault_of_the_robot_ends_the_run_and_what_was_judged_is_kept(tmp_path):
+    run = Judged(tmp_path, robot__fault="disconnect", robot__fault_at=40)
+    run.begin(1)
+    assert run.end() == 4
+    assert "the bus does not answer" in " ".join(run.text().split())
+    assert json.loads((tmp_path / "e" / "results.json").read_text())["partial"] is True
+
+
+def test_a_sequential_test_ends_a_real_run(tmp_path):
+    """The key after each prompt is for one brain, whichever runs: it wins all of 8 pairs."""
+    run = Judged(tmp_path, n_episodes=30, sequential="true")
+    keys = "".join("s" if label == "zeppelin" else "f" for i in range(8) for label in random_order(LABELS, i, 5))
+    run.judge(keys)
+    assert run.end() == 0, run.text()
+    assert "The sequential test ended the run after 8 of 30 pairs of episodes" in " ".join(run.text().split())
+    written = json.loads((tmp_path / "e" / "results.json").read_text())
+    assert written["partial"] is False
+    assert written["paired"]["zeppelin"]["e_value"] == pytest.approx(2**8 / 9)
