@@ -14,10 +14,13 @@ from bhd_lerobot.bodies.body import Shape as Shape
 from bhd_lerobot.bodies.differential_base import differential_base as differential_base
 from bhd_lerobot.bodies.tabletop import TableObject as TableObject
 from bhd_lerobot.bodies.tabletop import TableScene as TableScene
+from bhd_lerobot.bodies.truth import ArmTruth as ArmTruth
+from bhd_lerobot.bodies.truth import BaseTruth as BaseTruth
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger as turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5
 from bhd_lerobot.control.commands import BrainCommand as BrainCommand
 from bhd_lerobot.control.commands import Chunk as Chunk
+from bhd_lerobot.control.commands import CommandResult as CommandResult
 from bhd_lerobot.control.commands import Goals as Goals
 from bhd_lerobot.control.commands import Pose as Pose
 from bhd_lerobot.control.messages import Mode as Mode
@@ -35,6 +38,7 @@ from bhd_lerobot.envs.register import register_environment as register_environme
 from bhd_lerobot.envs.vector import BhdVectorEnv as BhdVectorEnv
 from bhd_lerobot.errors import BhdError as BhdError
 from bhd_lerobot.evaluation.config import EvalConfig as EvalConfig
+from bhd_lerobot.policies.brain import Brain as Brain
 from bhd_lerobot.policies.brain import BrainConfig as BrainConfig
 from bhd_lerobot.policies.brain import ConfiguredBrain as ConfiguredBrain
 from bhd_lerobot.policies.brain import Observation as Observation
@@ -56,6 +60,7 @@ from bhd_lerobot.tasks.task import ArmTask as ArmTask
 from bhd_lerobot.tasks.task import BaseTask as BaseTask
 from bhd_lerobot.tasks.task import Event as Event
 from bhd_lerobot.tasks.task import Outcome as Outcome
+from bhd_lerobot.tasks.task import Task as Task
 from bhd_lerobot.tasks.task import TaskConfig as TaskConfig
 from bhd_lerobot.training.config import BhdTrainConfig as BhdTrainConfig
 

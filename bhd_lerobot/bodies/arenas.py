@@ -35,7 +35,7 @@ class Arena:
         start: x [m], y [m], yaw [rad] of the robot, world frame.
         goal: likewise, where a task sends the robot.
         robot_radius: of the robot that is to get through [m].
-        report_seed: of the noise on what the task reports, where there is any.
+        report_seed: of the noise on what the task senses, where there is any.
     """
 
     name: str

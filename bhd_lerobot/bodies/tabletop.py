@@ -179,7 +179,7 @@ class TableScene:
             None. It is drawn, and touches nothing.
         instruction: what a person would ask for.
         variation: how this world differs from the nominal one.
-        report_seed: of the noise on what the task reports, where there is any.
+        report_seed: of the noise on what the task senses, where there is any.
     """
 
     name: str

@@ -80,7 +80,7 @@ class Cerebellum:
         self.fifo = CommandFifo(n, width) if fifo is None else fifo
         self.estop = EstopWord(n) if estop is None else estop
         self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
-        self.guard = Guard(WireLimits.of(body, control_hz), n)
+        self.guard = Guard(WireLimits.of(body, control_hz, plant.takes), n)
         self.guard.restart(np.arange(n), controller.actuators)
         self.refusals = np.zeros((len(Reason), n), np.int64)
         self.reading = PlantReading(n, self.controller.joints, sensors)

@@ -21,7 +21,8 @@ _TOLERANCE = 1.02
 class WireLimits:
     """What may be written to the actuators of a body; each array has shape (actuators,).
 
-    Wheels take speeds [rad/s]. An arm's joints take positions [rad] or torques [N m], its gripper an opening [m].
+    Wheels take speeds [rad/s], a base of its own controller a twist [m/s, rad/s]. An arm's joints take positions [rad]
+    or torques [N m], its gripper an opening [m].
 
     Attributes:
         lower: smallest value.
@@ -40,27 +41,37 @@ class WireLimits:
     start: Array
 
     @classmethod
-    def of(cls, body: Body, control_hz: int) -> Self:
+    def of(cls, body: Body, control_hz: int, takes: str = "actuators") -> Self:
         """Return the limits of a body, from its own numbers.
 
-        Wheels may change their speed as fast as the hardest stop does. Positions may change by the largest speed, and
-        by what the lead for the servos' damping adds when the reference accelerates; torques by what spares the gears.
-        The changes of positions may differ by what the largest acceleration makes of the reference, and of its lead
-        when it turns into the opposite one.
+        Wheels may change their speed as fast as the hardest stop does, and so may a twist; forward speed also as fast
+        as a turn takes it away, whose wheels have no more. Positions may change by the largest speed, and by what the
+        lead for the servos' damping adds when the reference accelerates; torques by what spares the gears. The changes
+        of positions may differ by what the largest acceleration makes of the reference, and of its lead when it turns
+        into the opposite one.
 
         Args:
             body: the robot.
             control_hz: ticks a second [Hz].
+            takes: see `Plant.takes`.
 
         Raises:
-            ConfigError: neither a base nor an arm.
+            ConfigError: neither a base nor an arm, or an arm that is to take twists.
         """
         if isinstance(body, MobileBase):
             drive, limits = body.drive, body.limits
             stop = np.maximum(limits.acceleration, limits.stop_deceleration)
-            change = (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / control_hz
-            largest = np.full(2, drive.max_wheel_speed * (1 + 1e-9))
-            return cls(-largest, largest, np.full(2, change * _TOLERANCE), np.full(2, np.inf), np.zeros(2))
+            sideways = stop[1] * drive.wheel_separation / 2  # [m/s^2] of a wheel that turns the base
+            if takes == "twist":
+                most = np.minimum(limits.velocity, (drive.max_wheel_speed * drive.wheel_radius, np.inf))
+                change = np.array((max(stop[0], sideways), stop[1])) / control_hz
+            else:
+                most = np.full(2, drive.max_wheel_speed)
+                change = np.full(2, (stop[0] + sideways) / drive.wheel_radius / control_hz)
+            largest = most * (1 + 1e-9)
+            return cls(-largest, largest, change * _TOLERANCE, np.full(2, np.inf), np.zeros(2))
+        if takes == "twist":
+            raise ConfigError(f"The plant takes twists (Plant.takes), and the body {body.name!r} is no base.")
         if not isinstance(body, Arm):
             raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; no limits are known for its actuators.")
         reference = body.limits

@@ -64,9 +64,11 @@ class Plant(Protocol):
 
     Attributes:
         n: number of robots.
+        takes: what `write` gets: ``"actuators"``, or of a base ``"twist"``.
     """
 
     n: int
+    takes: str = "actuators"
 
     def open(self) -> None:
         """Connect to the robot. Raises whatever reports why that is impossible."""
@@ -82,7 +84,11 @@ class Plant(Protocol):
 
     @abstractmethod
     def write(self, ctrl: NDArray[np.float64]) -> None:
-        """Take actuator commands, shape (n, joints): wheel speeds [rad/s], or joint positions and the opening.
+        """Take commands.
+
+        Args:
+            ctrl: joint positions [rad], or torques [N m], and the opening [m]; of a base wheel speeds [rad/s], or where
+                `takes` is ``"twist"`` the forward speed [m/s] and the yaw rate [rad/s]; shape (n, joints).
 
         The first follows an `enable` and is where the robot was read to be; wheels stand. A robot that gets none for
         too long has to stop by itself.

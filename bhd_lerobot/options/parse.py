@@ -156,6 +156,9 @@ def read_file(path: Path) -> dict[str, Any]:
 
 def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:
     fields = {name: (kind, default) for name, kind, default in options_of(config_class)}
+    for old, new in getattr(config_class, "renamed", {}).items():
+        if old in values and new not in values:
+            values[new] = values.pop(old)
     for key, value in values.items():
         if key not in fields:
             valid = [f"{prefix}{name}" for name in fields] + ([] if prefix else [CONFIG_PATH])

@@ -7,7 +7,7 @@ __all__ = [
     "grid",
     "loop",
     "mailbox",
-    "plan_link",
+    "planning_link",
     "plant_link",
     "privileges",
     "recorder_process",

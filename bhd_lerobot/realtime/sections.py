@@ -8,7 +8,7 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.mailbox import Mailbox
-from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
 
 _REQUESTS, _EVENTS = 16, 64
@@ -26,13 +26,13 @@ def section_sizes(cerebellum: Cerebellum) -> dict[str, int]:
         "events": Mailbox.nbytes(EVENT_DTYPE, _EVENTS),
     }
     if isinstance(cerebellum.controller, ArmController):
-        sizes["plan"] = PlanLink.nbytes(_dof(cerebellum), cerebellum.control_hz)
+        sizes["plan"] = PlanningLink.nbytes(_dof(cerebellum), cerebellum.control_hz)
     return sizes
 
 
-def plan_link(block: LiveBlock, dof: int, control_hz: int) -> PlanLink | None:
+def planning_link(block: LiveBlock, dof: int, control_hz: int) -> PlanningLink | None:
     """Return the planning of an arm whose goals the brain's process plans; None for a robot that takes none."""
-    return PlanLink(block.section("plan"), dof, control_hz) if block.has("plan") else None
+    return PlanningLink(block.section("plan"), dof, control_hz) if block.has("plan") else None
 
 
 def cerebellum_side(block: LiveBlock, cerebellum: Cerebellum) -> Callable[[int], None]:

@@ -24,8 +24,8 @@ _ODOMETRY, _GYRO = ("x.pos", "y.pos", "theta.pos"), ("imu_x.vel", "imu_y.vel", "
 class BaseHost(Host):
     """n bases.
 
-    A plant's further sensors, `PlantReading.sensors`, are the ranges of the scan [m], counter-clockwise from ahead, and
-    with `imu` the three rates of the gyroscope [rad/s].
+    A plant takes wheel speeds, or twists (`Plant.takes`). Its further sensors, `PlantReading.sensors`, are the ranges
+    of the scan [m], counter-clockwise from ahead, and with `imu` the three rates of the gyroscope [rad/s].
 
     Attributes:
         plant: the wheels.
@@ -49,7 +49,9 @@ class BaseHost(Host):
         if config.collision_monitor:
             monitor = CollisionMonitor(body, body.lidar, plant.n, config.control_hz, config.beams)
         gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
-        self._controller = BaseController(body, plant.n, config.control_hz, monitor=monitor, gyro=gyro)
+        self._controller = BaseController(
+            body, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes
+        )
         super().__init__(
             config,
             Cerebellum(

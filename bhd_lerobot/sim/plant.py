@@ -35,6 +35,8 @@ class SimulatedPlant:
         world: the simulations.
     """
 
+    takes = "actuators"
+
     def __init__(self, world: World) -> None:
         self.n = world.n
         body, efforts = world.body, world.efforts

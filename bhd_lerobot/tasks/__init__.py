@@ -9,7 +9,7 @@ __all__ = [
     "operator",
     "pick",
     "reach",
-    "report",
+    "sensing",
     "task",
     "variation",
 ]

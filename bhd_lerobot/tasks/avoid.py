@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
-from bhd_lerobot.tasks.report import ReportConfig, Reports
+from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
@@ -40,7 +40,7 @@ class AvoidConfig(TaskConfig):
         stuck_time_s: see `stuck_path_m` [s].
         trail: report which ground around the robot it has visited: `TRAIL`, the task's memory for brains that have none
             of their own.
-        report: what is wrong with the robot's pose that the trail is drawn around.
+        sensing: what is wrong with the robot's pose that the trail is drawn around.
     """
 
     arena: str = "random"
@@ -51,17 +51,17 @@ class AvoidConfig(TaskConfig):
     stuck_path_m: float = 0.1
     stuck_time_s: float = 10.0
     trail: bool = False
-    report: ReportConfig = field(default_factory=ReportConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
             raise ConfigError(unknown_name("arena", self.arena, ARENAS))
         check_positive("task", self, ("duration_s", "cell_m", "stuck_time_s"))
         check_positive("task", self, ("min_path_m", "stuck_path_m"), or_zero=True)
-        if not (self.trail or self.report.is_exact):
+        if not (self.trail or self.sensing.is_exact):
             raise ConfigError(
-                "task.report says what is wrong with the pose that the trail is drawn around, and task.trail is false: "
-                "nothing is told. Set --task.trail=true, or leave task.report out."
+                "task.sensing states what is wrong with the pose that the trail is drawn around, and task.trail is "
+                "false: there is no trail. Set --task.trail=true, or leave task.sensing out."
             )
 
 
@@ -82,7 +82,7 @@ class AvoidTask(BaseTask):
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
-        self._reports = Reports(config.report, n, fps, slice(2))
+        self._sensing = Sensing(config.sensing, n, fps, slice(2))
         self._window = self.in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
         self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
@@ -94,11 +94,11 @@ class AvoidTask(BaseTask):
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
-        arena, report = self.arena(self.config.arena, seed, self.config.random_start), self.config.report
-        if report.is_exact:
+        arena, sensing = self.arena(self.config.arena, seed, self.config.random_start), self.config.sensing
+        if sensing.is_exact:
             return arena
         rng = np.random.default_rng(np.random.SeedSequence([_REPORT_STREAM, int(seed)]))
-        return replace(arena, report_seed=report.draw_seed(rng))
+        return replace(arena, report_seed=sensing.draw_seed(rng))
 
     def instruction(self, scene: Arena) -> str:
         """Return what a person would ask for."""
@@ -107,11 +107,11 @@ class AvoidTask(BaseTask):
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
         """Return `TRAIL` if the configuration asks for it, shape (n, 128); else nothing, shape (n, 0).
 
-        `config.report` states what is wrong with the pose that it is drawn around; which cells were visited is true.
+        `config.sensing` states what is wrong with the pose that it is drawn around; which cells were visited is true.
         """
         if not self.config.trail:
             return np.zeros((len(truth.touched), 0))
-        pose = self._reports.told(truth.base_pose_in_world[:, None], self.frame)[:, 0]
+        pose = self._sensing.sense(truth.base_pose_in_world[:, None], self.frame)[:, 0]
         x, y, yaw = pose.T[:, :, None]
         cos, sin, (ahead, left) = np.cos(yaw), np.sin(yaw), _TRAIL_XY
         points = np.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left], axis=-1)
@@ -142,7 +142,7 @@ class AvoidTask(BaseTask):
                 grow = ((0, 0), (0, columns * rows - self._free.shape[1]))
                 self._free, self._visited = np.pad(self._free, grow), np.pad(self._visited, grow)
             self._free[sim] = self._visited[sim] = False
-            self._reports.begin(sim, arena.report_seed)
+            self._sensing.begin(sim, arena.report_seed)
             self._free[sim, cells] = True
             self._origin[sim], self._end[sim] = arena.extent[0::2], arena.extent[1::2]
             self._columns[sim] = columns

@@ -12,7 +12,7 @@ from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
-from bhd_lerobot.tasks.report import ReportConfig, Reports
+from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
@@ -42,7 +42,7 @@ class NavigateConfig(TaskConfig):
         hold_s: time that the robot must be there and at rest [s].
         stuck_path_m: a path shorter than this in `stuck_time_s` means stuck [m].
         stuck_time_s: see `stuck_path_m` [s].
-        report: what is wrong with what the task reports of the goal.
+        sensing: what is wrong with what the task senses of the goal.
     """
 
     arena: str = "random"
@@ -57,7 +57,7 @@ class NavigateConfig(TaskConfig):
     hold_s: float = 0.5
     stuck_path_m: float = 0.1
     stuck_time_s: float = 10.0
-    report: ReportConfig = field(default_factory=ReportConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
@@ -113,7 +113,7 @@ class NavigateTask(BaseTask):
         self._left: NDArray[np.float64] = np.ones(n)
         self._path, self._sum = PathLengths(n, self._window), np.zeros(n)
         self._within = np.zeros(n, np.int64)
-        self._reports = Reports(config.report, n, fps, slice(2))
+        self._sensing = Sensing(config.sensing, n, fps, slice(2))
         if config.arena != "random":  # better now than in the middle of a run
             self.sample(0)
 
@@ -138,7 +138,7 @@ class NavigateTask(BaseTask):
             if len(places):
                 x, y = places[rng.integers(len(places))]
                 goal = float(x), float(y), float(rng.uniform(-math.pi, math.pi))
-                scene = replace(arena, goal=goal, report_seed=config.report.draw_seed(rng))
+                scene = replace(arena, goal=goal, report_seed=config.sensing.draw_seed(rng))
                 vars(scene)["reachable"] = arena.reachable  # it does not depend on the goal, and takes a while
                 return scene
         raise ConfigError(
@@ -171,7 +171,7 @@ class NavigateTask(BaseTask):
                     f"{_place(goal)}; choose a goal that the robot can get to."
                 )
             self._keep(int(sim), ways)
-            self._reports.begin(int(sim), arena.report_seed)
+            self._sensing.begin(int(sim), arena.report_seed)
             self._goal[sim], self._pose[sim] = goal, arena.start
         self._path.begin(ids)
         self._sum[ids] = 0.0
@@ -182,11 +182,11 @@ class NavigateTask(BaseTask):
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
         """Return the goals in the robots' frames, shape (n, 4).
 
-        x and y [m], and cosine and sine of the angle from the robot's heading to the goal's. `config.report` says what
+        x and y [m], and cosine and sine of the angle from the robot's heading to the goal's. `config.sensing` says what
         is wrong with it.
         """
         goals = goal_in_robot(self._goal, truth.base_pose_in_world)
-        return self._reports.told(goals[:, None], self.frame)[:, 0]
+        return self._sensing.sense(goals[:, None], self.frame)[:, 0]
 
     def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""

@@ -12,7 +12,7 @@ from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIEL
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
-from bhd_lerobot.tasks.report import ReportConfig, Reports
+from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
@@ -71,11 +71,11 @@ class PickConfig(TaskConfig):
         names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
             ``"held_out"``, where it is asked for one of these four.
         objects: ``"known"``; or ``"unseen"``: smaller and larger than those, of another style and of other shades.
-        order: of the objects in what the task reports: ``"target"``: the target first, then the nearest to it; or
+        order: of the objects in what the task senses: ``"target"``: the target first, then the nearest to it; or
             ``"random"``, where only the column `target` tells which it is.
         swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
-        report: what is wrong with what the task reports of the objects.
+        sensing: what is wrong with what the task senses of the objects.
     """
 
     duration_s: float = 20.0
@@ -90,7 +90,7 @@ class PickConfig(TaskConfig):
     order: str = "target"
     swap: bool = False
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
         check_positive("task", self, ("duration_s", "lift_m", "hold_s"))
@@ -142,7 +142,7 @@ class PickTask(ArmTask):
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
         self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
         self._camera_error = np.zeros((n, 1, 3))
-        self._reports = Reports(config.report, n, fps, slice(3, 6), absent=_NOTHING)
+        self._sensing = Sensing(config.sensing, n, fps, slice(3, 6), absent=_NOTHING)
         self._best, self._height = np.zeros(n), np.zeros(n)
         self._held = np.zeros(n, np.int64)
 
@@ -167,7 +167,7 @@ class PickTask(ArmTask):
         if language == "zh":
             name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
         variation = draw_variation(config.randomisation, rng)
-        report_seed = config.report.draw_seed(rng)
+        report_seed = config.sensing.draw_seed(rng)
         places = [int(place) for place in rng.permutation(count)] if config.order == "random" else range(count)
         return TableScene(
             name="pick",
@@ -189,7 +189,7 @@ class PickTask(ArmTask):
             if scene.target_object is None:
                 raise ConfigError(f"The scene {scene.name!r} names no object to pick up.")
             self._target[sim] = scene.target_object
-            self._reports.begin(sim, scene.report_seed)
+            self._sensing.begin(sim, scene.report_seed)
             self._camera_error[sim] = scene.variation.camera_error
             self._present[sim] = np.arange(MAX_OBJECTS) < len(scene.objects)
             self._fixed[sim], self._start[sim] = 0.0, 0.0
@@ -209,12 +209,12 @@ class PickTask(ArmTask):
         Unless `config.order` is `random`, the first is the target; the others follow, at the start the nearest to it
         first. Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
-        places without one. `config.report` states what is wrong with it.
+        places without one. `config.sensing` states what is wrong with it.
         """
         state = self._fixed.copy()
         state[self._present, 3:10] = truth.object_poses[self._present]
         state[:, :, 3:6] += self._camera_error * self._present[:, :, None]
-        return self._reports.told(state, self.frame).reshape(len(state), -1)
+        return self._sensing.sense(state, self.frame).reshape(len(state), -1)
 
     # --- judging -----------------------------------------------------------------------------------------------------
 

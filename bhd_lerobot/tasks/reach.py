@@ -16,7 +16,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.tasks.report import ReportConfig, Reports
+from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
@@ -42,7 +42,7 @@ class ReachConfig(TaskConfig):
         hold_s: time that the tool must stay there [s].
         start_spread_rad: every joint starts at home plus or minus up to this [rad].
         randomisation: how much one episode's world differs from the next.
-        report: what is wrong with what the task reports of the target.
+        sensing: what is wrong with what the task senses of the target.
     """
 
     duration_s: float = 10.0
@@ -51,7 +51,7 @@ class ReachConfig(TaskConfig):
     hold_s: float = 0.25
     start_spread_rad: float = 0.3
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
         check_positive("task", self, ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"))
@@ -77,7 +77,7 @@ class ReachTask(ArmTask):
         self._hold = self.in_frames(config.hold_s)
         self._target = np.zeros((n, 7))
         self._camera_error = np.zeros((n, 3))
-        self._reports = Reports(config.report, n, fps, slice(3))
+        self._sensing = Sensing(config.sensing, n, fps, slice(3))
         self._first, self._last = np.ones(n), np.ones(n)
         self._angle = np.zeros(n)
         self._within = np.zeros(n, np.int64)
@@ -94,7 +94,7 @@ class ReachTask(ArmTask):
             target_pose=_draw_target(rng, kinematics),
             instruction=self.instruction(None),
             variation=draw_variation(self.config.randomisation, rng),
-            report_seed=self.config.report.draw_seed(rng),
+            report_seed=self.config.sensing.draw_seed(rng),
         )
 
     def instruction(self, scene: TableScene | None) -> str:
@@ -108,18 +108,18 @@ class ReachTask(ArmTask):
                 raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
             self._target[sim] = scene.target_pose
             self._camera_error[sim] = scene.variation.camera_error
-            self._reports.begin(sim, scene.report_seed)
+            self._sensing.begin(sim, scene.report_seed)
         self._within[ids] = self.frame[ids] = 0
         self._started[ids] = False
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7).
 
-        `config.report` states what is wrong with it.
+        `config.sensing` states what is wrong with it.
         """
         reported = self._target.copy()
         reported[:, :3] += self._camera_error
-        return self._reports.told(reported[:, None], self.frame)[:, 0]
+        return self._sensing.sense(reported[:, None], self.frame)[:, 0]
 
     def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""

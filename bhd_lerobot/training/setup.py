@@ -16,6 +16,7 @@ from lerobot.configs.types import FeatureType
 from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 
+from bhd_lerobot.datasets.format.identity import with_present_names
 from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
@@ -29,7 +30,7 @@ from bhd_lerobot.stock import (
     make_pre_post_processors,
     set_seed,
 )
-from bhd_lerobot.tasks.report import ReportConfig
+from bhd_lerobot.tasks.sensing import SensingConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 
 # Of `torch.cpu.get_capabilities`: what a processor computes bfloat16 with, x86 and Arm.
@@ -144,11 +145,11 @@ _DIFFERS = "several values, in recordings that were merged"
 
 
 def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset whose task told something else than the truth, for a policy that learns to say what is true."""
-    task: Any = PolicyContract.from_dataset(meta).task or {}
+    """Refuse a dataset whose task sensed something else than the truth, for a policy that learns what is true."""
+    task: Any = with_present_names({"task": PolicyContract.from_dataset(meta).task or {}})["task"]
     given = {}
-    if "report" in task:  # there was none in earlier versions
-        given = {f"report.{one.name}": task["report"].get(one.name, _DIFFERS) for one in fields(ReportConfig)}
+    if "sensing" in task:  # there was none in earlier versions
+        given = {f"sensing.{one.name}": task["sensing"].get(one.name, _DIFFERS) for one in fields(SensingConfig)}
     randomisation = task.get("randomisation") or {}
     if randomisation.get("enabled", True):
         given["randomisation.camera_error_m"] = randomisation.get("camera_error_m", 0.0)

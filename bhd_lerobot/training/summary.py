@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.datasets.format.identity import with_present_names
 from bhd_lerobot.errors import counted, quoted
 from bhd_lerobot.options.plugins import module_to_name
 from bhd_lerobot.policies.learned.contract import PolicyContract
@@ -98,7 +99,8 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = robot_configs()
-    task, found, module = (contract.task or {}).get("type"), contract.task or {}, ""
+    found: Any = with_present_names({"task": contract.task or {}})["task"]
+    task, module = found.get("type"), ""
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:

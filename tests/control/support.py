@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
@@ -22,8 +23,9 @@ BODY = turtlebot3_burger()
 class PerfectPlant(Plant):
     """Wheels that turn as commanded, and that a test can break."""
 
-    def __init__(self, n: int = 1) -> None:
-        self.n = n
+    def __init__(self, n: int = 1, takes: str = "actuators") -> None:
+        self.n, self.takes = n, takes
+        self._drive = DiffDrive(BODY.drive, n)
         self.position = np.zeros((n, 2))
         self.velocity = np.zeros((n, 2))
         self.fault = np.zeros(n, np.bool_)
@@ -40,14 +42,18 @@ class PerfectPlant(Plant):
     def write(self, ctrl: NDArray[np.float64]) -> None:
         assert np.isfinite(ctrl).all()
         self.written[:] = ctrl
-        self.velocity[:] = ctrl
-        self.position += ctrl / HZ
+        if self.takes == "twist":
+            self._drive.wheels_from_twist(ctrl, self.velocity)
+        else:
+            self.velocity[:] = ctrl
+        self.position += self.velocity / HZ
 
 
 class Rig:
-    def __init__(self, n: int = 1, active: bool = True, **options: object) -> None:
-        self.plant = PerfectPlant(n)
-        self.cerebellum = Cerebellum(BODY, self.plant, HZ, BaseController(BODY, n, HZ), **options)  # type: ignore[arg-type]
+    def __init__(self, n: int = 1, active: bool = True, takes: str = "actuators", **options: object) -> None:
+        self.plant = PerfectPlant(n, takes)
+        controller = BaseController(BODY, n, HZ, takes=takes)
+        self.cerebellum = Cerebellum(BODY, self.plant, HZ, controller, **options)  # type: ignore[arg-type]
         self.n = n
         self.now = 0
         self.sequence = 0

@@ -15,9 +15,11 @@ from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Setpoint, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
-from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from tests.control import arm_rig, support
 from tests.control.arm.test_impedance import ARM as TORQUE_ARM
 from tests.control.arm.test_impedance import StuckRig
@@ -25,6 +27,7 @@ from tests.control.arm.test_impedance import StuckRig
 Array = NDArray[np.float64]
 
 WHEEL = support.BODY.drive
+TWIST, TWIST_CHANGE = np.array([0.22, 2.84]), np.array([2.5, 20.0]) / support.HZ
 WHEEL_CHANGE = (2.5 + 20.0 * WHEEL.wheel_separation / 2) / WHEEL.wheel_radius / support.HZ
 ARM = arm_rig.ARM
 SERVO_CHANGE = (np.array(ARM.limits.velocity) + 2 * arm_rig.LEAD * arm_rig.STOP) / arm_rig.HZ
@@ -61,6 +64,12 @@ def base_rig(n: int = 1) -> support.Rig:
     return rig
 
 
+def twist_rig(n: int = 1) -> support.Rig:
+    rig = support.Rig(n, takes="twist")
+    rig.plant = rig.cerebellum.plant = Wire(rig.plant, -TWIST, TWIST, TWIST_CHANGE)  # type: ignore[assignment]
+    return rig
+
+
 def arm(n: int = 1, planning: Any = None) -> arm_rig.Rig:
     rig = arm_rig.Rig(n, planning=planning)
     lower, upper = ARM.limits.lower, ARM.limits.upper
@@ -77,10 +86,10 @@ def torque_arm() -> StuckRig:
     return rig
 
 
-def planned_arm() -> tuple[arm_rig.Rig, PlanLink, PlanServer]:
+def planned_arm() -> tuple[arm_rig.Rig, PlanningLink, PlanServer]:
     """Return an arm in the middle of a motion that another process planned."""
-    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
-    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    block = bytearray(PlanningLink.nbytes(6, arm_rig.HZ))
+    link, server = PlanningLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
     rig = arm(planning=link)
     assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
     for _ in range(220):
@@ -128,10 +137,10 @@ def test_rows_in_shared_memory_that_were_overwritten_stop_the_arm_and_move_nothi
 @pytest.mark.parametrize("how", BREAK)
 @pytest.mark.parametrize("what", ["command", "actuators"])
 def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str, what: str) -> None:
-    rigs: dict[str, Any] = {"base": base_rig(2), "arm": arm(2), "torques": torque_arm()}
+    rigs: dict[str, Any] = {"base": base_rig(2), "twist": twist_rig(2), "arm": arm(2), "torques": torque_arm()}
     for name, rig in rigs.items():
         for step in range(10 if name == "torques" else 30):
-            if name == "base":
+            if name in ("base", "twist"):
                 rig.send(0.2, 0.5)
                 rig.tick(4)
             elif name == "arm":
@@ -201,7 +210,7 @@ def test_what_was_missed_is_not_caught_up_at_the_wire() -> None:
     assert rig.results() == [("1", ResultCode.SUCCEEDED)]
 
 
-@pytest.mark.parametrize("make", [base_rig, arm])
+@pytest.mark.parametrize("make", [base_rig, twist_rig, arm])
 @pytest.mark.parametrize("sign", [1, -1], ids=["old", "from the future"])
 def test_a_reading_older_than_three_periods_or_a_period_ahead_is_a_fault(make: Callable[[], Any], sign: int) -> None:
     rig = make()
@@ -236,9 +245,10 @@ def test_a_reading_older_than_three_periods_or_a_period_ahead_is_a_fault(make: C
         assert rig.mode == Mode.HOLD
 
 
+@pytest.mark.parametrize("make", [base_rig, twist_rig])
 @pytest.mark.parametrize("what", ["frozen", "one wheel", "the other way"])
-def test_wheels_that_do_not_turn_as_commanded_are_a_fault(what: str) -> None:
-    rig = base_rig(2)
+def test_wheels_that_do_not_turn_as_commanded_are_a_fault(what: str, make: Callable[[int], support.Rig]) -> None:
+    rig = make(2)
     read, fault_at = rig.plant.read, None
     frozen = np.zeros(2)
 
@@ -264,6 +274,33 @@ def test_wheels_that_do_not_turn_as_commanded_are_a_fault(what: str) -> None:
     assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.BLOCKED
     assert (rig.plant.position[0, 0] - driven) * 0.033 < 0.012  # what the hardest stop needs
     assert rig.cerebellum.mode[1] == Mode.TRACKING  # the other robot noticed nothing
+
+
+def test_a_plant_that_takes_twists_moves_as_one_that_takes_wheel_speeds() -> None:
+    rng = np.random.default_rng(4)
+    wheels, twists = base_rig(), twist_rig()
+    for frame in range(200):
+        command = (2.0 * rng.uniform(-TWIST, TWIST)).tolist()
+        for rig in (wheels, twists):
+            if frame % 60 == 59:
+                rig.cerebellum.estop.press()
+            if frame % 60 == 0 and frame:
+                rig.tick(support.HZ)
+                rig.request(Request.RESET)
+                rig.request(Request.ACTIVATE)
+            rig.send(*command)
+        for _ in range(int(rng.integers(1, 30))):
+            wheels.tick()
+            twists.tick()
+            np.testing.assert_array_equal(twists.plant.written, twists.cerebellum.command)
+            np.testing.assert_allclose(twists.plant.velocity, wheels.plant.velocity, atol=1e-12)
+    np.testing.assert_allclose(twists.plant.position, wheels.plant.position, atol=1e-9)
+    assert np.abs(wheels.plant.position).max() > 1.0
+
+
+def test_an_arm_takes_no_twists() -> None:
+    with pytest.raises(ConfigError, match=r"takes twists \(Plant.takes\), and the body 'ur5' is no base"):
+        WireLimits.of(ARM, arm_rig.HZ, "twist")
 
 
 @pytest.mark.parametrize(("turns", "is_fault"), [(1.0, False), (0.8, False), (0.0, True), (-1.0, True), (2.5, True)])

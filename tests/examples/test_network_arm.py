@@ -42,6 +42,7 @@ def make(address=sys.argv[1]):
 print(json.dumps({"findings": check_robot(make)}), flush=True)
 robot = make()
 robot.connect()
+print(json.dumps({"heavy": robot.host.link.about["heavy"]}), flush=True)
 for line in sys.stdin:  # drives for as long as it is asked to
     start = robot.get_observation()
     action = {name: start[name] for name in robot.action_features}
@@ -213,6 +214,7 @@ def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm)
     assert process.stdout is not None
     lines, answers = process.stdin, process.stdout
     assert json.loads(answers.readline()) == {"findings": []}
+    assert json.loads(answers.readline()) == {"heavy": []}
 
     def drive(word: str = "") -> dict[str, Any]:
         lines.write(f"{word}\n")

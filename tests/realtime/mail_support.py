@@ -10,7 +10,7 @@ from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.motion.planner import Plan
 from bhd_lerobot.control.motion.trajectory import PlanFailure, Trajectory
 from bhd_lerobot.realtime.mailbox import Mailbox
-from bhd_lerobot.realtime.plan_link import PlanServer
+from bhd_lerobot.realtime.planning_link import PlanServer
 from tests.control.support import shared_block
 
 RECORD = np.dtype([("number", np.int64), ("flag", np.bool_), ("copies", np.int64, (100,))])  # 809 bytes: not aligned

@@ -21,7 +21,8 @@ _LEAST_TURN = 0.3  # [rad/s] by which wheels and gyroscope may differ: several t
 class BaseController(Controller):
     """Twist commands to wheel speeds, for bases with two driven wheels.
 
-    A command is the forward speed [m/s] and the yaw rate [rad/s]; an actuator command is a wheel speed [rad/s].
+    A command is the forward speed [m/s] and the yaw rate [rad/s]; an actuator command is a wheel speed [rad/s], or the
+    twist itself for a base whose own controller turns it into those.
 
     Args:
         body: limits and wheels.
@@ -29,6 +30,7 @@ class BaseController(Controller):
         control_hz: ticks a second [Hz].
         monitor: what keeps them from driving into what their scans show, the first values of the reading's sensors.
         gyro: which of the reading's sensors is the yaw rate of a gyroscope [rad/s]; None if there is none.
+        takes: what the plant takes, see `Plant.takes`.
 
     Raises:
         ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
@@ -44,13 +46,16 @@ class BaseController(Controller):
         *,
         monitor: CollisionMonitor | None = None,
         gyro: int | None = None,
+        takes: str = "actuators",
     ) -> None:
         limits, drive = body.limits, body.drive
         self._monitor, self._gyro = monitor, gyro
         self.width = width = len(limits.names)
         self.drive = DiffDrive(drive, n)
         self.command = np.zeros((n, width))
-        self.actuators = np.zeros((n, self.joints))
+        self._wheel_speeds = np.zeros((n, self.joints))
+        self._takes_twist = takes == "twist"
+        self.actuators = self.command if self._takes_twist else self._wheel_speeds
         self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         self.contact_wrench = np.zeros((n, 0))
         self._servo_gain, self._torque = drive.servo_gain, drive.max_torque
@@ -110,7 +115,8 @@ class BaseController(Controller):
 
     def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
         """Make the twist again what the wheels have."""
-        np.copyto(self.command, self.drive.twist_from_wheels(actuators), where=mask[:, None])
+        twist = actuators if self._takes_twist else self.drive.twist_from_wheels(actuators)
+        np.copyto(self.command, twist, where=mask[:, None])
         np.copyto(self._rate, 0.0, where=mask[:, None])
 
     def run(self, reading: PlantReading) -> None:
@@ -122,13 +128,13 @@ class BaseController(Controller):
         if not self._settled:
             self._filter()
         # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
-        error = np.subtract(self.actuators, reading.velocity, out=self._error)
+        error = np.subtract(self._wheel_speeds, reading.velocity, out=self._error)
         np.abs(error, out=error)
         if np.count_nonzero(np.greater(error, self._largest_error, out=self._beyond)):
             self._limited_effort |= self._beyond.any(axis=1)
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
-        self._asked += self.actuators
+        self._asked += self._wheel_speeds
         if self._gyro is not None:
             self._turned += reading.sensors[:, self._gyro]
         self._ticks += 1
@@ -210,7 +216,7 @@ class BaseController(Controller):
             limited = True
             self._rate[near] = 0.0  # the next change starts anew: such a large one could not end in time
         self._settled = not limited and np.count_nonzero(arrived) == arrived.size
-        self.drive.wheels_from_twist(self.command, self.actuators)
+        self.drive.wheels_from_twist(self.command, self._wheel_speeds)
 
     def _clip(self) -> None:
         """From the targets to targets within the limits; they stand until there are others."""
@@ -237,7 +243,7 @@ class BaseController(Controller):
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self.actuators, self._rate):
+        for array in (self.command, self._target, self._wheel_speeds, self._rate):
             array[ids] = 0.0
         self._hard[ids] = False
         if self._monitor is not None:
@@ -262,7 +268,7 @@ class BaseController(Controller):
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return the torques of the servos [N m], shape (n, joints)."""
-        torque = (self.actuators - reading.velocity) * self._servo_gain
+        torque = (self._wheel_speeds - reading.velocity) * self._servo_gain
         return np.minimum(np.maximum(torque, -self._torque), self._torque)
 
     def odometry(self) -> NDArray[np.float64]:

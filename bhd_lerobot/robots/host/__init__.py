@@ -1,8 +1,8 @@
 """n robots of one kind under one cerebellum, in this process or in others."""
 
 __all__ = [
+    "checked_plant",
     "config",
-    "hardware",
     "host",
     "link",
     "plant_loop",

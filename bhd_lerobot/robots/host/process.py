@@ -4,8 +4,9 @@ The plant is a simulated world or, with `robot.plant`, another package's class, 
 world in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
 
 Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.host.process``, never forked and not by
-`multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot. While
-its loop stands it takes messages from a pipe; while the loop runs it reads shared memory only.
+`multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot, and
+MuJoCo only for a simulated robot. While its loop stands it takes messages from a pipe; while the loop runs it reads
+shared memory only.
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -34,12 +35,13 @@ from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.plant_link import PlantLink
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
-from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
-from bhd_lerobot.robots.host.hardware import Hardware
+from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
+from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
-from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
-from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import StatePublisher
+
+if TYPE_CHECKING:  # it imports MuJoCo, which the process of a real robot does without
+    from bhd_lerobot.robots.host.simulation import Simulation
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02
@@ -74,20 +76,20 @@ class LiveSpec:
         """A reading of a plant that is older than this is none of the present [ns]; at least three ticks."""
         return max(3 * NANOSECONDS // self.rates.control_hz, round(self.limits.plant_timeout_s * NANOSECONDS))
 
-    def make_simulation(self, planning: Planning | None = None) -> Simulation:
+    def make_simulation(self, planning: Planning | None = None) -> "Simulation":
         """Return a simulation of one robot."""
         kind = _load(self.host)
         made: Simulation = kind(self._config, 1, 1) if planning is None else kind(self._config, 1, 1, planning)
         return made
 
-    def make_hardware(self) -> Hardware:
+    def make_plant(self) -> CheckedPlant:
         """Return the plant; it is not opened yet."""
-        return Hardware.made(self.plant, self._config, self.body, self.oldest_ns)
+        return CheckedPlant.made(self.plant, self._config, self.body, self.oldest_ns)
 
-    def make_host(self, hardware: Hardware, planning: Planning | None = None) -> Host:
+    def make_host(self, plant: CheckedPlant, planning: Planning | None = None) -> Host:
         """Return the host of a plant; the arguments as for `make_simulation`."""
         kind = _load(self.host)
-        made: Host = kind(self._config, hardware) if planning is None else kind(self._config, hardware, planning)
+        made: Host = kind(self._config, plant) if planning is None else kind(self._config, plant, planning)
         return made
 
 
@@ -104,15 +106,17 @@ class LiveProcess:
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
         dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
-        planning = plan_link(self._block, dof, spec.rates.control_hz)
-        self._hardware = spec.make_hardware() if spec.plant else None
+        planning = planning_link(self._block, dof, spec.rates.control_hz)
+        self._plant = spec.make_plant() if spec.plant else None
         self._host: Host
         link, sensed_ns = PlantLink.of(self._block), time.monotonic_ns
-        if self._hardware is not None:
-            self._hardware.open()
-            self._host = spec.make_host(self._hardware, planning)
+        if self._plant is not None:
+            self._plant.open()
+            self._host = spec.make_host(self._plant, planning)
             sensed_ns = self._stamp_ns
         elif link is not None:
+            from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
+
             self._host = remote = RemoteSimulation(spec.make_simulation(planning), link)
             sensed_ns = remote.sensed_ns
         else:
@@ -139,7 +143,7 @@ class LiveProcess:
             advance=self._advance,
             publish=self._publisher.publish,
             count=self._statistics.add,
-            may_stand=None if self._hardware is None else self._may_stand,
+            may_stand=None if self._plant is None else self._may_stand,
         )
 
     def work(self) -> None:
@@ -170,16 +174,16 @@ class LiveProcess:
 
     def _reset(self, scene: Any, seed: int) -> None:
         self._block.fifo.drop(np.zeros(1, np.intp))
-        if self._hardware is not None:
-            self._hardware.prepare(self._host.cerebellum.reading)
+        if self._plant is not None:
+            self._plant.prepare(self._host.cerebellum.reading)
         self._host.reset(np.zeros(1, np.intp), [scene], [seed])
         gc.collect()  # the loop runs without a collector
 
     def _warm_up(self, scene: Any, seed: int) -> None:
         """Run ticks before the first real one: first executions take longest."""
         self._reset(scene, seed)
-        if self._hardware is not None:
-            self._hardware.is_muted = True
+        if self._plant is not None:
+            self._plant.is_muted = True
         grid = TickGrid(0, self._loop.period_ns)
         for tick in range(self._warm_up_ticks):
             self._host.cerebellum.stamp_origin_ns = time.monotonic_ns() - tick * self._loop.period_ns
@@ -188,8 +192,8 @@ class LiveProcess:
             self._advance(1)
             self._publisher.publish(Slot(tick, 0, 0, 0), 0, 0, grid)
             self._statistics.add(0, 0, 0, 0)
-        if self._hardware is not None:
-            self._hardware.is_muted = False
+        if self._plant is not None:
+            self._plant.is_muted = False
         self._warm = True
 
     def _run(self, start_ns: int) -> tuple[int, int, str]:
@@ -204,10 +208,10 @@ class LiveProcess:
         return grid.executed, grid.skipped, self._problem()
 
     def _problem(self) -> str:
-        hardware, cerebellum = self._hardware, self._host.cerebellum
+        plant, cerebellum = self._plant, self._host.cerebellum
         if cerebellum.mode[0] != Mode.FAULT:
             return ""
-        return cerebellum.readings.problem or (hardware.not_ready(cerebellum.reading) if hardware else "")
+        return cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
 
     def _serve(self, now_ns: int) -> None:
         self._serve_bridge(now_ns)
@@ -240,8 +244,8 @@ class LiveProcess:
     def close(self) -> None:
         """Free everything."""
         self._words[Word.PHASE] = Phase.ENDED
-        if self._hardware is not None:
-            self._hardware.close()
+        if self._plant is not None:
+            self._plant.close()
         self._host.close()
         self._block.close()
 
@@ -267,7 +271,7 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
             process = make(spec, connection)
             try:
                 grants = [grant.as_dict() for grant in privileges.acquire(spec.privileges)]
-                heavy = sorted({"torch", "lerobot"} & set(sys.modules))
+                heavy = sorted({"torch", "lerobot", "mujoco"} & set(sys.modules))
                 connection.send(("ready", {"grants": grants, "pid": os.getpid(), "heavy": heavy}))
                 process.work()
             finally:

@@ -25,7 +25,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
-from bhd_lerobot.robots.host.hardware import Unconnected, plant_class
+from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.link import LiveLink
 from bhd_lerobot.robots.host.robots import Acted, Deliver, Frame, FrameReport, Receipt

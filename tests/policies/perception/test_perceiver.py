@@ -203,7 +203,7 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
     with pytest.raises((ConfigError, DatasetError), match="true poses of objects"):
         train(root, tmp_path / "run")
     for option, value, name in (
-        ("task__report__noise_m", 0.01, "report.noise_m"),
+        ("task__sensing__noise_m", 0.01, "sensing.noise_m"),
         ("task__randomisation__camera_error_m", "[0.03,0,0]", "randomisation.camera_error_m"),
     ):
         told = tmp_path / name
@@ -211,9 +211,20 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
         run_record(told, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, **wrong)
         with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn them"):
             train(told, tmp_path / "run")
-    merge([looks, tmp_path / "report.noise_m"], tmp_path / "merged")
-    with pytest.raises(DatasetError, match=r"recorded with task\.report\.noise_m = several values"):
+    noisy = tmp_path / "sensing.noise_m"
+    merge([looks, noisy], tmp_path / "merged")
+    with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = several values"):
         train(tmp_path / "merged", tmp_path / "run")
+    # Until version 0.3 the option was called `task.report`.
+    path = noisy / "meta" / "bhd.json"
+    identity = json.loads(path.read_text())
+    identity["recording"]["task"]["report"] = identity["recording"]["task"].pop("sensing")
+    path.write_text(json.dumps(identity))
+    with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = 0\.01"):
+        train(noisy, tmp_path / "run")
+    merge([looks, noisy], tmp_path / "merged_old")
+    with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = several values"):
+        train(tmp_path / "merged_old", tmp_path / "run")
 
 
 def test_without_held_out_episodes_the_checkpoint_refuses_to_see(looks: Path, tmp_path: Path) -> None:

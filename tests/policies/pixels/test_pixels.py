@@ -250,7 +250,7 @@ def test_a_checkpoint_that_is_no_perception_is_named(tmp_path: Path) -> None:
 
 def test_an_instruction_is_needed_and_never_cut_off() -> None:
     before, _ = make_pre_post_processors(made(longest_instruction=16))
-    with pytest.raises(ConfigError, match=r"takes 18 bytes; this bhd_pixels reads 16\. Say it shorter"):
+    with pytest.raises(ConfigError, match=r"takes 18 bytes; this bhd_pixels reads 16\. Shorten it"):
         before({"task": ["拿起红色杯"[:3] + "123456789"], OBS_STATE: torch.zeros(1, 14)})
     with pytest.raises(ConfigError, match=r"'\\udcff' is no text that UTF-8 can write"):
         before({"task": ["\udcff"], OBS_STATE: torch.zeros(1, 14)})

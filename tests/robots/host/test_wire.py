@@ -17,7 +17,7 @@ from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.realtime.block import LiveBlock
-from bhd_lerobot.realtime.plan_link import PlanLink
+from bhd_lerobot.realtime.planning_link import PlanningLink
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
 from tests.forks import Fork
@@ -79,7 +79,7 @@ def expect_no_jump(states: States, robot: UR5) -> None:
 def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, States], what: str) -> None:
     robot, states = arm
     turn(robot, f"garbage {what}", 1.0 if what == "a jump" else -1.0)
-    link = PlanLink(states.block.section("plan"), 6, HZ)
+    link = PlanningLink(states.block.section("plan"), 6, HZ)
     rows = link._memory.rows
     rows[...] = np.nan if what == "not a number" else rows + 1.0
     until(lambda: states.has(Mode.FAULT), "it is a fault")

@@ -98,7 +98,7 @@ class MockArmConfig(RobotConfig):
     `log` is a file for the actions that it was sent, `times` one for when it was observed, monotonic [ns].
     """
 
-    port: str = "/dev/null"
+    port: str = ""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     fault: str = ""
     fault_at: int = 10

@@ -16,7 +16,7 @@ from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.report import ReportConfig
+from bhd_lerobot.tasks.sensing import SensingConfig
 from tests.cases import each_case
 
 FPS = 10
@@ -29,9 +29,9 @@ TASKS: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
 }
 
 
-def make(name: str, n: int = 1, **report: float) -> Any:
+def make(name: str, n: int = 1, **sensing: float) -> Any:
     task, config, options = TASKS[name]
-    return task(config(**options, report=ReportConfig(**report)), n, FPS)
+    return task(config(**options, sensing=SensingConfig(**sensing)), n, FPS)
 
 
 def truth(task: Any, frame: int, n: int = 1) -> Any:
@@ -44,9 +44,9 @@ def truth(task: Any, frame: int, n: int = 1) -> Any:
     return ArmTruth(poses[:, 0], poses, np.zeros(n), no, no, no, np.zeros((n, MAX_OBJECTS), np.bool_))
 
 
-def told(name: str, frames: int, seed: int = 7, **report: float) -> np.ndarray:
+def told(name: str, frames: int, seed: int = 7, **sensing: float) -> np.ndarray:
     """Return what a task tells in the frames of an episode, shape (frames, things, fields)."""
-    task = make(name, **report)
+    task = make(name, **sensing)
     task.begin(np.array([0]), [task.sample(seed)])
     rows = []
     for frame in range(frames):
@@ -141,20 +141,20 @@ def test_how_many_run_side_by_side_and_when_they_begin_changes_nothing(name: str
 
 
 @each_case(
-    ("report", "message"),
+    ("sensing", "message"),
     [
-        ({"noise_m": -0.1}, r"report.noise_m is -0.1"),
-        ({"noise_m": 1e300}, r"report.noise_m is 1e\+300; it must be from 0 to 100 \[m\]"),
-        ({"delay_s": math.inf}, r"report.delay_s is inf; it must be from 0 to 3600 \[s\]"),
-        ({"dropout": 1.5}, r"report.dropout is 1.5; it is a probability"),
-        ({"dropout": math.nan}, r"report.dropout is nan"),
+        ({"noise_m": -0.1}, r"sensing.noise_m is -0.1"),
+        ({"noise_m": 1e300}, r"sensing.noise_m is 1e\+300; it must be from 0 to 100 \[m\]"),
+        ({"delay_s": math.inf}, r"sensing.delay_s is inf; it must be from 0 to 3600 \[s\]"),
+        ({"dropout": 1.5}, r"sensing.dropout is 1.5; it is a probability"),
+        ({"dropout": math.nan}, r"sensing.dropout is nan"),
     ],
 )
-def test_reports_that_cannot_be_made(report: dict[str, float], message: str) -> None:
+def test_sensing_that_cannot_be_made(sensing: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        ReportConfig(**report)
+        SensingConfig(**sensing)
 
 
 def test_where_nothing_is_told_nothing_can_be_wrong_with_it() -> None:
     with pytest.raises(ConfigError, match=r"task.trail is false.*--task.trail=true"):
-        AvoidConfig(report=ReportConfig(noise_m=0.1))
+        AvoidConfig(sensing=SensingConfig(noise_m=0.1))

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -15,7 +16,7 @@ from bhd_lerobot.robots.arm_host import ArmHost
 from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.host.hardware import Hardware, plant_class
+from bhd_lerobot.robots.host.checked_plant import CheckedPlant, plant_class
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
@@ -86,17 +87,17 @@ class Rig:
     def __init__(self, plant: Perfect | None = None) -> None:
         self.plant = plant or Perfect()
         self.slept = 0.0
-        self.hardware = Hardware(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
-        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.hardware)
+        self.checked = CheckedPlant(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
+        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.checked)
         self.plant.time = lambda: self.host.bridge.now_ns
-        self.hardware.open()
+        self.checked.open()
 
     def _sleep(self, seconds: float) -> None:
         self.slept += seconds
         self.plant.offset += round(seconds * NANOSECONDS)
 
     def start(self) -> None:
-        self.hardware.prepare(self.host.cerebellum.reading)
+        self.checked.prepare(self.host.cerebellum.reading)
         self.host.cerebellum.stamp_origin_ns = self.plant.offset
         self.host.reset(FIRST, [None], [0])
 
@@ -176,7 +177,7 @@ def test_a_plant_that_fails_is_a_fault_that_stays_until_a_reset(call: str, how: 
     written = np.array(rig.plant.written[before - 1 :])
     assert np.isfinite(written).all()
     assert np.abs(np.diff(written, axis=0)).max(initial=0.0) < 0.05
-    assert rig.hardware.not_ready(rig.host.cerebellum.reading)
+    assert rig.checked.not_ready(rig.host.cerebellum.reading)
     rig.plant.broken.clear()
     for _ in range(25):
         rig.host.step(None)
@@ -243,7 +244,7 @@ def test_a_robot_that_fails_for_a_moment_before_it_starts_is_waited_for() -> Non
 
     rig.plant.broken["read"] = flaky
     rig.start()
-    assert rig.hardware.problem == ""
+    assert rig.checked.problem == ""
     assert rig.drive(2) == Mode.TRACKING
 
 
@@ -308,7 +309,7 @@ def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], wh
 
 def test_a_plant_that_cannot_be_made_says_why() -> None:
     with pytest.raises(ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"):
-        Hardware.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
+        CheckedPlant.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
 
 
 class Refusing(Perfect):
@@ -319,9 +320,9 @@ class Refusing(Perfect):
 def test_a_base_observes_what_its_plant_measures() -> None:
     plant = Perfect(sensors=39, start=[0.0, 0.0])
     config = TurtleBot3Config(beams=36, imu=True, odometry=True)
-    hardware = Hardware(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
-    base = BaseHost(config, hardware)
-    hardware.prepare(base.cerebellum.reading)
+    checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(config, checked)
+    checked.prepare(base.cerebellum.reading)
     plant.time = lambda: base.bridge.now_ns
     base.reset(FIRST, [None], [0])
     base.step(None)
@@ -338,6 +339,50 @@ def test_a_base_observes_what_its_plant_measures() -> None:
     plant.sensors[3] = np.inf
     base.step(None)
     assert base.modes[0] == Mode.FAULT
+
+
+class Twisted(Perfect):
+    """A base whose own controller turns twists into wheel speeds."""
+
+    takes = "twist"
+    drive = DiffDrive(TurtleBot3Config().body().drive, 1)
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        self.written.append(ctrl[0].copy())
+        self.position = self.position + self.drive.wheels_from_twist(ctrl, np.zeros((1, 2)))[0] / 200
+
+    def read(self, out: PlantReading) -> None:
+        super().read(out)
+        out.velocity[:] = self.drive.wheels_from_twist(np.array(self.written[-1:] or [[0.0, 0.0]]), np.zeros((1, 2)))
+
+
+def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> None:
+    plant = Twisted(sensors=36, start=[0.0, 0.0])
+    checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(TurtleBot3Config(beams=36), checked)
+    checked.prepare(base.cerebellum.reading)
+    plant.time = lambda: base.bridge.now_ns
+    base.reset(FIRST, [None], [0])
+    for action in ([0.1, 0.5], [9.0, 0.0], [-9.0, 9.0]):
+        for _ in range(20):
+            base.step(np.array([action]))
+            assert plant.written[-1].tolist() == base.cerebellum.command[0].tolist()
+    written, limits = np.array(plant.written), base.body.limits
+    assert (np.abs(written).max(axis=0) <= np.array(limits.velocity) + 1e-9).all()
+    most = np.array(limits.acceleration) / 200
+    assert (np.abs(np.diff(written, axis=0)).max(axis=0) <= most + 1e-12).all()
+    assert base.observe().state[0, :2].tolist() == pytest.approx(written[-1].tolist())
+    assert base.modes[0] == Mode.TRACKING
+
+
+def test_a_plant_that_takes_something_else_is_refused() -> None:
+    plant = Perfect()
+    plant.takes = "velocities"
+    with pytest.raises(ConfigError, match=r"The plant mine:Arm takes 'velocities'; .* 'actuators' or 'twist'"):
+        Rig(plant)
+    plant.takes = "twist"
+    with pytest.raises(ConfigError, match=r"takes twists .* 'ur5' is no base"):
+        Rig(plant)
 
 
 def test_what_a_robot_does_not_measure_a_person_judges() -> None:

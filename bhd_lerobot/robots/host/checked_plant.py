@@ -55,7 +55,7 @@ def plant_class(name: str) -> Callable[[Any, Any], Plant]:
     return found
 
 
-class Hardware(Plant):
+class CheckedPlant(Plant):
     """Passes calls on to a plant, and takes what it raises or what is not a number for a fault of the robot.
 
     Attributes:
@@ -82,6 +82,9 @@ class Hardware(Plant):
     ) -> None:
         if plant.n != 1:
             raise ConfigError(f"The plant {name} is of n = {plant.n} robots; on the wall clock there is one.")
+        self.takes = getattr(plant, "takes", Plant.takes)
+        if self.takes not in ("actuators", "twist"):
+            raise ConfigError(f"The plant {name} takes {self.takes!r}; what a plant takes is 'actuators' or 'twist'.")
         self._plant, self._name, self._oldest_ns, self._clock, self._sleep = plant, name, oldest_ns, clock, sleep
         self._stamp_ns = np.zeros(1, np.int64)
         self.problem = ""

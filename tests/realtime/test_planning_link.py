@@ -15,7 +15,7 @@ from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.motion.planning import MIN_LEAD
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
 from tests.control.motion.test_goal_properties import actions, follow
 from tests.control.support import shared_block
@@ -30,14 +30,14 @@ def ramp(ticks: int, step: float = 1.0, **fields: Any) -> BrainCommand:
     return BrainCommand("x" * 200, gripper=step, timeout_s=float(ticks), **fields)  # a planner needs no name
 
 
-def linked(planner: Any = None) -> tuple[PlanLink, PlanServer, Any, bytearray]:
+def linked(planner: Any = None) -> tuple[PlanningLink, PlanServer, Any, bytearray]:
     planner = planner or RampPlanner()
-    block = bytearray(PlanLink.nbytes(planner.dof, planner.hz, DURATION_S))
-    link = PlanLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
+    block = bytearray(PlanningLink.nbytes(planner.dof, planner.hz, DURATION_S))
+    link = PlanningLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
     return link, PlanServer(block, planner, duration_s=DURATION_S), planner, block
 
 
-def answer(link: PlanLink) -> Plan:
+def answer(link: PlanningLink) -> Plan:
     plan = link.poll(0)
     assert isinstance(plan, Plan)
     return plan
@@ -52,8 +52,8 @@ def answer(link: PlanLink) -> Plan:
     ],
 )
 def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(command: BrainCommand) -> None:
-    block = bytearray(PlanLink.nbytes(6, HZ))
-    link, server = PlanLink(block, 6, HZ), PlanServer(block, PLANNER)
+    block = bytearray(PlanningLink.nbytes(6, HZ))
+    link, server = PlanningLink(block, 6, HZ), PlanServer(block, PLANNER)
     state = State.at_rest(HOME)
     assert not server.serve_once()
     link.request(0, command, state, 0.05, 17)
@@ -217,7 +217,7 @@ def test_a_half_written_request_is_not_read() -> None:
     guard += 1
     assert not server.serve_once()
     # After a writer that was killed while writing, the next one can write again.
-    again = PlanLink(block, 6, 100, duration_s=DURATION_S)
+    again = PlanningLink(block, 6, 100, duration_s=DURATION_S)
     assert guard[0] % 2 == 0
     again.request(0, ramp(4), STATE, None, 0)
     assert server.serve_once()
@@ -255,8 +255,8 @@ def test_a_restarted_planner_answers_only_open_requests() -> None:
 
 def test_another_process_plans(tmp_path: Path) -> None:
     path, count = tmp_path / "block", 200
-    block = shared_block(path, PlanLink.nbytes(6, 100, DURATION_S))
-    link = PlanLink(block, 6, 100, duration_s=DURATION_S)
+    block = shared_block(path, PlanningLink.nbytes(6, 100, DURATION_S))
+    link = PlanningLink(block, 6, 100, duration_s=DURATION_S)
     process = Fork(serve_plans, path, count)
     playing_rows: tuple[np.ndarray, np.ndarray] | None = None
     for number in range(1, count + 1):
@@ -283,11 +283,11 @@ class Scribbler(PlanServer):
         return super()._plan(request, capacity)
 
 
-class LateLink(PlanLink):
+class LateLink(PlanningLink):
     """A link whose planner answers at the k-th poll after a request."""
 
     def __init__(self, latencies: list[int], lead: int) -> None:
-        block = bytearray(PlanLink.nbytes(6, HZ, 6.0))
+        block = bytearray(PlanningLink.nbytes(6, HZ, 6.0))
         super().__init__(block, 6, HZ, lead_s=lead / HZ, timeout_s=0.4, duration_s=6.0)
         self.server, self.latencies, self.left = Scribbler(block, PLANNER, duration_s=6.0), iter(latencies), 0
 
@@ -321,13 +321,13 @@ def test_another_process_plans_for_one_arm_only() -> None:
 
 
 def test_the_block_of_memory_has_the_stated_size() -> None:
-    size = PlanLink.nbytes(6, 100, 2.0)
-    PlanLink(bytearray(size), 6, 100, duration_s=2.0)
+    size = PlanningLink.nbytes(6, 100, 2.0)
+    PlanningLink(bytearray(size), 6, 100, duration_s=2.0)
     with pytest.raises(ValueError, match="buffer"):
-        PlanLink(bytearray(size - 1), 6, 100, duration_s=2.0)
+        PlanningLink(bytearray(size - 1), 6, 100, duration_s=2.0)
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0, np.nan, np.inf])
 def test_a_timeout_is_positive(timeout_s: float) -> None:
     with pytest.raises(ConfigError, match="time-out is"):
-        PlanLink(bytearray(PlanLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)
+        PlanningLink(bytearray(PlanningLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)

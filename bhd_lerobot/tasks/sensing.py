@@ -1,4 +1,4 @@
-"""What may be wrong with what a task reports a brain: noise, delay and gaps, as of a real robot's tracker."""
+"""What may be wrong with what a task senses for a brain: noise, delay and gaps, as of a real robot's tracker."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ _MOST_NOISE_M, _LONGEST_DELAY_S = 100.0, 3600.0  # what no tracker is worse than
 
 
 @dataclass
-class ReportConfig:
-    """What is wrong with what the task reports; nothing by default: then it is the truth.
+class SensingConfig:
+    """What is wrong with what the task senses; nothing by default: then it is the truth.
 
     Attributes:
         noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame, at most 100 [m].
         delay_s: how old it is, in whole frames, at most 3600 [s].
         dropout: probability that something is missing, for each thing and anew in every frame: an object is left out;
-            of a target, a goal or the robot's pose, what was told before is told again.
+            of a target, a goal or the robot's pose, what was sensed before is repeated.
     """
 
     noise_m: float = 0.0
@@ -29,9 +29,9 @@ class ReportConfig:
     def __post_init__(self) -> None:
         for name, unit, most in (("noise_m", "m", _MOST_NOISE_M), ("delay_s", "s", _LONGEST_DELAY_S)):
             if not 0 <= getattr(self, name) <= most:
-                raise ConfigError(f"report.{name} is {getattr(self, name)}; it must be from 0 to {most:g} [{unit}].")
+                raise ConfigError(f"sensing.{name} is {getattr(self, name)}; it must be from 0 to {most:g} [{unit}].")
         if not 0 <= self.dropout <= 1:
-            raise ConfigError(f"report.dropout is {self.dropout}; it is a probability, from 0 to 1.")
+            raise ConfigError(f"sensing.dropout is {self.dropout}; it is a probability, from 0 to 1.")
 
     @property
     def is_exact(self) -> bool:
@@ -43,8 +43,8 @@ class ReportConfig:
         return 0 if self.is_exact else int(rng.integers(2**31))
 
 
-class Reports:
-    """What n tasks tell of some things each, with noise, late and with gaps.
+class Sensing:
+    """What n tasks sense of some things each, with noise, late and with gaps.
 
     Args:
         config: what is wrong.
@@ -55,13 +55,13 @@ class Reports:
     """
 
     def __init__(
-        self, config: ReportConfig, n: int, fps: int, position: slice, absent: NDArray[np.float64] | None = None
+        self, config: SensingConfig, n: int, fps: int, position: slice, absent: NDArray[np.float64] | None = None
     ) -> None:
         self._config, self._position, self._absent = config, position, absent
         self._rngs = [np.random.default_rng(0)] * n
         self._past: list[deque[NDArray[np.float64]]] = [deque(maxlen=1 + round(config.delay_s * fps)) for _ in range(n)]
         self._frame = np.full(n, -1)
-        self._told: list[NDArray[np.float64]] = [np.zeros((0, 0))] * n
+        self._sensed: list[NDArray[np.float64]] = [np.zeros((0, 0))] * n
 
     def begin(self, sim: int, seed: int) -> None:
         """Start an episode in one simulation."""
@@ -69,8 +69,8 @@ class Reports:
         self._past[sim].clear()
         self._frame[sim] = -1
 
-    def told(self, state: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return what is told; in the same frame again, it is the same again.
+    def sense(self, state: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what is sensed; in the same frame again, it is the same again.
 
         Args:
             state: what is true, shape (n, things, fields).
@@ -82,21 +82,21 @@ class Reports:
         if self._config.is_exact:
             return state
         for sim in np.flatnonzero(self._frame != frame).tolist():
-            self._told[sim] = self._tell(sim, state[sim])
+            self._sensed[sim] = self._measure(sim, state[sim])
         self._frame[:] = frame
-        return np.stack(self._told)
+        return np.stack(self._sensed)
 
-    def _tell(self, sim: int, state: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _measure(self, sim: int, state: NDArray[np.float64]) -> NDArray[np.float64]:
         config, absent, past, rng = self._config, self._absent, self._past[sim], self._rngs[sim]
         is_first = not past
         past.append(state.copy())
-        told = past[0].copy()  # at an episode's start, what was so then
-        present = np.ones(len(told), np.bool_) if absent is None else (told != absent).any(axis=1)
-        at = told[:, self._position]
+        sensed = past[0].copy()  # at an episode's start, what was so then
+        present = np.ones(len(sensed), np.bool_) if absent is None else (sensed != absent).any(axis=1)
+        at = sensed[:, self._position]
         at += config.noise_m * rng.standard_normal(at.shape) * present[:, None]
-        is_missing = rng.random(len(told)) < config.dropout
+        is_missing = rng.random(len(sensed)) < config.dropout
         if absent is not None:
-            told[is_missing] = absent
+            sensed[is_missing] = absent
         elif not is_first:
-            told[is_missing] = self._told[sim][is_missing]
-        return told
+            sensed[is_missing] = self._sensed[sim][is_missing]
+        return sensed

@@ -80,7 +80,7 @@ class _Memory:
         return int(np.ceil((duration_s + _SLACK_S) * control_hz))
 
 
-class PlanLink:
+class PlanningLink:
     """The cerebellum's side: a `Planning` for one arm that another process plans for.
 
     Attributes:
