@@ -97,7 +97,7 @@ def test_an_episode_that_no_machine_could_keep_is_rejected_and_the_dataset_stays
     result, _ = run_live(root, robot__id=name, dataset__num_episodes=1, dataset__episode_time_s=1)
     assert result.recorded == 1
     before = data_columns(root)
-    with pytest.raises(RealtimeError, match=r"Episode 1 was too unpunctual 3 times.*resume=true"):
+    with pytest.raises(RealtimeError, match=r"Episode 1 exceeded the timing tolerance 3 times.*resume=true"):
         run_live(
             root,
             robot__id=name,

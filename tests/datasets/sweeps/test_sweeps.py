@@ -23,7 +23,8 @@ FAULTS = ("kill", "interrupt", "full")
 
 # What messages say of the state in which a command leaves what it works on.
 OLD = re.compile(
-    r"(nothing was changed|is as it was|is unchanged|are unchanged|are as they were|was not touched|no part was written|no dataset was made|"
+    r"(nothing was changed|is as it was|is unchanged|are unchanged|are as they were|was not touched|"
+    r"no part was written|no dataset was made|"
     r"no bag was (written|left)|nothing was written there)(?! now)",
     re.IGNORECASE,
 )
