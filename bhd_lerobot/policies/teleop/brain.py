@@ -1,5 +1,6 @@
 """The brain `teleop`: what a person does with a teleoperator is the action."""
 
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pkgutil import resolve_name
@@ -136,7 +137,11 @@ class TeleopBrain(ConfiguredBrain):
             self._calls.close()
             self._calls = None
         if self.teleop.is_connected:
-            self.teleop.disconnect()
+            try:
+                self.teleop.disconnect()
+            except Exception as error:  # of another package's code: what was recorded is reported all the same
+                kind = self.config.teleop.type
+                print(f"warning: the teleoperator {kind} could not be disconnected: {_words(error)}", file=sys.stderr)
 
 
 def _made(config: Any) -> Any:

@@ -195,13 +195,18 @@ class FrameThread:
                 self._idle = False
             try:
                 self._episode()
+                if self._gate.has_speeds:  # which would go on: positions stay by themselves
+                    self._hold()
             except Exception as error:  # of another package's code
                 words = " ".join(f"{type(error).__name__}: {error}".split())
                 text = str(error) if isinstance(error, RealtimeError) else f"{self._call[0]} raised {words}"
                 with self._changed:
                     self._call = ("", 0)
                     self._fault(text)
-                self._hold_if_possible()
+                try:
+                    self._hold()
+                except Exception:  # the fault that is known already is the one that counts
+                    self._call = ("", 0)
 
     def _episode(self) -> None:
         number, due, skipped = 0, self.origin_ns, 0
@@ -267,23 +272,20 @@ class FrameThread:
                 self._changed.wait(min(left, until_silent) if until_silent > 0 else left)
 
     def _where_it_is(self, frame: DeviceFrame) -> Vector:
-        """Return the action that stops the robot: the positions that were measured, no speed."""
+        """Return the action that stops the robot, which it holds from then on: the measured positions, no speed."""
         measured, holding = self._device.measured(frame.reading.state), self._gate.holding()
-        is_position = np.array([not name.endswith(".vel") for name in self._gate.names])
-        return np.where(is_position & np.isfinite(measured), measured, holding)
+        self._gate.begin(np.where(np.isfinite(measured), measured, holding))
+        return self._gate.holding()
 
     def _send(self, frame: DeviceFrame, action: Vector) -> None:
         if not np.isfinite(action).all():
             return  # it is not known where the robot is, so it gets nothing
         frame.applied = self._called("send_action", lambda: self._device.send(action))
 
-    def _hold_if_possible(self) -> None:
+    def _hold(self) -> None:
         action = self._gate.holding()
         if np.isfinite(action).all():
-            try:
-                self._called("send_action", lambda: self._device.send(action))
-            except Exception:  # the fault that is known already is the one that counts
-                self._call = ("", 0)
+            self._called("send_action", lambda: self._device.send(action))
 
     def _called[T](self, name: str, call: Callable[[], T]) -> T:
         self._call = (name, time.monotonic_ns())

@@ -61,6 +61,11 @@ class Gate:
         self.max_change = change
         self._last: Vector | None = None
 
+    @property
+    def has_speeds(self) -> bool:
+        """Whether any of the actions is a speed, with which a robot goes on until it gets another."""
+        return bool(self._is_speed.any())
+
     def begin(self, measured: Vector) -> None:
         """Begin an episode from what the robot measures, shape (actions,); NaN where it does not."""
         self._last = np.where(self._is_speed & ~np.isfinite(measured), 0.0, measured)

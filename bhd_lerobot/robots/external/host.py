@@ -1,5 +1,6 @@
 """Another package's LeRobot robot, with the interface of `Robots`."""
 
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -116,7 +117,7 @@ class LeRobotHost:
         return np.zeros((len(ids), 0))
 
     def stop(self, ids: NDArray[np.intp]) -> None:
-        """End the episode: the robot gets nothing more, and keeps its last action."""
+        """End the episode: positions stay, speeds are set to 0, and the robot gets nothing more."""
         if len(ids):
             self.running[:] = False
             self._frames.pause()
@@ -232,6 +233,10 @@ class LeRobotHost:
     def close(self) -> None:
         """Disconnect the robot. May be called twice; a call that does not return is not waited for."""
         if self._frames.close() and self.robot.is_connected:
-            self.robot.disconnect()
+            try:
+                self.robot.disconnect()
+            except Exception as error:  # of another package's code: what was recorded is reported all the same
+                words = " ".join(f"{type(error).__name__}: {error}".split())
+                print(f"warning: {self.device.name} could not be disconnected: {words}", file=sys.stderr)
         if self._lock is not None:
             self._lock.close()

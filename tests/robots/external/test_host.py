@@ -248,3 +248,86 @@ def test_notes_say_what_is_limited_and_what_is_not(tmp_path: Path) -> None:
         text = "\n".join(host.notes)
     assert "1 of 3 actions limited; not known, so not limited: shoulder.pos, gripper.pos" in text
     assert "not promised" in text
+
+
+class MockBase(MockArm):
+    """A base: its speeds go on until it gets others."""
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return {"x.vel": float, "arm.pos": float}
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        return {"x.vel": float, "arm.pos": float}
+
+    def get_observation(self) -> dict[str, Any]:
+        super().get_observation()
+        if self.config.fault and self.observed >= self.config.fault_at:
+            raise ConnectionError("the bus does not answer")
+        return {"x.vel": 0.1, "arm.pos": self.at}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        self.rows.append((action["x.vel"], action["arm.pos"]))
+        return dict(action)
+
+
+def base(tmp_path: Path, **options: Any) -> tuple[LeRobotHost, MockBase]:
+    robot = MockBase(MockArmConfig(id="base", calibration_dir=tmp_path, **options))
+    robot.rows, robot.at = [], 0.0
+    host = LeRobotHost(robot, FPS, GateConfig())
+    robot.connect()
+    return host, robot
+
+
+@pytest.mark.parametrize("ending", ["stop", "close", "fault", "estop"])
+def test_a_base_stands_whatever_ends_an_episode(tmp_path: Path, ending: str) -> None:
+    host, robot = base(tmp_path, fault="bus" * (ending == "fault"), fault_at=4)
+    with closing(host):
+        start(host)
+        for _ in range(5):
+            host.observe()
+            if host.step(np.array([[0.2, 1.0]])).mode[0] == Mode.FAULT:
+                break
+        if ending == "estop":
+            host.estop()
+            host.observe()
+            host.step(np.array([[0.2, 1.0]]))
+        if ending != "close":
+            host.stop(ONLY)
+            assert robot.rows[-1][0] == 0.0
+    assert (0.2, 1.0) in robot.rows
+    assert robot.rows[-1][0] == 0.0
+
+
+def test_after_an_emergency_stop_nothing_moves_the_robot_again(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, fault="bus", fault_at=8)
+    with closing(host):
+        start(host)
+        for _ in range(3):
+            host.observe()
+            host.step(np.array([[0.2, 50.0]]))
+        robot.at = 7.0  # where it is when it is stopped, on its way to 50
+        host.observe()
+        host.step(np.array([[0.2, 50.0]]))
+        host.estop()
+        stopped = len(robot.rows)
+        for _ in range(10):
+            host.observe()
+            if host.step(np.array([[0.2, 50.0]])).mode[0] == Mode.FAULT:
+                break
+        host.stop(ONLY)
+    after = robot.rows[stopped:]
+    assert after
+    assert set(after) == {(0.0, 7.0)}
+
+
+def test_a_robot_that_cannot_be_disconnected_is_reported_and_hides_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(self: MockArm) -> None:
+        raise ConnectionError("the bus does not answer")
+
+    monkeypatch.setattr(MockArm, "disconnect", fail)
+    make(tmp_path).close()
+    assert "mock_arm could not be disconnected: ConnectionError: the bus does not answer" in capsys.readouterr().err
