@@ -150,6 +150,8 @@ class RecordConfig:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot
         if not is_ours(robot.type):
+            if self.dataset.fps < 0:
+                raise ConfigError(f"dataset.fps is {self.dataset.fps}; it must be at least 1, or 0 for {FPS}.")
             self.dataset.fps = self.dataset.fps or FPS
             self._settle_duration()
             return

@@ -64,6 +64,11 @@ class TeleopConfig(BrainConfig):
     def __post_init__(self) -> None:
         if not 0 < self.timeout_s < float("inf"):
             raise ConfigError(f"brain.timeout_s is {self.timeout_s}; it must be positive and finite [s].")
+        if self.map and self.processor:
+            raise ConfigError(
+                "map and processor are both set, and each gives the robot's actions: leave one of them out; a processor "
+                "can translate names and units, too."
+            )
         module, sign, name = self.processor.partition(":")
         if self.processor and not (sign and module and name):
             raise ConfigError(f"brain.processor is {self.processor!r}; name a function as package.module:name.")
