@@ -66,7 +66,7 @@ class TeleopConfig(BrainConfig):
             raise ConfigError(f"brain.timeout_s is {self.timeout_s}; it must be positive and finite [s].")
         if self.map and self.processor:
             raise ConfigError(
-                "map and processor are both set, and each gives the robot's actions: leave one of them out; a processor "
+                "map and processor are both set, and both give the robot's actions: leave one of them out; a processor "
                 "can translate names and units, too."
             )
         module, sign, name = self.processor.partition(":")
