@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.cli import record, train
+from bhd_lerobot.cli import evaluate, record, train
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -32,6 +32,7 @@ SHORTER = {
     "--dataset.num_episodes=40": "--dataset.num_episodes=4",
     "--dataset.num_episodes=10": "--dataset.num_episodes=1",
     "--dataset.reset_time_s=15": "--dataset.reset_time_s=0.2",
+    "--n_episodes=10": "--n_episodes=2",
 }
 SMALL = [
     *("--policy.dim_model=16", "--policy.n_heads=2", "--policy.dim_feedforward=16", "--policy.chunk_size=5"),
@@ -43,9 +44,10 @@ def arguments_of(line: str) -> list[str]:
     """Return the arguments of a command of the page, for the mock robot and shorter."""
     arguments = [SHORTER.get(argument, argument) for argument in shlex.split(line)[1:]]
     arguments = [one for one in arguments if not re.match(r"--(robot|teleop)\.", one)]
-    if line.startswith("bhd-record"):
+    if line.startswith(("bhd-record", "bhd-eval")):
         robot = [f"--robot.{part}" for part in ROBOT.removeprefix("--robot.").split(" --robot.")]
-        arguments = [PLUGIN, *robot, "--teleop.type=mock_leader", *arguments]
+        leader = ["--teleop.type=mock_leader"] * line.startswith("bhd-record")
+        arguments = [PLUGIN, *robot, *leader, *arguments]
     return arguments + SMALL * line.startswith("bhd-train")
 
 
@@ -74,7 +76,7 @@ class Terminal:
 def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     section = [line for line in quoted_commands(PAGE) if "data/cup" in line]
-    first, resumed, check, timing, view, training, corrected = section
+    first, resumed, check, timing, view, training, corrected, compared = section
     root = tmp_path / "data" / "cup"
 
     # A kill costs the running episode at most.
@@ -121,3 +123,14 @@ def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert {span[2] for span in json.loads(episode.metadata["interventions"])} == {"person"}
     events = np.asarray(read_episode(tmp_path / "data" / "cup_corrected", 0)["event"])
     assert (events == Event.INTERVENTION).any()
+
+    # Two brains in an order that is not shown: the person judges by keys.
+    person = Terminal(evaluate.main, arguments_of(compared), tmp_path / "compared.log")
+    for number in range(1, 5):
+        person.press(b"\r", f"Episode {number} of 4, scene")
+        person.press(b"s" if number % 2 else b"f", f"Episode {number} of 4 runs")
+    assert person.wait() == 0, (tmp_path / "compared.log").read_text()
+    before_the_end = (tmp_path / "compared.log").read_text().split("Episode 4 of 4 runs")[0]
+    assert not re.search(r"\b(act|hold)\b", before_the_end)
+    results = json.loads((tmp_path / "outputs" / "eval" / "cup" / "results.json").read_text())
+    assert sum(brain["successes"] for brain in results["brains"].values()) == 2
