@@ -107,6 +107,11 @@ class FrameError(DatasetError, ValueError):
     """A frame, an image or episode metadata that does not fit the features of the dataset."""
 
 
+def as_text(error: BaseException) -> str:
+    """Return an error of another package's code as text: its kind and its message, without a full stop at the end."""
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")
+
+
 def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
     """Return the message for a name that is not among the valid ones, with the nearest valid name if there is one.
 

@@ -22,7 +22,7 @@ from rich.markup import escape
 
 import bhd_lerobot.envs.config_env  # noqa: F401  registers the type `bhd`
 from bhd_lerobot import stock
-from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+from bhd_lerobot.errors import BhdError, ConfigError, as_text, unknown_name
 from bhd_lerobot.evaluation.config import Comparison, EvalDatasetConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, finish, measured_with, refuse_results
 from bhd_lerobot.evaluation.metrics import EnvironmentMetrics
@@ -284,12 +284,12 @@ def _make(config: EnvironmentEvalConfig, n: int) -> Envs:
         extras = metadata.metadata("lerobot").get_all("Provides-Extra") or []
         package = f"lerobot[{kind}]" if kind in extras else (error.name or config.env.package_name).replace("_", "-")
         raise ConfigError(
-            f"env.type is {kind!r}, which needs a package that is not installed: {_words(error)} Install it: "
+            f"env.type is {kind!r}, which needs a package that is not installed: {as_text(error)}. Install it: "
             f"pip install '{package}'"
         ) from error
     except Exception as error:  # of another package's code
         raise ConfigError(
-            f"env.type is {kind!r}, which cannot be made: {_words(error)} Check the options of env and what is "
+            f"env.type is {kind!r}, which cannot be made: {as_text(error)}. Check the options of env and what is "
             "installed for it."
         ) from error
     return made
@@ -303,7 +303,7 @@ def _check(config: EnvironmentEvalConfig, policies: Sequence[_Policy]) -> list[s
         try:
             seen, _ = first.reset(seed=[config.seed])
         except Exception as error:  # of another package's code
-            raise ConfigError(f"env.type is {config.env.type!r}, which cannot be reset: {_words(error)}") from error
+            raise ConfigError(f"env.type is {config.env.type!r}, which cannot be reset: {as_text(error)}.") from error
         for one in policies:
             loaded = one.load()
             before, _ = stock.make_env_pre_post_processors(env_cfg=config.env, policy_cfg=loaded.config)
@@ -389,7 +389,7 @@ def _run(config: EnvironmentEvalConfig, one: _Policy, stop: StopRequest) -> Iter
                 except Exception as error:  # of a policy, an environment, or a processor between them
                     raise BhdError(
                         f"brains.{one.label}: the policy {one.config.path!r} cannot be evaluated in env.type "
-                        f"{config.env.type!r}: {_words(error)} Use the options of env that it was trained with."
+                        f"{config.env.type!r}: {as_text(error)}. Use the options of env that it was trained with."
                     ) from error
                 for i, outcome in enumerate(rolled["per_episode"]):
                     one.episodes.append(_metrics(config, one, task, outcome, watched.ending(i)))
@@ -429,11 +429,6 @@ def _metrics(
         length_s=frames / config.env.fps,
         task=task,
     )
-
-
-def _words(error: BaseException) -> str:
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 PROGRAM = Program(EnvironmentEvalConfig, lambda config: evaluate_in_environment(config).exit_status, read=read)

@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, as_text
 
 ENTRY_POINTS = "bhd_lerobot.plugins"
 """The group of entry points; each names a module."""
@@ -47,7 +47,7 @@ def import_plugins() -> Iterator[tuple[str, str]]:
         try:
             load()
         except Exception as error:  # whatever a module raises while it is imported
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = as_text(error)
         yield name, reason
 
 
@@ -92,7 +92,7 @@ def load_named(arguments: Sequence[str]) -> list[str]:
         try:
             importlib.import_module(name)
         except Exception as error:  # whatever a module raises while it is imported, also a name that is none
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = as_text(error)
             here = Path(f"{name}.py").is_file() or Path(name, "__init__.py").is_file()
             remedy = (
                 "Give a module that Python can find: an installed one, or one in a folder of PYTHONPATH."

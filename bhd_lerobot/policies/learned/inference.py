@@ -19,7 +19,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, as_text
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
 from bhd_lerobot.stock import ACTTemporalEnsembler
 
@@ -245,7 +245,7 @@ class StockInference:
         try:
             chunk = policy.predict_action_chunk(batch)
         except Exception as error:  # whatever it wants besides
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = as_text(error)
             raise ConfigError(
                 f"The policy type {self.loaded.kind!r} cannot be executed here: it gives no single actions "
                 f"({' '.join(str(missing).split()) or 'no select_action'}), and no chunk for an observation alone "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
-from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError
+from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_text
 from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
@@ -60,7 +60,7 @@ class TeleopBrain(ConfiguredBrain):
                 raise
             except Exception as error:  # of another package's code
                 raise ConfigError(
-                    f"The teleoperator {teleop_type!r} cannot be connected: {_words(error)}. Check its power, its "
+                    f"The teleoperator {teleop_type!r} cannot be connected: {as_text(error)}. Check its power, its "
                     "cable and its port, and that no other program uses it."
                 ) from error
         features = tuple(self.teleop.action_features)
@@ -114,7 +114,7 @@ class TeleopBrain(ConfiguredBrain):
         except (ActionError, BrainStoppedError) as error:
             raise BrainStoppedError(str(error).removesuffix(".")) from error
         except Exception as error:  # of another package's code
-            raise BrainStoppedError(f"the teleoperator {teleop_type} failed: {_words(error)}") from error
+            raise BrainStoppedError(f"the teleoperator {teleop_type} failed: {as_text(error)}") from error
         if action is None:
             return None
         if missing := [name for name in self._robot.action_names if name not in action]:
@@ -141,7 +141,7 @@ class TeleopBrain(ConfiguredBrain):
                 self.teleop.disconnect()
             except Exception as error:  # of another package's code: what was recorded is reported all the same
                 kind = self.config.teleop.type
-                print(f"warning: the teleoperator {kind} could not be disconnected: {_words(error)}", file=sys.stderr)
+                print(f"warning: the teleoperator {kind} could not be disconnected: {as_text(error)}", file=sys.stderr)
 
 
 def _made(config: Any) -> Any:
@@ -151,7 +151,7 @@ def _made(config: Any) -> Any:
         return make_teleoperator_from_config(config)
     except Exception as error:  # of another package's code
         raise ConfigError(
-            f"teleop.type is {config.type!r}, which cannot be made: {_words(error.__cause__ or error)}."
+            f"teleop.type is {config.type!r}, which cannot be made: {as_text(error.__cause__ or error)}."
         ) from error
 
 
@@ -162,14 +162,10 @@ def _processor(name: str) -> Callable[[Any, Any], Mapping[str, Any]] | None:
         found = resolve_name(name)
     except Exception as error:  # whatever a module raises while it is imported
         raise ConfigError(
-            f"processor is {name!r}, which cannot be imported: {_words(error)}. Name a function as "
+            f"processor is {name!r}, which cannot be imported: {as_text(error)}. Name a function as "
             "package.module:name, of a module that Python finds."
         ) from error
     if not callable(found):
         raise ConfigError(f"processor is {name!r}, which cannot be called.")
     result: Callable[[Any, Any], Mapping[str, Any]] = found
     return result
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import RealtimeError, as_text
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.device import Device, Reading
 from bhd_lerobot.robots.external.gate import Gate
@@ -198,7 +198,7 @@ class FrameThread:
                 if self._gate.has_speeds:  # which would go on: positions stay by themselves
                     self._hold()
             except Exception as error:  # of another package's code
-                words = " ".join(f"{type(error).__name__}: {error}".split())
+                words = as_text(error)
                 text = str(error) if isinstance(error, RealtimeError) else f"{self._call[0]} raised {words}"
                 with self._changed:
                     self._call = ("", 0)

@@ -16,7 +16,7 @@ from bhd_lerobot.control.commands import Chunk, Command
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.device import Device
 from bhd_lerobot.robots.external.frames import DeviceFrame, FrameThread
@@ -236,7 +236,7 @@ class LeRobotHost:
             try:
                 self.robot.disconnect()
             except Exception as error:  # of another package's code: what was recorded is reported all the same
-                words = " ".join(f"{type(error).__name__}: {error}".split())
+                words = as_text(error)
                 print(f"warning: {self.device.name} could not be disconnected: {words}", file=sys.stderr)
         if self._lock is not None:
             self._lock.close()

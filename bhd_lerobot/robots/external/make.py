@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.host import LeRobotHost
 from bhd_lerobot.robots.external.lock import RobotLock
@@ -21,7 +21,7 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         robot = make_robot_from_config(config)
     except Exception as error:  # of another package's code
         raise ConfigError(
-            f"robot.type is {config.type!r}, which cannot be made: {_words(error.__cause__ or error)}."
+            f"robot.type is {config.type!r}, which cannot be made: {as_text(error.__cause__ or error)}."
         ) from error
     lock = RobotLock(config)
     try:
@@ -33,11 +33,7 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
     except Exception as error:  # of another package's code
         lock.close()
         raise RealtimeError(
-            f"The robot {config.type!r} cannot be connected: {_words(error)}. Check its power, its cable and "
+            f"The robot {config.type!r} cannot be connected: {as_text(error)}. Check its power, its cable and "
             "robot.port, and that no other program uses it."
         ) from error
     return host
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")

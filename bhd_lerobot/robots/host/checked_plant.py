@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.control.reading_check import ahead_of_time
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
 
 _READY_S = 10.0  # that a robot may take until it follows commands: brakes are released, a stop is left
 _AGAIN_S = 1.0  # after which a robot that is still stopped is asked again: a datagram is lost, or it asks for a pause
@@ -41,7 +41,7 @@ def plant_class(name: str) -> Callable[[Any, Any], Plant]:
     try:
         found: Any = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # whatever a module raises while it is imported
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = as_text(error)
         raise ConfigError(
             f"robot.plant is {name!r}, which cannot be imported: {reason}. Name a class as package.module:Class, of a "
             "module that Python finds: one that is installed, or in a folder of PYTHONPATH."
@@ -107,7 +107,7 @@ class CheckedPlant(Plant):
         try:
             plant = make(config, body)
         except Exception as error:  # of another package's code
-            raise ConfigError(f"The plant {name} cannot be made of this configuration: {_words(error)}.") from error
+            raise ConfigError(f"The plant {name} cannot be made of this configuration: {as_text(error)}.") from error
         return cls(plant, name, oldest_ns)
 
     def open(self) -> None:
@@ -168,7 +168,7 @@ class CheckedPlant(Plant):
         try:
             call()
         except Exception as error:  # of another package's code
-            raise RealtimeError(f"The plant {self._name} cannot be {done}: {_words(error)}.") from error
+            raise RealtimeError(f"The plant {self._name} cannot be {done}: {as_text(error)}.") from error
 
     # --- in the control loop -----------------------------------------------------------------------------------------
 
@@ -221,8 +221,4 @@ class CheckedPlant(Plant):
             return None
 
     def _fail(self, error: Exception) -> None:
-        self.problem = self.problem or _words(error)
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+        self.problem = self.problem or as_text(error)

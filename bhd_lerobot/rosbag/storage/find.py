@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError, as_text
 from bhd_lerobot.rosbag.storage.read import FILES, Bag, opened, publishers_in
 
 _UNREADABLE = (
@@ -82,7 +82,7 @@ def _folder(path: Path) -> Bag | None:
         mode, kind = (_text(about.get(f"compression_{what}") or "").lower() for what in ("mode", "format"))
         publishers = publishers_of(about.get("topics_with_message_count"))
     except _UNREADABLE as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = as_text(error)
         if not files:
             raise DatasetError(f"{metadata} cannot be read ({reason[:200]}), and there is no bag file.") from error
         return _without_metadata(path, files, f"{path.name}: metadata.yaml cannot be read ({reason[:200]})")
