@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 
 from bhd_lerobot.control.commands import Command
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import BrainStoppedError
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
@@ -64,7 +65,8 @@ class ResetPhase:
             while goes_on():
                 frame = robots.observe()
                 command: Command = self._brain.act(Observation(robots.observation_names, frame.state))
-                robots.step(command)
+                if robots.step(command).mode[0] in (Mode.ESTOP, Mode.FAULT):
+                    return
         except BrainStoppedError as error:
             self._console.print(f"Nobody drives the robot: {error}.")
         finally:

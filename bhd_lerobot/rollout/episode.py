@@ -1,5 +1,6 @@
 """The observe-act-record loop: n episodes side by side, each as if it were alone."""
 
+import contextlib
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import BrainStoppedError
+from bhd_lerobot.errors import BrainStoppedError, RealtimeError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -65,6 +66,7 @@ class EpisodeLoop:
         self.marks = Marks(robots.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
+        self._is_stopped: Callable[[], bool] = lambda: False
         self._frames = max(1, round(task.duration_s * robots.rates.fps))
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(robots.n, np.int64)
@@ -100,7 +102,7 @@ class EpisodeLoop:
             stop: called between frames; when it returns true, the running episodes are dropped and the loop ends.
             open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
-        self._open_images = open_images
+        self._open_images, self._is_stopped = open_images, stop
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]
@@ -136,6 +138,9 @@ class EpisodeLoop:
                     yield done.pop(order.pop(0))
                 self._start(ids, waiting)
         finally:
+            if self.robots.clock is not None:  # it does not go on while the dataset is finished
+                with contextlib.suppress(RealtimeError):
+                    self.robots.stop(np.flatnonzero(self.robots.running))
             self._images.discard()
             for episode in done.values():
                 if episode.writer is not None:
@@ -156,13 +161,13 @@ class EpisodeLoop:
         ids = ids[: len(waiting)]
         if not len(ids):
             return
+        if self.before_start is not None and not (self.emergency_stop or self.fault):
+            self.before_start(waiting[-1])
         # A person decides when the robot moves again; the stop may also have come between two episodes.
         self.emergency_stop |= self.robots.estop_pressed
-        if self.emergency_stop or self.fault:
+        if self.emergency_stop or self.fault or self._is_stopped():
             waiting.clear()
             return
-        if self.before_start is not None:
-            self.before_start(waiting[-1])
         specs = [waiting.pop() for _ in ids]
         scenes = [self.task.sample(spec.seed) for spec in specs]
         states = self.robots.reset(ids, scenes, [spec.seed for spec in specs])

@@ -206,7 +206,7 @@ def test_a_slow_device_is_late_and_counted_and_no_frame_is_repeated(tmp_path: Pa
         host.stop(ONLY)
     assert skipped >= 5  # 0.15 s at 50 frames a second
     assert numbers == sorted(set(numbers))
-    assert numbers[-1] == 7 + skipped
+    assert numbers[-1] == len(numbers) - 1 + skipped
 
 
 def test_a_frozen_camera_is_seen_in_the_age_of_its_images(tmp_path: Path) -> None:
