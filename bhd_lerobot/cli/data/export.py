@@ -19,12 +19,12 @@ from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, counted
-from bhd_lerobot.rosbag.exporter.episode import START_S, ExportOptions
-from bhd_lerobot.rosbag.exporter.export import export_bags
-from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME
-from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
-from bhd_lerobot.rosbag.messages.views import JointFrame, RobotView, StaticFrame
-from bhd_lerobot.rosbag.storage.write import FORMATS
+from bhd_lerobot.ros2.bag.exporter.episode import START_S, ExportOptions
+from bhd_lerobot.ros2.bag.exporter.export import export_bags
+from bhd_lerobot.ros2.bag.storage.write import FORMATS
+from bhd_lerobot.ros2.messages.arm import ARM_FRAME, TOOL_FRAME
+from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
+from bhd_lerobot.ros2.messages.views import JointFrame, RobotView, StaticFrame
 
 _BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
 _CASTER = (-0.081, 0.0, -0.004)  # [m] in base_link, the same

@@ -26,8 +26,8 @@ from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.storage import write
+from bhd_lerobot.ros2.bag.storage import write
+from bhd_lerobot.ros2.messages import types
 from tests.datasets import support
 from tests.recording.support import run_record
 
