@@ -1,3 +1,14 @@
 """Messages and what they mean for a robot."""
 
-__all__ = ["arm", "base", "images", "parts", "serialize", "split", "types", "views"]
+__all__ = [
+    "arm",
+    "base",
+    "fields",
+    "images",
+    "mapping",
+    "parts",
+    "serialize",
+    "split",
+    "types",
+    "views",
+]
