@@ -7,6 +7,8 @@ __all__ = [
     "images",
     "mapping",
     "parts",
+    "robot_views",
+    "scan",
     "serialize",
     "split",
     "types",
