@@ -183,7 +183,12 @@ def _types(gid_bytes: int) -> tuple[Any, Any, Any]:
     node: Any = make_idl_struct(
         "NodeEntitiesInfo",
         f"{package}NodeEntitiesInfo_",
-        {"node_namespace": text, "node_name": text, "reader_gid_seq": idl.sequence[gid], "writer_gid_seq": idl.sequence[gid]},
+        {
+            "node_namespace": text,
+            "node_name": text,
+            "reader_gid_seq": idl.sequence[gid],
+            "writer_gid_seq": idl.sequence[gid],
+        },
     )
     info: Any = make_idl_struct(
         "ParticipantEntitiesInfo",

@@ -15,7 +15,9 @@ DISTROS = ("humble", "jazzy")
 def _domain() -> int:
     text = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal():
-        raise ConfigError(f"The environment variable ROS_DOMAIN_ID is {text!r}; it is a number from 0 to {_DOMAINS - 1}.")
+        raise ConfigError(
+            f"The environment variable ROS_DOMAIN_ID is {text!r}; it is a number from 0 to {_DOMAINS - 1}."
+        )
     return int(text)
 
 

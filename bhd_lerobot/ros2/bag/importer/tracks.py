@@ -12,11 +12,11 @@ from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import Times, apart, message_times, sane
-from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.bag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topics
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
 from bhd_lerobot.ros2.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.ros2.messages.parts import NANO, WXYZ, head_stamps, header_stamps, numbers
+from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import decode
 
 Array = NDArray[np.float64]
