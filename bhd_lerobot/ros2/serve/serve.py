@@ -86,7 +86,7 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
             server = Server(host, node, _parts(config, host, node, counts), counts)
             where = "this machine" if config.network.is_local else config.network.interface
             console.print(
-                f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain}, {where}. Ctrl-C ends it."
+                f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
             )
             if config.duration_s:
                 timer = threading.Timer(config.duration_s, ended.set)
