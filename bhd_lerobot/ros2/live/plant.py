@@ -15,6 +15,7 @@ class Ros2Plant(Plant):
     """A robot on a ROS 2 network.
 
     Args:
+        name: of the robot.
         config: the robot's configuration.
         inputs: what is received.
         outputs: what is sent.
@@ -22,9 +23,11 @@ class Ros2Plant(Plant):
 
     n = 1
 
-    def __init__(self, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
+    def __init__(
+        self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]
+    ) -> None:
         spec = NodeSpec(
-            f"bhd_{config.type}_{os.getpid()}",
+            f"bhd_{name}_{os.getpid()}",
             config.ros2,
             inputs,
             outputs,
