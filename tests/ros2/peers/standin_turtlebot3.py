@@ -11,9 +11,13 @@ the start [s]; an option may be given several times.
 import json
 import math
 import os
+import signal
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import node as peer
@@ -37,6 +41,7 @@ CYCLE = 5  # steps between two publications of turtlebot3_node: 20 Hz
 TICK = math.tau / 4096  # [rad], of a DYNAMIXEL XL430-W250's encoder
 RPM_UNIT = 0.229 * math.tau / 60 * WHEEL_RADIUS  # [m/s], of its velocity
 TURN = 0.2  # [s], of the lidar: 5 Hz
+RESTART = 75  # exit status of a life that ends by --restart
 OLDEST = 0.2  # [s], what is older by the time it could be published is left out, as after SIGCONT
 
 
@@ -84,7 +89,7 @@ fault.add_argument("--clock-offset", type=float, default=0.0, help="[s]")
 fault.add_argument("--clock-drift", type=float, default=0.0, help="[s/s]")
 fault.add_argument("--clock-jump", action="append", default=[], type=at("START:OFFSET"), metavar="START:OFFSET")
 fault.add_argument("--restart", action="append", default=[], type=at("START:DURATION"), metavar="START:DURATION")
-parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # JSON, of what outlives a restart
+parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # file of what outlives a restart
 args = parser.parse_args()
 
 log_file = open(args.log, "a", buffering=1) if args.log else None  # noqa: SIM115
@@ -142,7 +147,7 @@ class Outlet:
 
 class Robot:
     def __init__(self, new_node: Callable[[str], Node]) -> None:
-        before = json.loads(args.resume) if args.resume else {}
+        before = json.loads(Path(args.resume).read_text()) if args.resume else {}
         self.start = before.get("start", time.monotonic())
         self.restarts = before.get("restarts", 0)
         self.random = np.random.default_rng([args.seed, self.restarts])
@@ -255,12 +260,10 @@ class Robot:
         """Vanish as a robot does whose power fails, without a goodbye, and come back after a time."""
         pose = [self.base.x, self.base.y, self.base.yaw]
         state = {"start": self.start, "pose": pose, "restarts": self.restarts + 1}
+        Path(args.resume).write_text(json.dumps(state))
         record("restart", self.now, down=duration)
         peer.log("restart", down=duration)
-        if log_file is not None:
-            log_file.close()
-        time.sleep(duration)
-        os.execv(sys.executable, [sys.executable, sys.argv[0], *sys.argv[1:], "--resume", json.dumps(state)])
+        os._exit(RESTART)
 
     def begin_turn(self) -> None:
         self.turn_start = self.now
@@ -392,5 +395,34 @@ class Robot:
         )
 
 
+def supervise() -> int:
+    """Run the stand-in in processes of their own, one after the other: each life is another participant of DDS."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        file.write("{}")
+        file.flush()
+        child: subprocess.Popen[bytes] | None = None
+        stopped = False
+
+        def stop(*_: object) -> None:
+            nonlocal stopped
+            stopped = True
+            if child is not None:
+                child.send_signal(signal.SIGINT)
+
+        signal.signal(signal.SIGINT, stop)
+        peer.end_with_parent()
+        for _, down in [*sorted(args.restart), (0.0, 0.0)]:
+            variables = os.environ | {"BHD_PARENT": str(os.getpid())}
+            child = subprocess.Popen([sys.executable, *sys.argv, "--resume", file.name], env=variables)
+            if (status := child.wait()) != RESTART:
+                return status
+            time.sleep(down)
+            if stopped:
+                break
+        return 0
+
+
 if __name__ == "__main__":
+    if args.restart and not args.resume:
+        sys.exit(supervise())
     peer.run(lambda new_node: Robot(new_node).report, args.seconds)
