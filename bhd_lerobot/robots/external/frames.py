@@ -250,7 +250,7 @@ class FrameThread:
                     if frame.mode != Mode.ESTOP:
                         frame.mode = Mode.ESTOP
                         return self._where_it_is(frame)
-                elif self._command is not None:
+                elif self._command is not None and self._active:  # after a fault nothing more is sent
                     (requested, self._came_ns), self._command = self._command, None
                     frame.mode = Mode.TRACKING
                     passed = self._gate.passed(requested)
@@ -263,7 +263,7 @@ class FrameThread:
                 elif silent > config.brain_timeout_s and not frame.watchdog & Watchdog.COMMAND_AGE:
                     frame.mode = Mode.HOLD
                     frame.watchdog |= Watchdog.COMMAND_AGE
-                    return self._gate.holding()
+                    return self._gate.hold()
                 if now >= end_ns or not self._active:
                     self._takes = False
                     return None

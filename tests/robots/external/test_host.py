@@ -331,3 +331,37 @@ def test_a_robot_that_cannot_be_disconnected_is_reported_and_hides_nothing(
     monkeypatch.setattr(MockArm, "disconnect", fail)
     make(tmp_path).close()
     assert "mock_arm could not be disconnected: ConnectionError: the bus does not answer" in capsys.readouterr().err
+
+
+def test_an_action_that_waits_behind_a_blocked_call_is_not_sent_after_the_fault(tmp_path: Path) -> None:
+    gate = GateConfig(brain_timeout_s=0.05, call_timeout_s=0.2)
+    with closing(make(tmp_path, gate, fps=4, fault="send blocks", fault_at=2)) as host:
+        start(host)
+        host.observe()
+        host.step(action(1.0))
+        time.sleep(0.1)  # the hold of the late brain blocks for 2 s
+        host.observe()
+        report = host.step(action(50.0))
+        host.stop(ONLY)
+        assert report.mode[0] == Mode.FAULT
+        time.sleep(2.2)
+    assert {row[0] for row in sent(tmp_path)} == {1.0}
+
+
+def test_after_a_hold_a_base_speeds_up_from_rest(tmp_path: Path) -> None:
+    robot = MockBase(MockArmConfig(id="base", calibration_dir=tmp_path))
+    robot.rows, robot.at = [], 0.0
+    robot.connect()
+    with closing(LeRobotHost(robot, FPS, GateConfig(max_change={"x.vel": 0.1}, brain_timeout_s=0.06))) as host:
+        start(host)
+        for _ in range(5):
+            host.observe()
+            host.step(np.array([[0.5, 0.0]]))
+        time.sleep(0.2)
+        host.observe()
+        host.step(np.array([[0.5, 0.0]]))
+        host.stop(ONLY)
+    speeds = [row[0] for row in robot.rows]
+    held = speeds.index(0.0)
+    assert speeds[held - 1] == pytest.approx(0.5)
+    assert next(speed for speed in speeds[held:] if speed) == pytest.approx(0.1)
