@@ -106,6 +106,11 @@ class Gate:
         self._last = np.where(np.isfinite(near), near, last)
         return Passed(near, int(limits))
 
+    def free_to_jump(self) -> list[str]:
+        """Return the names of positions whose change from one frame to the next is not limited."""
+        is_free = ~(self._is_speed | np.isfinite(self.max_change))
+        return [name for name, free in zip(self.names, is_free, strict=True) if free]
+
     def unlimited(self) -> list[str]:
         """Return the names of actions whose range is not known."""
         is_limited = np.isfinite(self.lower) & np.isfinite(self.upper)
