@@ -272,10 +272,12 @@ class MockBase(MockArm):
         return dict(action)
 
 
-def base(tmp_path: Path, gate: GateConfig | None = None, **options: Any) -> tuple[LeRobotHost, MockBase]:
+def base(
+    tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, **options: Any
+) -> tuple[LeRobotHost, MockBase]:
     robot = MockBase(MockArmConfig(id="base", calibration_dir=tmp_path, **options))
     robot.rows, robot.at = [], 0.0
-    host = LeRobotHost(robot, FPS, gate or GateConfig())
+    host = LeRobotHost(robot, fps, gate or GateConfig())
     robot.connect()
     return host, robot
 
@@ -432,3 +434,15 @@ def test_a_robot_that_cannot_say_whether_it_is_connected_is_let_go_of(
     monkeypatch.setattr(MockArm, "is_connected", property(fail))
     host.close()
     assert "mock_arm could not be disconnected: ConnectionError: the bus does not answer" in capsys.readouterr().err
+
+
+def test_at_the_end_of_an_episode_a_base_stands_at_once(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, fps=2)
+    with closing(host):
+        start(host)
+        host.observe()
+        host.step(np.array([[0.2, 0.0]]))
+        began = time.monotonic()
+        host.stop(ONLY)
+        assert time.monotonic() - began < 0.3  # a frame lasts 0.5 s
+        assert robot.rows[-1][0] == 0.0
