@@ -248,6 +248,8 @@ def test_two_programs_do_not_use_one_robot(tmp_path: Path) -> None:
     with RobotLock(config):
         with pytest.raises(RealtimeError, match=rf"mock_arm .*is used by process {os.getpid()}"):
             run(tmp_path / "d", robot__id="shared")
+        with pytest.raises(RealtimeError, match="is used by process"):  # a port is one robot, whatever it is called
+            run(tmp_path / "d", robot__id="renamed")
         run(tmp_path / "other", robot__id="another", dataset__num_episodes=1)
     run(tmp_path / "again", robot__id="shared", dataset__num_episodes=1)
 
