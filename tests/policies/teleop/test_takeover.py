@@ -94,6 +94,29 @@ class Driver(Counting):
         return np.full((1, len(JOINTS)), self._value)
 
 
+class Late(Counting):
+    """Is still computing when the episode's time is up."""
+
+    def act(self, observation: Observation) -> Any:
+        super().act(observation)
+        if self.resets == 1 and self._count == 3:
+            self.marks.again()
+            time.sleep(0.4)
+        return np.ones((1, len(JOINTS)))
+
+
+def test_a_take_that_ends_before_its_discard_is_seen_is_discarded(tmp_path: Path) -> None:
+    brain = Late("policy", 1.0)
+    robot = MockArm(MockArmConfig(id="arm", calibration_dir=tmp_path))
+    robot.connect()
+    with closing(LeRobotHost(robot, 50, GateConfig())) as host:
+        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.3), 1, 50, None), brain)  # type: ignore[arg-type]
+        brain.marks = loop.marks
+        episodes = list(loop.run([EpisodeSpec(0, 0)]))
+    assert len(episodes) == 1
+    assert brain.resets == 2
+
+
 def test_frames_are_flagged_from_the_first_action_of_the_person_on(tmp_path: Path) -> None:
     marks, brain, person = Marks(hands_over=True), Driver("policy", 1.0), Driver("teleop", 2.0)
     brain.marks = marks
