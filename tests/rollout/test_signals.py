@@ -39,3 +39,14 @@ def test_a_run_in_another_thread_changes_no_handler() -> None:
     thread.start()
     thread.join()
     assert seen == [(False, former)]
+
+
+def test_what_is_ignored_stays_ignored_as_under_nohup() -> None:
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as request:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not request
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, former)

@@ -200,7 +200,7 @@ class Receiver:
         mismatches = self._node.graph.mismatches(one.topic, one.msgtype, one.qos, is_publisher=False)
         if mismatches:
             return " ".join(mismatches)
-        endpoints = [other for other in self._node.graph.endpoints() if other.is_publisher and not other.is_own]
+        endpoints = [other for other in self._node.graph.endpoints() if other.is_publisher and not self._is_ours(other)]
         if any(other.topic == one.topic for other in endpoints):
             so_long = f"for {silent_s:.1f} s" if heard else "yet"
             return f"{one.topic} has a publisher and no message {so_long}."
@@ -211,11 +211,10 @@ class Receiver:
         if not self._spec.is_alone:
             return ""
         topics = {one.topic for one in self._spec.outputs}
-        own = {f"/{self._spec.name}", f"/{self._spec.name}_guard"}
         now = {
             f"{other.topic} by {other.node or 'an unnamed node'}"
             for other in self._node.graph.endpoints()
-            if other.is_publisher and other.topic in topics and not other.is_own and other.node not in own
+            if other.is_publisher and other.topic in topics and not self._is_ours(other)
         }
         # One that has just appeared may not have told its name yet, and may be the guard.
         self._intruders, self._others = now & self._others, now
@@ -225,6 +224,9 @@ class Receiver:
             f"Another node commands the robot: {', '.join(sorted(self._intruders))}. Stop it; one that was killed "
             "counts for up to 20 s more."
         )
+
+    def _is_ours(self, endpoint: Endpoint) -> bool:
+        return endpoint.is_own or endpoint.node == f"/{self._spec.name}_guard"
 
 
 def _header_stamp(data: bytes) -> int:

@@ -4,7 +4,6 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -74,8 +73,10 @@ def test_it_reads_what_the_robot_measures_and_drives_it(robot: Peer, plant: Base
     out = reading()
     plant.read(out)
     now = time.monotonic_ns()
-    assert 0 < now - int(out.stamp_ns[0]) < 5e9 and 0 < now - int(out.sensors_ns[0]) < 5e9
-    assert np.isfinite(out.sensors).all() and 0.12 <= out.sensors[0, :360].min() <= out.sensors[0, :360].max() <= 3.5
+    assert 0 < now - int(out.stamp_ns[0]) < 5e9
+    assert 0 < now - int(out.sensors_ns[0]) < 5e9
+    assert np.isfinite(out.sensors).all()
+    assert 0.12 <= out.sensors[0, :360].min() <= out.sensors[0, :360].max() <= 3.5
     before = out.position.copy()
     drive(plant, lambda: moves(robot), "the robot moves")
     plant.read(out)
@@ -97,7 +98,7 @@ def test_it_stops_when_commands_cease_and_when_it_is_closed(robot: Peer, plant: 
 def test_it_stops_when_the_node_is_killed_or_stopped(robot: Peer, plant: BasePlant, number: int) -> None:
     drive(plant, lambda: moves(robot), "the robot moves")
     os.kill(plant.link.pids["node"], number)
-    with pytest.raises(RealtimeError, match="node (ended with status -9|is stopped)"):
+    with pytest.raises(RealtimeError, match=r"node (ended with status -9|is stopped)"):
         until(lambda: [plant.write(FORWARD), plant.read(reading()), False][2], "it is noticed")
     until(lambda: stands(robot), "the guard stops the robot")
     if number == signal.SIGSTOP:
@@ -127,10 +128,14 @@ def test_what_is_wrong_with_a_topic_is_named(domain: int, options: list[str], te
     with Peer("standin_turtlebot3.py", *options, domain=domain) as peer:
         peer.wait_event("ready")
         plant = make(domain)
+
+        def fails() -> None:
+            plant.link.open(patience_s=4.0)
+            until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
         try:
             with pytest.raises(RealtimeError, match=text):
-                plant.link.open(patience_s=4.0)
-                until(lambda: [plant.read(reading()), False][1], "it is noticed")
+                fails()
         finally:
             plant.close()
 
@@ -138,7 +143,9 @@ def test_what_is_wrong_with_a_topic_is_named(domain: int, options: list[str], te
 def test_another_node_that_commands_the_robot_is_named(robot: Peer, plant: BasePlant, domain: int) -> None:
     with (
         Peer("avoidance_node.py", domain=domain),
-        pytest.raises(RealtimeError, match="Another node commands the robot: /cmd_vel by /"),
+        pytest.raises(
+            RealtimeError, match=r"Another node commands the robot: /cmd_vel by (/avoidance_node|an unnamed node)"
+        ),
     ):
         until(lambda: [plant.read(reading()), False][1], "it is noticed")
 
