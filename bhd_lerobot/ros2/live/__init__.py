@@ -1,3 +1,16 @@
 """Robots on a ROS 2 network, through Cyclone DDS, without a ROS installation."""
 
-__all__ = ["graph", "network", "node", "topic_types"]
+__all__ = [
+    "arm_plant",
+    "base_plant",
+    "channel",
+    "clock_offset",
+    "graph",
+    "link",
+    "network",
+    "node",
+    "plant",
+    "process",
+    "spec",
+    "topic_types",
+]

@@ -105,6 +105,7 @@ class BasePlant(Ros2Plant):
     """
 
     takes = "twist"
+    command_hz = 50.0
 
     def __init__(self, config: Any, body: MobileBase) -> None:
         if body.lidar is None:

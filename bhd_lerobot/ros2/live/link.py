@@ -88,10 +88,10 @@ class NodeLink:
     def _wait_for_topics(self, end: float) -> None:
         while True:
             state = self.state
-            counts = [] if state is None else state["count"].tolist()
-            if (not self.spec.inputs or (counts and all(counts))) and all(
-                len(images) for images in self.channel.images
-            ):
+            heard = state is not None and all(
+                count or not one.is_required for one, count in zip(self.spec.inputs, state["count"], strict=True)
+            )
+            if (heard or not self.spec.inputs) and all(len(images) for images in self.channel.images):
                 return
             if time.monotonic() > end:
                 raise RealtimeError(self.problem or "No topic has sent anything yet.")

@@ -86,18 +86,21 @@ class Ros2Config(NetworkConfig):
     """A robot on the network.
 
     Attributes:
-        command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough.
+        command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
+            base, 125 Hz to an arm.
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
         silence_s: readings that are older are a fault [s].
     """
 
-    command_hz: float = 50.0
+    command_hz: float = 0.0
     timeout_s: float = 0.2
     silence_s: float = 0.2
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("command_hz", "timeout_s", "silence_s"):
+        if not 0 <= self.command_hz < float("inf"):
+            raise ConfigError(f"robot.ros2.command_hz is {self.command_hz}; it is finite and not negative.")
+        for name in ("timeout_s", "silence_s"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"robot.ros2.{name} is {getattr(self, name)}; it is positive and finite.")
 

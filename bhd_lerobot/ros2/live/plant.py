@@ -22,6 +22,7 @@ class Ros2Plant(Plant):
     """
 
     n = 1
+    command_hz: float
 
     def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
         spec = NodeSpec(
@@ -29,7 +30,7 @@ class Ros2Plant(Plant):
             config.ros2,
             inputs,
             outputs,
-            command_hz=config.ros2.command_hz,
+            command_hz=config.ros2.command_hz or self.command_hz,
             timeout_s=config.ros2.timeout_s,
         )
         self.link = NodeLink(spec)

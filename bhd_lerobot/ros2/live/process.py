@@ -110,6 +110,7 @@ class Receiver:
         self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
         self._stamps = [0] * len(self._inputs)
         self._record = np.zeros((), channel.state_dtype)
+        self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()

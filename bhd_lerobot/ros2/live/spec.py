@@ -43,7 +43,8 @@ class InputSpec:
     Attributes:
         topic, msgtype, qos: of the subscription.
         reader: takes the numbers from a message.
-        silence_s: without a message for so long it is silent, which is a problem [s].
+        silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
+            when something changes, which is not waited for either: its numbers are not a number until then.
         frame: what the header's `frame_id` has to be; any if empty.
     """
 
@@ -53,6 +54,11 @@ class InputSpec:
     qos: Qos = field(default_factory=Qos)
     silence_s: float = 1.0
     frame: str = ""
+
+    @property
+    def is_required(self) -> bool:
+        """Whether it is waited for."""
+        return np.isfinite(self.silence_s).item()
 
 
 @dataclass(frozen=True)

@@ -12,5 +12,6 @@ __all__ = [
     "serialize",
     "split",
     "types",
+    "ur",
     "views",
 ]
