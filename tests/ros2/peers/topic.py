@@ -14,6 +14,7 @@ import math
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import node as peer
@@ -21,12 +22,18 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
+
+def from_json(text: str) -> Any:
+    return json.loads(Path(text[1:]).read_text() if text.startswith("@") else text)
+
+
 parser = peer.options(__doc__)
 parser.add_argument("verb", choices=("pub", "echo", "list", "call"))
 parser.add_argument("name", nargs="?")
 parser.add_argument("type", nargs="?")
-parser.add_argument("values", nargs="?", type=json.loads, default={})
+parser.add_argument("values", nargs="?", type=from_json, default={}, help="JSON, or @ and the name of a file with it")
 parser.add_argument("--hz", type=float, default=10.0)
+parser.add_argument("--burst", type=int, default=1, help="messages each time")
 parser.add_argument("--count", type=int, default=0, help="end after so many messages; 0: never")
 parser.add_argument("--best-effort", action="store_true")
 parser.add_argument("--latched", action="store_true", help="durability transient local")
@@ -88,9 +95,10 @@ def publish(node: Node) -> Callable[[], None]:
         message = fill(kind(), args.values)
         if hasattr(message, "header") and "stamp" not in args.values.get("header", {}):
             message.header.stamp = node.get_clock().now().to_msg()
-        publisher.publish(message)
-        sent += 1
-        if sent == args.count:
+        for _ in range(args.burst):
+            publisher.publish(message)
+            sent += 1
+        if args.count and sent >= args.count:
             end()
 
     node.create_timer(1 / args.hz, send)
