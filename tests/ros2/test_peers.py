@@ -90,6 +90,7 @@ def test_the_standin_has_the_faults_that_are_asked_for(domain: int) -> None:
         "--zero-stamp=imu",
         "--clock-jump=0:3600",
         "--silence=battery_state:2",
+        "--swap=joint_states:3",
     )
     topics = {
         "scan": "sensor_msgs/msg/LaserScan",
@@ -104,6 +105,8 @@ def test_the_standin_has_the_faults_that_are_asked_for(domain: int) -> None:
             name: stack.enter_context(Peer("topic.py", "echo", f"/{name}", kind, "--best-effort", domain=domain))
             for name, kind in topics.items()
         }
+        joints = echoes["joint_states"]
+        joints.wait(lambda _: len(joints.events("message")) >= 12)
         heard = {
             name: echo.wait_event("message")["message"] for name, echo in echoes.items() if name != "battery_state"
         }
@@ -114,6 +117,9 @@ def test_the_standin_has_the_faults_that_are_asked_for(domain: int) -> None:
     assert abs(heard["odom"]["twist"]["twist"]["linear"]["x"]) < 1e-6
     assert heard["imu"]["header"]["stamp"] == {"sec": 0, "nanosec": 0}
     assert heard["joint_states"]["header"]["stamp"]["sec"] > time.time() + 3000
+    stamps = [line["message"]["header"]["stamp"] for line in joints.events("message")]
+    times = [stamp["sec"] + stamp["nanosec"] * 1e-9 for stamp in stamps]
+    assert times != sorted(times)
     assert 0 < published["battery_state"] < published["odom"]
 
 
