@@ -17,7 +17,7 @@ from bhd_lerobot.cli import evaluate, record
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.remote import hub, local, store
 from bhd_lerobot.hub import transfer
-from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.ros2.messages.types import type_store
 from bhd_lerobot.training import train
 from bhd_lerobot.training.rl import train as rl
 from tests import quick

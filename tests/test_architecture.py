@@ -65,10 +65,13 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.remote": (*_DATASETS, "datasets.assembly", "datasets.edit"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": (*_DATASETS, "control"),
-    "rosbag.messages": ("bodies", "datasets.format"),
-    "rosbag.storage": ("datasets.storage", "rosbag.messages"),
-    "rosbag.exporter": (*_DATASETS, "datasets.edit", "rosbag.messages", "rosbag.storage"),
-    "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),
+    "ros2.messages": ("bodies", "datasets.format"),
+    "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
+    "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
+    "ros2.bag.importer": (
+        *("tasks", "bodies", "control", "datasets.format", "datasets.writer"),
+        *("ros2.messages", "ros2.bag.storage", "ros2.bag.exporter"),
+    ),
     "rollout": (
         *("__version__", "options", "registry"),
         *("tasks", "bodies", "sim", "control", "robots.*", "policies.*"),

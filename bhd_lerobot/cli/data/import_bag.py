@@ -11,8 +11,8 @@ from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.errors import ConfigError, counted, quoted, unknown_name
-from bhd_lerobot.rosbag.importer.convert import ImportReport, import_bags
-from bhd_lerobot.rosbag.importer.exported import (
+from bhd_lerobot.ros2.bag.importer.convert import ImportReport, import_bags
+from bhd_lerobot.ros2.bag.importer.exported import (
     ExportedEpisode,
     exported_cameras,
     exported_episodes,
@@ -20,12 +20,12 @@ from bhd_lerobot.rosbag.importer.exported import (
     is_exported,
     names_of,
 )
-from bhd_lerobot.rosbag.importer.options import ImportOptions
-from bhd_lerobot.rosbag.messages.base import TWIST
-from bhd_lerobot.rosbag.messages.types import require_rosbags
-from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
-from bhd_lerobot.rosbag.storage.place import refuse_existing
-from bhd_lerobot.rosbag.storage.read import Bag
+from bhd_lerobot.ros2.bag.importer.options import ImportOptions
+from bhd_lerobot.ros2.bag.storage.find import check_distinct, find_bags
+from bhd_lerobot.ros2.bag.storage.place import refuse_existing
+from bhd_lerobot.ros2.bag.storage.read import Bag
+from bhd_lerobot.ros2.messages.base import TWIST
+from bhd_lerobot.ros2.messages.types import require_rosbags
 from bhd_lerobot.tasks.task import OUTCOMES
 
 ROBOTS = ("turtlebot3",)

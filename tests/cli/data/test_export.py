@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.cli.data.export import robot_view
+from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.storage import write
+from bhd_lerobot.ros2.bag.storage import write
+from bhd_lerobot.ros2.messages import types
 from tests.datasets import support
 from tests.recording.support import run_record
 

@@ -12,8 +12,8 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from tests.cli.data.import_support import TASK, imported, refused, run
-from tests.rosbag import support as bags
-from tests.rosbag.support import NANO, START, drive, without, write
+from tests.ros2.bag import support as bags
+from tests.ros2.bag.support import NANO, START, drive, without, write
 
 
 @pytest.fixture(scope="module")

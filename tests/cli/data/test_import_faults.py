@@ -15,8 +15,8 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from tests.cli.data.import_support import TASK, imported, refused, run
-from tests.rosbag import support as bags
-from tests.rosbag.support import NANO, START, STORE, changed, drive, write
+from tests.ros2.bag import support as bags
+from tests.ros2.bag.support import NANO, START, STORE, changed, drive, write
 
 
 @pytest.fixture(scope="module")

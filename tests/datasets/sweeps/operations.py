@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.storage.atomic import UNFINISHED_VERSION
-from bhd_lerobot.rosbag.exporter.episode import ExportOptions
-from bhd_lerobot.rosbag.exporter.export import export_bags
-from bhd_lerobot.rosbag.messages.views import RobotView
+from bhd_lerobot.ros2.bag.exporter.episode import ExportOptions
+from bhd_lerobot.ros2.bag.exporter.export import export_bags
+from bhd_lerobot.ros2.messages.views import RobotView
 from tests.datasets import support
 from tests.datasets.edit_support import record
 from tests.datasets.foreign import edit_json

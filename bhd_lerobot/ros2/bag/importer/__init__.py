@@ -1,0 +1,15 @@
+"""Bags into a dataset."""
+
+__all__ = [
+    "columns",
+    "convert",
+    "diagnostics",
+    "exported",
+    "frames",
+    "options",
+    "resample",
+    "segments",
+    "topics",
+    "tracks",
+    "video",
+]

@@ -1,0 +1,163 @@
+"""What is in the frames of an episode that is made of a robot's bag: every column but the images."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.ros2.bag.importer.options import ImportOptions
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, newest
+from bhd_lerobot.ros2.bag.importer.tracks import Array, Track
+from bhd_lerobot.ros2.messages.base import ODOMETRY, TWIST
+from bhd_lerobot.tasks.task import OUTCOMES, Event
+
+MOST_UNEXPLAINED = 0.1
+"""Share of the frames in which a robot may move without a command: beyond it, what drove it is another one."""
+_MOVES = 0.01
+"""[m/s, rad/s] A robot that is slower stands."""
+
+
+def frame_columns(
+    options: ImportOptions, tracks: Mapping[str, Track], times: Times, ages: Times, outcome: str | None
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of an episode.
+
+    Args:
+        times: of the frames [ns], shape (n,).
+        ages: of the oldest of each frame's newest readings [ns], shape (n,).
+    """
+    n = len(times)
+    commands, command_age = _commands(options, tracks, times)
+    in_force = command_age >= 0
+    limits = np.inf if options.max_speed is None else np.array(options.max_speed)
+    applied = np.clip(commands, -limits, limits)
+    over = (applied != commands).any(axis=1)
+    done = np.arange(n) == n - 1
+    ended = Event[outcome.upper()] if outcome in OUTCOMES else Event.NOTHING
+    vectors = {
+        keys.OBSERVATION_STATE: _state(options, tracks, times),
+        keys.ENVIRONMENT_STATE: _vector(options.environment_names, keys.ENVIRONMENT_STATE, tracks, times),
+        keys.ACTION: commands,
+        keys.APPLIED_ACTION: applied,
+    }
+    return {
+        **{key: values.astype(np.float32) for key, values in vectors.items() if values.shape[1]},
+        keys.TIME: (times - times[0]) / NANO,
+        keys.AGE: (ages / NANO).astype(np.float32),
+        keys.COMMAND_AGE: (np.where(in_force, command_age, 0) / NANO).astype(np.float32),
+        keys.LATENESS: np.zeros(n, np.float32),
+        keys.OVERRUNS: np.zeros(n, np.int64),
+        keys.SKIPPED: np.zeros(n, np.int64),
+        keys.INFERENCE_TIME: np.zeros(n, np.float32),
+        keys.LATE: ages > round(options.max_age_s * NANO),
+        keys.LIMITS: np.where(over, int(Limit.VELOCITY), 0),
+        keys.WATCHDOG: np.where(in_force, 0, int(Watchdog.COMMAND_AGE)),
+        keys.MODE: np.where(in_force, int(Mode.TRACKING), int(Mode.HOLD)),
+        keys.REWARD: np.zeros(n, np.float32),
+        keys.SUCCESS: done & (ended == Event.SUCCESS),
+        keys.DONE: done,
+        keys.EVENT: np.where(done, int(ended), 0),
+    }
+
+
+def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
+    """Return how many frames have no command, or one that the robot does not obey; None if all is well."""
+    n, silent = len(columns[keys.MODE]), columns[keys.MODE] == int(Mode.HOLD)
+    for_ever = np.isinf(options.command_timeout_s)
+    if not silent.any():
+        judged = for_ever and options.timeouts and TWIST[0] in options.observation_names
+        return _standing_note(options, columns) if judged else None
+    lacking = "come before the first command" if for_ever else (
+        f"have no command that is younger than {options.command_timeout_s:g} s"
+    )  # fmt: skip
+    moving = int((silent & _moves(options, columns[keys.OBSERVATION_STATE])).sum())
+    drove = f", though the robot moved in {moving} of them" if moving else ""
+    if moving and not for_ever:
+        drove += ": --command_timeout=inf is for robots that continue with the last command"
+    return f"{int(silent.sum())} of {n} frames of the episode {lacking}; their action is 0{drove}"
+
+
+def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
+    driven = (np.abs(columns[keys.ACTION]) > _MOVES).any(axis=1)
+    against = int((driven & ~_moves(options, columns[keys.OBSERVATION_STATE])).sum())
+    if against <= MOST_UNEXPLAINED * len(driven):
+        return None
+    return (
+        f"in {against} of {len(driven)} frames of the episode the robot stands though its last command is to drive. If "
+        "it stops by itself when no command comes, give that time: --command_timeout=S"
+    )
+
+
+def unexplained_frames(
+    options: ImportOptions, tracks: Mapping[str, Track], times: Times, timeout_s: float
+) -> tuple[int, int]:
+    """Return in how many frames the robot moves without a command, and in how many it stands against one.
+
+    Args:
+        times: of the frames [ns], shape (n,).
+    """
+    commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
+    moves = _moves(options, _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times))
+    driven = (np.abs(commands) > _MOVES).any(axis=1)
+    return int((moves & (age < 0)).sum()), int((~moves & driven).sum())
+
+
+def _moves(options: ImportOptions, state: NDArray[Any]) -> NDArray[np.bool_]:
+    names = list(options.observation_names)
+    return (np.abs(state[:, [names.index(name) for name in TWIST if name in names]]) > _MOVES).any(axis=1)
+
+
+def _commands(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:
+    """Return the command in force at the end of each frame, shape (n, d), and its age then [ns]; 0 and -1 if none.
+
+    An action is the command over the frame that an observation begins. What answers the observation comes after
+    it: the command in force when the observation was taken is the answer to the one before.
+    """
+    ends = times + round(NANO / options.fps)
+    if "cmd" not in tracks:
+        parts = [track for role, track in tracks.items() if role.startswith(f"{keys.ACTION}/")]
+        ages = [ends - track.times[newest(track.times, ends - 1)] for track in parts]
+        oldest = np.maximum.reduce(ages) if ages else np.zeros_like(ends)
+        return _vector(options.action_names, keys.ACTION, tracks, ends - 1), oldest
+    track = tracks["cmd"]
+    place = newest(track.times, ends - 1)
+    known = np.maximum(place, 0)
+    if not len(track.times):
+        return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
+    age = np.where(place < 0, -1, ends - track.times[known])
+    if np.isfinite(options.command_timeout_s):
+        age = np.where(age > round(options.command_timeout_s * NANO), -1, age)
+    order = [TWIST.index(name) for name in options.action_names]
+    return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
+
+
+def _state(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> Array:
+    state = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    names = list(options.observation_names)
+    if "odom" in tracks and options.pose:
+        pose = [names.index(name) for name in ODOMETRY]
+        state[:, pose] = _since_start(state[:, pose])
+    elif ODOMETRY[2] in names:  # unwrapped over a bag, which may hold several episodes
+        yaw = state[:, names.index(ODOMETRY[2])]
+        yaw -= 2 * np.pi * np.round(yaw[0] / (2 * np.pi))
+    return state
+
+
+def _vector(names: tuple[str, ...], feature: str, tracks: Mapping[str, Track], at: Times) -> Array:
+    """Return what the newest messages at some times say of a feature, shape (n, len(names))."""
+    columns: dict[str, Array] = {}
+    for role, track in tracks.items():
+        if role.startswith(f"{feature}/") or (feature == keys.OBSERVATION_STATE and role in ("scan", "odom", "imu")):
+            columns |= dict(zip(track.names, track.values[newest(track.times, at)].T, strict=True))
+    return np.stack([columns[name] for name in names], axis=1) if names else np.zeros((len(at), 0))
+
+
+def _since_start(pose: Array) -> Array:
+    """Return poses x, y, yaw in the frame of the first one, shape (n, 3)."""
+    x, y, yaw = (pose - pose[0]).T
+    cos, sin = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)

@@ -1,0 +1,354 @@
+"""From bags to a dataset with the columns that our own recordings of the robot have: all of it, or nothing."""
+
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetError, DatasetWriteError
+from bhd_lerobot.ros2.bag.importer.columns import (
+    MOST_UNEXPLAINED,
+    command_note,
+    frame_columns,
+    unexplained_frames,
+)
+from bhd_lerobot.ros2.bag.importer.exported import ExportedEpisode
+from bhd_lerobot.ros2.bag.importer.options import ImportOptions
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
+from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
+from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
+from bhd_lerobot.ros2.bag.importer.video import CAMERA, CameraImages
+from bhd_lerobot.ros2.bag.storage.place import complete_or_not
+from bhd_lerobot.ros2.bag.storage.read import Bag
+from bhd_lerobot.ros2.messages.base import TWIST
+from bhd_lerobot.tasks.task import Event
+
+_LISTED = 8  # sentences in an error; a damaged bag may give hundreds
+
+
+@dataclass
+class ImportReport:
+    """What was made of bags.
+
+    Attributes:
+        root: the dataset.
+        episodes, frames: how many.
+        problems: what was wrong with the bags, in sentences.
+        notes: what was done that the user should know, in sentences.
+    """
+
+    root: Path
+    episodes: int = 0
+    frames: int = 0
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def import_bags(
+    bags: Sequence[Bag],
+    root: Path | str | None,
+    repo_id: str,
+    options: ImportOptions,
+    exported: Sequence[Sequence[ExportedEpisode]] = (),
+) -> ImportReport:
+    """Make a dataset of bags of a robot, or of exported ones; the whole of it, or nothing, also after a kill.
+
+    Args:
+        bags: in order; each gives one episode, or several where it has gaps.
+        root: where to put it; LeRobot's default place if None.
+        repo_id: its name.
+        options: what becomes of them.
+        exported: the episodes that each bag describes, if `bhd-data export` wrote it.
+
+    Raises:
+        DatasetError: a bag does not have what is needed.
+        DatasetExistsError: `root` exists.
+        DatasetWriteError: the dataset cannot be written.
+    """
+    report = ImportReport(Path(root) if root is not None else default_root(repo_id))
+    if "scan" in options.topics and "odom" not in options.topics:
+        names = options.observation_names
+        report.notes.append(
+            f"no odometry is read: the state is {names[0]} to {names[-1]}, without {' and '.join(TWIST)}. Whether the "
+            "robot obeyed is not known, and a policy that learns from it needs a robot that observes the same"
+        )
+    # A dataset with some of the episodes would look like a recording that was interrupted.
+    with (
+        complete_or_not(report.root, "--root", "import bags", "No dataset was made.") as folder,
+        _recording(folder, repo_id, options) as recording,
+    ):
+        for place, bag in enumerate(bags):
+            robot_bag = _RobotBag(bag, options, recording, exported[place] if exported else ())
+            episodes = list(robot_bag.episodes())
+            robot_bag.check_commands(episodes)
+            for episode in episodes:
+                report.frames += robot_bag.save(episode)
+                report.episodes += 1
+            report.problems += bag.problems
+            report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
+        if not report.episodes:
+            sensors = ", ".join(topic for role, topic in options.topic_of.items() if role != "cmd")
+            reasons = "; ".join([*report.problems, *report.notes][:_LISTED])
+            raise DatasetError(
+                f"No episode of {options.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}:"
+                f" there is no such time in which {sensors} were received at least every {options.max_gap_s:g} s. "
+                f"{reasons}"
+            )
+    if late := recording.late:
+        most, bag_name = max(late)
+        report.notes.append(
+            f"{sum(count for count, _ in late)} of {report.frames} frames, in {len(late)} of {report.episodes} "
+            f"episodes, have a reading older than {options.max_age_s:g} s; control.late is true in them (the most in "
+            f"one of {bag_name}: {most})"
+        )
+    return report
+
+
+@contextlib.contextmanager
+def _recording(folder: Path, repo_id: str, options: ImportOptions) -> Iterator["_Recording"]:
+    """Give the dataset that is being made, and finalise it at the end of the block."""
+    recording = _Recording(folder, repo_id, options)
+    try:
+        yield recording
+        recording.finalize()
+    except BaseException as error:
+        with contextlib.suppress(Exception):
+            recording.finalize()  # releases the lock
+        if isinstance(error, DatasetWriteError) and isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None  # the recorder's remedies are for a dataset that stays
+        raise
+
+
+class _Recording:
+    """The dataset that is being made.
+
+    Attributes:
+        late: of each episode that has any, how many frames are late, and the name of its bag.
+    """
+
+    def __init__(self, folder: Path, repo_id: str, options: ImportOptions) -> None:
+        self.late: list[tuple[int, str]] = []
+        self._folder, self._repo_id, self._options = folder, repo_id, options
+        self._recorder: DatasetRecorder | None = None
+        self._seen: dict[tuple[int, ...], Path] = {}
+
+    def finalize(self) -> None:
+        if self._recorder is not None:
+            self._recorder.finalize()
+
+    def recorder(self, cameras: Sequence[CameraImages]) -> DatasetRecorder:
+        """Return the recorder, which is created with the first episode."""
+        if self._recorder is None:
+            options = self._options
+            images = {camera.name: camera.shape() for camera in cameras}
+            features = keys.dataset_features(
+                options.observation_names, options.action_names, images, {}, options.environment_names
+            )  # the state of a real robot's physics is not known
+            self._recorder = DatasetRecorder.create(
+                self._repo_id,
+                options.fps,
+                {key: feature for key, feature in features.items() if feature["shape"] != (0,)},
+                robot_type=options.robot_type,
+                root=self._folder,
+                recording=options.identity(),
+            )
+        return self._recorder
+
+    def refuse_again(self, bag: Path, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage."""
+        vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
+        numbers = (start, *(crc32(values.tobytes()) for values in vectors))
+        if numbers in self._seen:
+            raise DatasetError(
+                f"{self._seen[numbers]} and {bag} hold the same drive: the same numbers at {start / NANO:.3f} s. It "
+                "would be in the dataset twice; leave one of them out."
+            )
+        self._seen[numbers] = bag
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time."""
+
+    grid: Grid
+    tracks: Mapping[str, Track]
+    exported: ExportedEpisode | None
+
+
+class _RobotBag:
+    """One bag, all of it but images in memory."""
+
+    def __init__(
+        self, bag: Bag, options: ImportOptions, recording: _Recording, exported: Sequence[ExportedEpisode]
+    ) -> None:
+        self.notes: list[str] = []
+        self._bag, self._options, self._recording, self._exported = bag, options, recording, exported
+        self._tracks = read_tracks(bag, options, self.notes)
+        self._cameras = [
+            CameraImages(bag, role, track, self.notes)
+            for role, track in self._tracks.items()
+            if role.startswith(CAMERA)
+        ]
+        self._begin = min(int(track.times.min()) for track in self._tracks.values())
+        self._check_clocks()
+
+    def _check_clocks(self) -> None:
+        """Check that commands and sensors are of one time."""
+        if "cmd" not in self._tracks:
+            return
+        cmd = self._tracks["cmd"].times
+        sensors = [track.times for role, track in self._tracks.items() if role != "cmd"]
+        begin, end = min(int(sensor.min()) for sensor in sensors), max(int(sensor.max()) for sensor in sensors)
+        if int(cmd.max()) < begin - NANO or int(cmd.min()) > end + NANO:
+            raise DatasetError(
+                f"{self._bag.path}: {self._tracks['cmd'].topic} is from {cmd.min() / NANO:.1f} to "
+                f"{cmd.max() / NANO:.1f} s and the sensors are from {begin / NANO:.1f} to {end / NANO:.1f} s, so no "
+                "command belongs to them. Their stamps are of different clocks; --stamps=receive takes the recorder's "
+                "for all."
+            )
+
+    def episodes(self) -> Iterator[_Episode]:
+        """Yield the episodes in order."""
+        options = self._options
+        parts = segments(
+            self._tracks,
+            [episode.place for episode in self._exported],
+            stamps=options.stamps,
+            max_speed=options.max_speed if "odom" in self._tracks and options.pose else None,
+            max_gap_s=options.max_gap_s,
+            notes=self.notes,
+        )
+        begin = 0
+        for part in parts:
+            # The pose began anew, not the clock: a command from before is still in force.
+            begin = begin if part.why == "reset" else part.first
+            begun = [episode for episode in self._exported if episode.place <= part.first] or self._exported[:1]
+            of_commands = part._replace(first=begin)
+            tracks = {
+                role: track.part((of_commands if role == "cmd" else part).mask(track))
+                for role, track in self._tracks.items()
+            }
+            sensors = {role: track for role, track in tracks.items() if role != "cmd"}
+            self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
+            for grid in grids(
+                [track.times for track in sensors.values()],
+                options.fps,
+                max_age_ns=round(options.max_age_s * NANO),
+                max_gap_ns=round(options.max_gap_s * NANO),
+                why=part.why,
+            ):
+                lasts = (len(grid.times) - 1) / options.fps
+                if lasts >= options.min_episode_s:
+                    yield _Episode(grid, tracks, begun[-1] if begun else None)
+                else:
+                    self.notes.append(
+                        f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
+                        "was left out"
+                    )
+
+    def check_commands(self, episodes: Sequence[_Episode]) -> None:
+        """Check that commands explain how the robot moves, unless the user said how long they are in force."""
+        options, n = self._options, sum(len(episode.grid.times) for episode in episodes)
+        if "cmd" not in self._tracks:
+            return
+        counts = {
+            timeout: np.sum(
+                [unexplained_frames(options, one.tracks, one.grid.times, timeout) for one in episodes], axis=0
+            )
+            for timeout in options.timeouts
+            if n
+        }
+        if not counts or (moving := counts[options.command_timeout_s][0]) <= MOST_UNEXPLAINED * n:
+            return
+        what = {
+            timeout: "the last command" if math.isinf(timeout) else "none, after so many seconds" for timeout in counts
+        }
+        choices = "; ".join(
+            f"--command_timeout={timeout:g}, {what[timeout]}: the robot moves in {blind} frames with the action 0, and "
+            f"stands in {against} although the action says to drive"
+            for timeout, (blind, against) in counts.items()
+        )
+        raise DatasetError(
+            f"{self._bag.path}: the robot moves in {moving} of {n} frames ({100 * moving / n:.0f} %) without a command "
+            f"of {self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove "
+            f"it with --cmd, or choose what is in force while no command comes. {choices}."
+        )
+
+    def save(self, episode: _Episode) -> int:
+        """Save an episode and return its number of frames."""
+        recorder = self._recording.recorder(self._cameras)
+        episode = self._with_images(episode)
+        times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
+        writer = recorder.begin_episode()
+        try:
+            for camera in self._cameras:
+                shown = camera.write(episode.tracks[camera.role], times, writer)
+                ages = np.maximum(ages, times - shown)
+            task, metadata = self._described(episode)
+            columns = frame_columns(self._options, episode.tracks, times, ages, metadata.get("outcome"))
+            self._recording.refuse_again(self._bag.path, int(times[0]), columns)
+            writer.set_columns(columns)
+            recorder.save(writer, task=task, metadata={**metadata, "source": self._source(episode, columns)})
+        except BaseException:
+            writer.discard()
+            raise
+        begin = self._after_start(episode.grid)
+        if silence := command_note(self._options, columns):
+            self.notes.append(f"{begin}: {silence}")
+        if late := int(columns[keys.LATE].sum()):
+            self._recording.late.append((late, self._bag.path.name))
+        return len(times)
+
+    def _with_images(self, episode: _Episode) -> _Episode:
+        """Return an episode from the frame on at which every camera has an image that can be decoded."""
+        grid = episode.grid
+        blind = max((camera.blind(episode.tracks[camera.role], grid.times) for camera in self._cameras), default=0)
+        if blind:
+            self.notes.append(
+                f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first image that can "
+                "be decoded"
+            )
+        return replace(episode, grid=Grid(grid.times[blind:], grid.ages[:, blind:], grid.why))
+
+    def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
+        """Return the task of an episode, and its metadata: those of the user have precedence over those of the bag."""
+        options, exported = self._options, episode.exported
+        given: dict[str, Any] = {}
+        if options.outcome is not None:
+            given = {"outcome": options.outcome, "success": options.outcome == Event.SUCCESS.cause}
+        if exported is None:
+            assert options.task is not None
+            return options.task, given
+        metadata = {**exported.metadata}
+        end = exported.start[options.stamps == "header"] + exported.duration
+        if int(episode.grid.times[-1]) + 2 * NANO // options.fps < end and metadata.get("outcome"):
+            self.notes.append(
+                f"{self._after_start(episode.grid)}: the episode ends before the one that was exported, so that its "
+                f"outcome, {metadata['outcome']}, is left out"
+            )
+            metadata |= {"outcome": ""} | ({"success": False} if "success" in metadata else {})
+        return options.task or exported.task, metadata | given
+
+    def _source(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> str:
+        """Return where an episode is from, JSON."""
+        source = {
+            "bag": self._bag.path.name,
+            "start_ns": int(episode.grid.times[0]),
+            "why": episode.grid.why,
+            "late_frames": int(columns[keys.LATE].sum()),
+            "problems": self._bag.problems,
+        }
+        return json.dumps(source)
+
+    def _after_start(self, grid: Grid) -> str:
+        return f"{seconds(int(grid.times[0]) - self._begin)} after the start"

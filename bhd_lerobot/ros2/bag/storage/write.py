@@ -1,0 +1,101 @@
+"""rosbag2 folders."""
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.ros2.messages.types import DEFINITIONS, require_rosbags, type_store
+
+FORMATS = ("mcap", "sqlite3")
+_VERSION: Literal[8] = 8  # of rosbag2's metadata: the newest whose quality of service Humble reads, too
+_FOREVER = (9223372036, 854775807)  # [s, ns] 2^63 - 1 ns, which ROS 2 takes for no limit
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The messages of one topic.
+
+    Attributes:
+        messages: when each was received [ns], in order, and its bytes.
+        latched: late subscribers get the last message, too (transient local).
+    """
+
+    topic: str
+    msgtype: str
+    messages: Iterable[tuple[int, bytes]]
+    latched: bool = False
+
+
+class BagWriter:
+    """Writes one bag; use it as a context manager. After an exception inside the bag is incomplete.
+
+    Args:
+        path: the folder to write; it must not exist.
+    """
+
+    def __init__(self, path: Path, storage: str, custom: Mapping[str, str]) -> None:
+        require_rosbags()
+        if storage not in FORMATS:
+            raise ConfigError(unknown_name("format", storage, FORMATS))
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self._writer = Writer(path, version=_VERSION, storage_plugin=StoragePlugin[storage.upper()])
+        for key, value in custom.items():
+            self._writer.set_custom_data(key, value)
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Create the folder."""
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Write index and metadata, or give up."""
+        self._writer.__exit__(kind, error, traceback)
+
+    def write(self, streams: Iterable[Stream]) -> int:
+        """Write streams in the order of time; at the same time in the order given. Return how many messages."""
+        count = 0
+        writer = self._writer
+        for time_ns, _, connection, payload in heapq.merge(*map(self._timed, range(10**6), streams), key=_order):
+            writer.write(connection, time_ns, payload)
+            count += 1
+        return count
+
+    def _timed(self, place: int, stream: Stream) -> Iterator[tuple[int, int, Any, bytes]]:
+        connection = self._connections.get(stream.topic)
+        if connection is None:
+            connection = self._connections[stream.topic] = self._connect(stream)
+        return ((time_ns, place, connection, payload) for time_ns, payload in stream.messages)
+
+    def _connect(self, stream: Stream) -> Any:
+        from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+        forever = QosTime(*_FOREVER)
+        durability = QosDurability.TRANSIENT_LOCAL if stream.latched else QosDurability.VOLATILE
+        profile = Qos(
+            QosHistory.KEEP_LAST, 1 if stream.latched else 10, QosReliability.RELIABLE, durability,
+            forever, forever, QosLiveliness.AUTOMATIC, forever, False,
+        )  # fmt: skip
+        store = type_store()
+        text, _ = store.generate_msgdef(stream.msgtype, ros_version=2)
+        if stream.msgtype in DEFINITIONS:  # with its comments
+            _, separator, rest = text.partition("=" * 80)
+            text = DEFINITIONS[stream.msgtype].lstrip() + separator + rest
+        return self._writer.add_connection(
+            stream.topic,
+            stream.msgtype,
+            msgdef=text,
+            rihs01=store.hash_rihs01(stream.msgtype),
+            offered_qos_profiles=[profile],
+        )
+
+
+def _order(item: tuple[int, int, Any, bytes]) -> tuple[int, int]:
+    return item[0], item[1]

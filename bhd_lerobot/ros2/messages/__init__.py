@@ -1,0 +1,16 @@
+"""Messages and what they mean for a robot."""
+
+__all__ = [
+    "arm",
+    "base",
+    "fields",
+    "images",
+    "mapping",
+    "parts",
+    "robot_views",
+    "scan",
+    "serialize",
+    "split",
+    "types",
+    "views",
+]

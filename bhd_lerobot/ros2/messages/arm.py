@@ -1,0 +1,68 @@
+"""The messages of an arm: JointState and PoseStamped."""
+
+from collections.abc import Sequence
+from typing import Any, override
+
+import numpy as np
+
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.ros2.messages.parts import WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.ros2.messages.serialize import encode
+
+TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+ARM_FRAME, TOOL_FRAME = "base", "tool"
+
+
+class JointsPart(Part):
+    """Positions of joints, and their speeds where there are any."""
+
+    msgtype = "sensor_msgs/msg/JointState"
+
+    @property
+    def joints(self) -> list[str]:
+        """The joints' names, as ROS has them."""
+        return [f"{name.removesuffix('.pos')}_joint" for name in self.names if name.endswith(".pos")]
+
+    @override
+    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+        count = len(self.joints)
+        fields = {"header": header(frames.stamps), "name": self.joints, "position": values[:, :count]}
+        if len(self.names) > count:
+            fields["velocity"] = values[:, count:]
+        return encode(self.msgtype, fields, len(values))
+
+    @override
+    def decode(self, messages: Sequence[Any]) -> Array:
+        if any(message.name != self.joints for message in messages):
+            raise DatasetError(f"The joints of {self.topic} are not {', '.join(self.joints)}.")
+        with_speeds = len(self.names) > len(self.joints)
+        return self.table([[*message.position, *(message.velocity if with_speeds else ())] for message in messages])
+
+
+class PosePart(Part):
+    """The pose of the tool in the base frame. Our quaternions are w, x, y, z; ROS's fields have names."""
+
+    msgtype = "geometry_msgs/msg/PoseStamped"
+
+    @override
+    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+        fields = {"header": header(frames.stamps, ARM_FRAME), "pose": pose_tree(values)}
+        return encode(self.msgtype, fields, len(values))
+
+    @override
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return np.concatenate(
+            [
+                numbers([message.pose.position for message in messages], XYZ),
+                numbers([message.pose.orientation for message in messages], WXYZ),
+            ],
+            axis=1,
+        )
+
+
+def pose_tree(values: Array) -> dict[str, Any]:
+    """Return `geometry_msgs/msg/Pose` of positions and quaternions wxyz, shape (n, 7)."""
+    return {
+        "position": dict(zip(XYZ, values[:, :3].T, strict=True)),
+        "orientation": dict(zip(WXYZ, values[:, 3:].T, strict=True)),
+    }

@@ -1,0 +1,130 @@
+"""What a topic carries of a feature: numbers that become messages, and come back as they were.
+
+Numbers are float64 in the messages, and ranges float32, as they are in the dataset.
+"""
+
+import re
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.ros2.messages import types
+from bhd_lerobot.ros2.messages.serialize import encode
+
+Array = NDArray[np.float64]
+NANO = 1_000_000_000
+
+XYZ, WXYZ = ("x", "y", "z"), ("w", "x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames of an episode that messages are made for.
+
+    Attributes:
+        episode: its index.
+        index: numbers of the frames, shape (n,).
+        stamps: when the messages are stamped [ns], shape (n,).
+    """
+
+    episode: int
+    index: NDArray[np.int64]
+    stamps: NDArray[np.int64]
+
+    def at(self, number: int) -> "Frames":
+        """Return one of the frames, by its place among them."""
+        part = slice(number, number + 1)
+        return Frames(self.episode, self.index[part], self.stamps[part])
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields that all messages of ours begin with."""
+        return {"header": header(self.stamps), "episode_index": self.episode, "frame_index": self.index}
+
+
+def stamp_tree(stamps: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """Return `builtin_interfaces/msg/Time` of times [ns]."""
+    return {"sec": stamps // NANO, "nanosec": stamps % NANO}
+
+
+def header(stamps: NDArray[np.int64], frame: str = "") -> dict[str, Any]:
+    """Return `std_msgs/msg/Header`."""
+    return {"stamp": stamp_tree(stamps), "frame_id": frame}
+
+
+def header_stamps(messages: Sequence[Any]) -> NDArray[np.int64]:
+    """Return the stamps [ns] of messages with a header, shape (n,)."""
+    return np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec for message in messages], np.int64)
+
+
+def head_stamps(heads: Sequence[bytes]) -> NDArray[np.int64]:
+    """Return the stamps [ns] of messages of which only the first 12 bytes or more are there, with a header's stamp."""
+    pairs = [struct.unpack_from("<iI" if head[1] else ">iI", head, 4) for head in heads]
+    return np.array([seconds * NANO + nanoseconds for seconds, nanoseconds in pairs], np.int64)
+
+
+@dataclass(frozen=True)
+class Part(ABC):
+    """Numbers of a feature that one topic carries.
+
+    Attributes:
+        names: of the numbers, in the order in which they are given and taken.
+    """
+
+    topic: str
+    names: tuple[str, ...]
+
+    msgtype: ClassVar[str]
+
+    @abstractmethod
+    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+        """Return messages of values, shape (n, len(names))."""
+
+    @abstractmethod
+    def decode(self, messages: Sequence[Any]) -> Array:
+        """Return the values in deserialised messages, shape (n, len(names))."""
+
+    def table(self, rows: Sequence[Sequence[float]]) -> Array:
+        """Return rows of numbers as an array, shape (n, len(names))."""
+        if any(len(row) != len(self.names) for row in rows):
+            raise DatasetError(f"{self.topic} does not have {len(self.names)} numbers in each message.")
+        return np.array(rows, np.float64).reshape(-1, len(self.names))
+
+    def __len__(self) -> int:
+        """Return how many numbers it carries."""
+        return len(self.names)
+
+
+class NumbersPart(Part):
+    """Numbers that no standard message is made for."""
+
+    msgtype = types.NUMBERS
+
+    @override
+    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+        return encode(self.msgtype, {**frames.fields(), "names": list(self.names), "values": values}, len(values))
+
+    @override
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return self.table([message.values for message in messages])
+
+
+class IntegersPart(NumbersPart):
+    """Whole numbers, or truths."""
+
+    msgtype = types.INTEGERS
+
+
+def numbers(parts: Sequence[Any], names: Sequence[str]) -> Array:
+    """Return attributes of parts of messages, such as of vectors, shape (n, len(names))."""
+    return np.array([[getattr(part, name) for name in names] for part in parts], np.float64).reshape(-1, len(names))
+
+
+def own_topic(key: str) -> str:
+    """Return the topic of a feature that goes into a message of ours."""
+    return "/bhd/" + re.sub(r"[^A-Za-z0-9_]+", "_", key).strip("_")

@@ -1,0 +1,166 @@
+"""The ROS 2 message types of a bag: the standard ones, as `rosbags` knows them, and the few of ours.
+
+Bags embed the definitions, so that a reader without this package decodes our messages as well.
+"""
+
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError, install_extra
+
+FORMAT = 2
+"""Version of the messages below; an `Episode` of another one is refused."""
+
+INTERFACES = "bhd_interfaces"
+"""Package of the messages in the folder `msg`: what a brain, a cerebellum and a person send one another."""
+
+EPISODE = "bhd_msgs/msg/Episode"
+STATE = "bhd_msgs/msg/CerebellumState"
+OUTCOME = "bhd_msgs/msg/Outcome"
+NUMBERS = "bhd_msgs/msg/Numbers"
+INTEGERS = "bhd_msgs/msg/Integers"
+TEXT = "bhd_msgs/msg/Text"
+
+DEFINITIONS = {
+    EPISODE: """
+# An episode of a LeRobotDataset. Sent once, before its frames; transient local.
+int64 FORMAT=2
+builtin_interfaces/Time stamp   # when it started, by the bag's clock
+int64 format                    # version of these messages
+string repo_id                  # name of the dataset
+string robot_type
+int64 fps
+int64 episode_index
+int64 frames
+string task                     # the instruction
+string features                 # LeRobot's feature dictionaries, JSON
+string metadata                 # what is recorded of the episode, without the prefix bhd/, JSON
+string metadata_types           # type of each of these values, JSON
+string recording                # identity of the recording, JSON
+string topics                   # which topic carries which numbers of which feature, JSON
+""",
+    STATE: """
+# What the cerebellum did in a frame. The header's stamp is the frame's end.
+int64 UNCONFIGURED=0
+int64 INACTIVE=1
+int64 HOLD=2
+int64 TRACKING=3
+int64 STOPPING=4
+int64 SAFE_OFF=5
+int64 ESTOP=6
+int64 FAULT=7
+int64 LIMIT_NOT_FINITE=1
+int64 LIMIT_VELOCITY=2
+int64 LIMIT_ACCELERATION=4
+int64 LIMIT_EFFORT=8
+int64 LIMIT_POSITION=16
+int64 LIMIT_POSTURE=32
+int64 LIMIT_CLEARANCE=64
+int64 WATCHDOG_COMMAND_TOO_OLD=1
+int64 WATCHDOG_ARM_BLOCKED=2
+int64 WATCHDOG_BRAIN_SILENT=4
+int64 WATCHDOG_RECORDER_SILENT=8
+int64 WATCHDOG_PLANT_SILENT=16
+int64 WATCHDOG_MISSED_TICKS=32
+int64 WATCHDOG_GUARD=64
+int64 WATCHDOG_FORCE=128
+std_msgs/Header header
+builtin_interfaces/Time observed  # stamp of the observation that the frame began with
+int64 episode_index
+int64 frame_index
+float64 time                    # when the observation was measured, since the episode's start [s]
+float32 age                     # of the oldest reading in it [s]
+float32 command_age             # of the command in force at the end of the frame [s]
+float32 lateness                # largest lateness of a control tick in the frame [s]
+int64 overruns                  # control ticks of the frame that ended after the next was due
+int64 skipped                   # control ticks of the frame that were left out
+float32 inference_time          # that the brain took for the decision that drove the frame [s]
+bool late                       # the frame violates the timing tolerance
+int64 limits                    # what the limits changed, a sum of LIMIT_*
+int64 watchdog                  # what the watchdogs noticed, a sum of WATCHDOG_*
+int64 mode                      # at the end of the frame
+""",
+    OUTCOME: """
+# What a frame brought. The header's stamp is the frame's end.
+int64 NOTHING=0
+int64 SUCCESS=1
+int64 COLLISION=2
+int64 STUCK=3
+int64 TIMEOUT=4
+int64 INTERVENTION=5
+int64 ESTOP=6
+int64 WRONG_OBJECT=7
+int64 DROPPED=8
+int64 UNREACHABLE=9
+int64 FAULT=10
+int64 FAILURE=11                # without a cause
+std_msgs/Header header
+int64 episode_index
+int64 frame_index
+float32 reward
+bool success                    # the episode ended in success with this frame
+bool done                       # the episode ended with this frame
+int64 event
+string subtask                  # what the brain was doing, in words; empty if it has no plan
+""",
+    NUMBERS: """
+# Named numbers of a frame that no standard message is made for.
+std_msgs/Header header
+int64 episode_index
+int64 frame_index
+string[] names
+float64[] values
+""",
+    INTEGERS: """
+# Named whole numbers, or truths, of a frame.
+std_msgs/Header header
+int64 episode_index
+int64 frame_index
+string[] names
+int64[] values
+""",
+    TEXT: """
+# A text of a frame.
+std_msgs/Header header
+int64 episode_index
+int64 frame_index
+string text
+""",
+}
+"""Name -> definition, in ROS's message language."""
+
+
+def require_rosbags() -> None:
+    """Raise unless the extra that bags need is installed.
+
+    Raises:
+        ConfigError: it is not; names the command that installs it.
+    """
+    try:
+        import mcap.reader  # noqa: F401
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            f"ROS 2 bags need the packages rosbags and mcap, which cannot be imported ({error}). "
+            f"{install_extra('ros2')}"
+        ) from error
+
+
+@cache
+def type_store() -> Any:
+    """Return `rosbags`' store of the standard types and ours.
+
+    The standard types that are used here are the same in all distributions since Foxy.
+    """
+    require_rosbags()
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    interfaces = resources.files(__package__).joinpath("msg")
+    shipped = {
+        f"{INTERFACES}/msg/{file.name.removesuffix('.msg')}": file.read_text("utf-8") for file in interfaces.iterdir()
+    }
+    for name, text in {**DEFINITIONS, **shipped}.items():
+        store.register(get_types_from_msg(text, name))
+    return store

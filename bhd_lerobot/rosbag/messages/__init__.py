@@ -1,3 +1,0 @@
-"""Messages and what they mean for a robot."""
-
-__all__ = ["arm", "base", "images", "parts", "serialize", "split", "types", "views"]

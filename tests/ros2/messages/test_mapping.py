@@ -1,0 +1,118 @@
+"""Fields of messages and features of a robot, by names."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, topics_of
+from bhd_lerobot.ros2.messages.serialize import decode, encode
+
+ODOMETRY, JOINTS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
+
+FEATURES = {
+    "x.vel": FieldConfig("odom", ODOMETRY, "twist.twist.linear.x"),
+    "shoulder.pos": FieldConfig("/joint_states", JOINTS, "position[name=shoulder]", scale=np.pi / 180, offset=0.5),
+    "theta.vel": FieldConfig("/odom", ODOMETRY, "twist.twist.angular.z", scale=-1),
+    "elbow.pos": FieldConfig("/joint_states", JOINTS, "position[name=elbow]"),
+    "second.pos": FieldConfig("/path", "trajectory_msgs/msg/JointTrajectory", "points[1].positions[2]"),
+    "wheel.pos": FieldConfig("/tf", "tf2_msgs/msg/TFMessage", "transforms[child_frame_id=wheel].transform.rotation.z"),
+}
+
+
+def test_features_are_grouped_by_topic_and_come_back_from_what_is_sent() -> None:
+    values = np.linspace(-1, 1, len(FEATURES))
+    found = np.full(len(FEATURES), np.nan)
+    topics = topics_of(FEATURES, {})
+    assert [topic.topic for topic in topics] == ["/odom", "/joint_states", "/path", "/tf"]
+    for topic in topics:
+        columns = list(topic.columns)
+        message = decode(topic.msgtype, topic.encode(values[columns], 1_500_000_000))
+        if topic.has_header:
+            assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1, 500_000_000)
+        found[columns] = topic.read(message)
+    np.testing.assert_allclose(found, values, rtol=0, atol=1e-15)
+
+
+def test_a_quaternion_is_read_as_its_yaw() -> None:
+    [topic] = topics_of({"yaw": FieldConfig("odom", ODOMETRY, "pose.pose.orientation")}, {})
+    pose = {"pose": {"orientation": {"z": np.sin([0.6]), "w": np.cos([0.6])}}}
+    [message] = encode(ODOMETRY, {"pose": pose}, 1)
+    assert topic.read(decode(ODOMETRY, message)) == pytest.approx([1.2])
+
+
+def test_a_message_without_the_element_is_named() -> None:
+    [topic] = topics_of({"a": FEATURES["elbow.pos"]}, {})
+    [message] = encode(JOINTS, {"name": ["wrist"], "position": np.zeros((1, 1))}, 1)
+    with pytest.raises(DatasetError, match="name has no 'elbow'; it has 'wrist'"):
+        topic.read(decode(JOINTS, message))
+
+
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("", "A field of nav_msgs/msg/Odometry is missing; it has: header, child_frame_id, pose, twist"),
+        ("twist.twst.linear.x", "Did you mean 'twist'"),
+        ("twist.twist.linear", "is geometry_msgs/msg/Vector3; a feature is one number"),
+        ("header.frame_id", "is text"),
+        ("pose.covariance", "is array; a feature is one number"),
+        ("pose.covariance[3].x", "name an element"),
+        ("twist[2]", "is not an array"),
+        ("twist..x", "is no name"),
+    ],
+)
+def test_a_wrong_field_is_named(path: str, text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        topics_of({"q": FieldConfig("odom", ODOMETRY, path)}, {})
+
+
+def test_a_wrong_type_and_a_topic_of_two_types_are_named() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'nav_msgs/msg/Odometry'"):
+        topics_of({"q": FieldConfig("odom", "nav_msgs/msg/Odometri", "twist")}, {})
+    two = {"a": FEATURES["x.vel"], "b": FieldConfig("odom", "std_msgs/msg/Float64", "data")}
+    with pytest.raises(ConfigError, match="mapped with several types"):
+        topics_of(two, {})
+
+
+YAML = """
+observation:
+  x.vel: {topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}
+  load: {topic: /load, type: my_msgs/msg/Load, field: "parts[0].mass", scale: 2}
+action:
+  x.vel: {topic: /cmd_vel, type: geometry_msgs/msg/Twist, field: linear.x}
+images:
+  front: {topic: /camera/image_raw/compressed, width: 640, height: 480}
+types:
+  my_msgs/msg/Load: "my_msgs/Part[] parts"
+  my_msgs/msg/Part: "float64 mass"
+"""
+
+
+def test_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(YAML)
+    mapping = MappingConfig.load(path)
+    assert list(mapping.observation) == ["x.vel", "load"]
+    assert mapping.images["front"].type == "sensor_msgs/msg/CompressedImage"
+    _, load = topics_of(mapping.observation, mapping.types)
+    assert load.read(decode(load.msgtype, load.encode(np.array([3.0]), 0))) == [3.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("observation:", "observations:", "Did you mean 'observation'"),
+        ("field: linear.x", "feld: linear.x", "Did you mean 'field'"),
+        ("topic: /cmd_vel, ", "", "action.x.vel has no topic"),
+        ("scale: 2", "scale: 0", "scale is not 0"),
+        ("scale: 2", "scale: two", "could not convert"),
+        ("width: 640", "type: sensor_msgs/msg/Imu, width: 640", "Unknown type of images"),
+        ("action:", "action: [", "cannot be read"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused(tmp_path: Path, old: str, new: str, text: str) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(YAML.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=text):
+        MappingConfig.load(path)

@@ -1,0 +1,130 @@
+"""Messages: made of arrays, read back from either byte order, refused where they are something else."""
+
+import re
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.ros2.bag.exporter.episode import scan_stream
+from bhd_lerobot.ros2.messages import types
+from bhd_lerobot.ros2.messages.base import ScanPart
+from bhd_lerobot.ros2.messages.parts import Frames, header, header_stamps
+from bhd_lerobot.ros2.messages.serialize import decode, encode
+from bhd_lerobot.ros2.messages.split import parts_of
+from bhd_lerobot.ros2.messages.views import TF
+from bhd_lerobot.tasks.task import Event
+from tests.ros2.bag.support import STORE, odometry, scan
+
+SCAN, JOINTS = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/JointState"
+
+
+def test_trees_of_arrays_become_messages():
+    stamps = np.array([5 * 10**9 + 7, 6 * 10**9])
+    ranges = np.random.default_rng(0).random((2, 37)).astype(np.float32)
+    trees = {
+        SCAN: {"header": header(stamps, "base_scan"), "range_max": 3.5, "ranges": ranges},
+        JOINTS: {"header": header(stamps, "x"), "name": ["a", "bcd", ""], "position": np.arange(6.0).reshape(2, 3)},
+        types.NUMBERS: {"header": header(stamps), "frame_index": np.array([3, -4]), "values": ranges[:, :2]},
+        TF: {"transforms": [{"child_frame_id": name, "transform": {"rotation": {"w": 1.0}}} for name in ("a", "bb")]},
+    }
+    read = {kind: [decode(kind, message) for message in encode(kind, tree, 2)] for kind, tree in trees.items()}
+    scan, joints, numbers, moved = (messages[1] for messages in read.values())
+    assert header_stamps(read[SCAN]).tolist() == stamps.tolist()
+    assert (scan.header.frame_id, scan.range_max, scan.angle_min) == ("base_scan", 3.5, 0.0)
+    assert np.array_equal(scan.ranges, ranges[1])
+    assert (joints.name, joints.position.tolist(), joints.velocity.tolist()) == (["a", "bcd", ""], [3.0, 4.0, 5.0], [])
+    assert (numbers.frame_index, numbers.values.tolist()) == (-4, ranges[1, :2].tolist())
+    assert [(transform.child_frame_id, transform.transform.rotation.w) for transform in moved.transforms] == [
+        ("a", 1.0),
+        ("bb", 1.0),
+    ]
+    with pytest.raises(KeyError, match="no field"):
+        encode(SCAN, {"beams": 3}, 1)
+
+
+@pytest.mark.parametrize("little", [True, False])
+def test_decoding_takes_either_byte_order(little):
+    one = scan(10**9 + 1, beams=5)
+    found = decode(SCAN, bytes(STORE.serialize_cdr(one, SCAN, little_endian=little)))
+    assert header_stamps([found]).tolist() == [10**9 + 1]
+    assert np.array_equal(one.ranges, found.ranges)
+
+
+def test_a_message_of_another_type_cut_off_or_of_another_encoding_is_refused():
+    whole = bytes(STORE.serialize_cdr(odometry(10**9), "nav_msgs/msg/Odometry"))
+    for wrong in (whole, whole[:40], whole[:3], b""):
+        with pytest.raises(DatasetError, match=r"LaserScan"):
+            decode(SCAN, wrong)
+    with pytest.raises(DatasetError, match="plain CDR"):
+        decode("nav_msgs/msg/Odometry", b"\x00\x07" + whole[2:])
+
+
+@pytest.mark.parametrize(
+    ("definition", "prefix", "enum"),
+    [
+        (types.STATE, "", Mode),
+        (types.OUTCOME, "", Event),
+        (types.STATE, "LIMIT_", Limit),
+        (types.STATE, "WATCHDOG_", Watchdog),
+    ],
+)
+def test_constants_of_the_messages_are_those_of_the_program(definition, prefix, enum):
+    constants = dict(re.findall(rf"int64 {prefix}([A-Z][A-Z_]*)=(\d+)", types.DEFINITIONS[definition]))
+    values = {int(value) for name, value in constants.items() if prefix or not name.startswith(("LIMIT", "WATCHDOG"))}
+    assert values == {int(one) for one in enum if prefix == "" or int(one)}
+
+
+@pytest.mark.parametrize(
+    ("names", "velocity"), [(["b_joint", "a_joint"], [1.0, 2.0]), (["a_joint", "b_joint"], []), (["a_joint"], [1.0])]
+)
+def test_joints_in_another_order_or_without_speeds_are_not_taken_for_ours(names, velocity):
+    (part,) = parts_of("observation.state", ["a.pos", "b.pos", "a.vel", "b.vel"], "ur5", lidar=None)
+    values = np.array([[1.0, 2.0, 3.0, 4.0]])
+    frames = Frames(0, np.array([0]), np.array([10**18]))
+    assert np.array_equal(part.decode([decode(JOINTS, one) for one in part.encode(frames, values)]), values)
+    fields = {"header": header(frames.stamps), "name": names, "position": values[:, : len(names)], "velocity": velocity}
+    with pytest.raises(DatasetError, match=r"joint|numbers in each message"):
+        part.decode([decode(JOINTS, one) for one in encode(JOINTS, fields, 1)])
+
+
+def test_of_an_unknown_robot_everything_is_plain_numbers():
+    names = ["x.vel", "theta.vel", "shoulder.pos"]
+    (part,) = parts_of("observation.state", names, "so100", lidar=None)
+    assert (part.msgtype, part.topic, part.names) == (types.NUMBERS, "/bhd/observation_state", tuple(names))
+    kinds = [type(one).__name__ for one in parts_of("observation.state", names, "ur5", lidar=None)]
+    assert kinds == ["OdometryPart", "JointsPart"]
+
+
+def test_a_yaw_that_goes_on_turning_comes_back():
+    values = np.zeros((200, 5))
+    values[:, 4] = np.cumsum(np.random.default_rng(0).uniform(-0.1, 0.28, 200)).astype(np.float32)
+    names = ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"]
+    (part,) = parts_of("observation.state", names, "turtlebot3", lidar=None)
+    index = np.arange(200)
+    assert values[-1, 4] > 4 * np.pi
+    messages = [decode(part.msgtype, one) for one in part.encode(Frames(0, index, index * 10**8 + 10**18), values)]
+    assert np.array_equal(part.decode(messages).astype(np.float32), values.astype(np.float32))
+
+
+def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ros2\]'"):
+        types.require_rosbags()
+
+
+def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
+    """On the wall clock the age includes the way to the brain: 5 ms here, for a scan 1 ms after an observation."""
+    lidar = turtlebot3_burger().lidar
+    part = ScanPart("/scan", tuple(f"scan_{beam:03d}.pos" for beam in range(4)), lidar)
+    observed = np.array([0, 100, 200, 300]) * 10**6 + 10**18
+    values = np.repeat([[1.0], [1.0], [2.0], [2.0]], 4, axis=1)
+    age = np.array([0.005, 0.105, 0.104, 0.204], np.float32)
+    stream = scan_stream(part, Frames(0, np.arange(4), observed), values, age)
+    received, messages = zip(*stream.messages, strict=True)
+    assert received == (observed[0], observed[2])
+    first, second = header_stamps([decode(SCAN, message) for message in messages])
+    assert first == pytest.approx(observed[0] - 5 * 10**6, abs=100)
+    assert second == observed[1] + 1
