@@ -63,5 +63,6 @@ def run(make: Callable[[Callable[[str], Node]], Callable[[], None]], seconds: fl
     end = None if seconds is None else time.monotonic() + seconds
     while not stopped and (end is None or time.monotonic() < end):
         executor.spin_once(timeout_sec=0.1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # while Python ends, it would be Python's own end by SIGINT
     close()
     rclpy.shutdown()
