@@ -83,7 +83,7 @@ class ArmPlant(Ros2Plant):
     def __init__(self, config: Any, body: Arm) -> None:
         joints = tuple(f"{joint}_joint" for joint in body.chain.joints)
         self._count = len(joints)
-        self._opening = body.gripper.max_opening if hasattr(body.gripper, "max_opening") else 0.0
+        self._opening = body.home[-1]
         inputs = (
             InputSpec("/joint_states", JOINT_STATE, JointReader(joints), silence_s=_SILENCE_S),
             InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), silence_s=_FOREVER),
