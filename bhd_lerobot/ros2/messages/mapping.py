@@ -144,6 +144,11 @@ class TopicFields:
     offsets: NDArray[np.float64]
 
     @property
+    def width(self) -> int:
+        """How many features."""
+        return len(self.columns)
+
+    @property
     def has_header(self) -> bool:
         """Whether a message begins with a header, and so with a stamp."""
         first = type_store().fielddefs[self.msgtype][1][:1]
