@@ -1,3 +1,3 @@
 """Messages and what they mean for a robot."""
 
-__all__ = ["arm", "base", "images", "parts", "serialize", "split", "types", "views"]
+__all__ = ["arm", "base", "fields", "images", "mapping", "parts", "presets", "serialize", "split", "types", "views"]

@@ -1,5 +1,6 @@
 """The messages of a base with a scanner: LaserScan, Odometry, Imu, TwistStamped and Twist."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, override
@@ -7,7 +8,7 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.ros2.messages.parts import NANO, WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.ros2.messages.parts import NANO, XYZ, Array, Frames, Part, header, numbers
 from bhd_lerobot.ros2.messages.serialize import encode
 
 TWIST = ("x.vel", "theta.vel")
@@ -136,16 +137,20 @@ def odometry(messages: Sequence[Any]) -> tuple[Array, Array]:
     The yaw of a quaternion that was never set, all zeros, is not a number.
     """
     poses = [message.pose.pose for message in messages]
-    w, x, y, z = numbers([pose.orientation for pose in poses], WXYZ).T
-    flat = (x == 0) & (y == 0)
-    # Half the angle is precise also where a yaw of exactly zero, or one with its sign, has to come back.
-    yaw = np.where(flat, 2 * np.arctan2(z, w), np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    yaw[(w == 0) & flat & (z == 0)] = np.nan
+    yaw = np.array([yaw_of(one.w, one.x, one.y, one.z) for one in (pose.orientation for pose in poses)])
     place = numbers([pose.position for pose in poses], XYZ)
-    return twists([message.twist.twist for message in messages]), np.stack([*place[:, :2].T, _unwrapped(yaw)], axis=1)
+    return twists([message.twist.twist for message in messages]), np.stack([*place[:, :2].T, unwrapped(yaw)], axis=1)
 
 
-def _unwrapped(yaw: Array) -> Array:
+def yaw_of(w: float, x: float, y: float, z: float) -> float:
+    """Return the yaw of a unit quaternion [rad]; that of one that was never set, all zeros, is not a number."""
+    if x == y == 0:  # half the angle is precise also where a yaw of zero, or one with its sign, has to come back
+        return 2 * math.atan2(z, w) if w or z else math.nan
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def unwrapped(yaw: Array) -> Array:
+    """Return angles without jumps by whole turns [rad], shape (n,); those that are not finite stay."""
     finite = np.isfinite(yaw)
     result = yaw.copy()
     # An angle is changed by whole turns only: what needs none stays as it is, to the last bit.

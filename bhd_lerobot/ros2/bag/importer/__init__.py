@@ -10,6 +10,7 @@ __all__ = [
     "resample",
     "scan",
     "segments",
+    "sources",
     "topics",
     "tracks",
     "video",
