@@ -1,6 +1,7 @@
 """`bhd-data import`: ROS 2 bags become a dataset."""
 
 import argparse
+import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -218,8 +219,10 @@ def _mapping(options: argparse.Namespace) -> MappingConfig | None:
         mapping = MappingConfig()
     elif options.map in presets.PRESETS:
         mapping = presets.PRESETS[options.map]()
+    elif not Path(options.map).exists() and not Path(options.map).suffix:
+        raise ConfigError(f"{unknown_name('mapping', options.map, presets.PRESETS)} Or name a YAML file.")
     else:
-        mapping = MappingConfig.load(options.map)
+        mapping = MappingConfig.load(Path(options.map).expanduser())
     return MappingConfig.of(tree, "--map").over(mapping)
 
 
@@ -246,7 +249,7 @@ def _wanted_of_mapping(options: argparse.Namespace, mapping: MappingConfig) -> I
         action_names=actions,
         sources=tuple(mapped_sources(mapping, options.scan_frame, options.scan_yaw)),
         max_speed=None,
-        **real,
+        **real | {"given": real["given"] | {"mapping": dataclasses.asdict(mapping)}},
     )
 
 

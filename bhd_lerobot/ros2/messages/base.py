@@ -149,13 +149,17 @@ def yaw_of(w: float, x: float, y: float, z: float) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def unwrapped(yaw: Array) -> Array:
-    """Return angles without jumps by whole turns [rad], shape (n,); those that are not finite stay."""
+def unwrapped(yaw: Array, turn: float = 2 * np.pi) -> Array:
+    """Return angles without jumps by whole turns, shape (n,); those that are not finite stay.
+
+    Args:
+        turn: a whole one, in the angles' unit.
+    """
     finite = np.isfinite(yaw)
     result = yaw.copy()
     # An angle is changed by whole turns only: what needs none stays as it is, to the last bit.
-    turns = np.round((np.unwrap(yaw[finite]) - yaw[finite]) / (2 * np.pi))
-    result[finite] = np.where(turns == 0, yaw[finite], yaw[finite] + turns * 2 * np.pi)
+    turns = np.round((np.unwrap(yaw[finite], period=turn) - yaw[finite]) / turn)
+    result[finite] = np.where(turns == 0, yaw[finite], yaw[finite] + turns * turn)
     return result
 
 

@@ -153,9 +153,9 @@ def _state(options: ImportOptions, tracks: Sequence[Track], times: Times) -> Arr
         pose = [names.index(name) for name in ODOMETRY]
         state[:, pose] = _since_start(state[:, pose])
         return state
-    for angle in {name for track in tracks for name in track.source.angles} & {*names}:
+    for angle, turn in {name: turn for track in tracks for name, turn in track.source.angles.items()}.items():
         yaw = state[:, names.index(angle)]  # unwrapped over a bag, which may hold several episodes
-        yaw -= 2 * np.pi * np.round(yaw[0] / (2 * np.pi))
+        yaw -= turn * np.round(yaw[0] / turn)
     return state
 
 

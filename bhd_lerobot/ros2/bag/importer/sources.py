@@ -1,7 +1,7 @@
 """What is read of a bag: which topic carries which numbers of the dataset, and how they are in its messages."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
 from bhd_lerobot.ros2.bag.importer.scan import GEOMETRY, resampled_scans
@@ -59,7 +59,8 @@ class Source:
         option: what names the topic.
         remedy: if it is missing, instead of the option.
         is_turned: whether ``/tf_static`` states how the sensor is mounted.
-        angles: those of the names that are yaws, which count on beyond half a turn.
+        angles: those of the names that are yaws, which count on beyond half a turn, and a whole turn of each.
+        size: height and width that images must have [px]; 0 for any.
     """
 
     key: str
@@ -71,7 +72,8 @@ class Source:
     option: str = "--map"
     remedy: str = ""
     is_turned: bool = False
-    angles: tuple[str, ...] = ()
+    angles: Mapping[str, float] = field(default_factory=dict)
+    size: tuple[int, int] = (0, 0)
 
     @property
     def is_action(self) -> bool:
@@ -94,13 +96,17 @@ def mapped_sources(
     for feature, section in ((keys.OBSERVATION_STATE, mapping.observation), (keys.ACTION, mapping.action)):
         place = feature.removesuffix(".state")
         numbers = {name: one for name, one in section.items() if not one.beams}
-        for topic in topics_of(numbers, mapping.types):
+        try:
+            topics = topics_of(numbers, mapping.types)
+        except ConfigError as error:
+            raise ConfigError(f"The mapping's {place}: {error}") from error
+        for topic in topics:
             names = tuple(list(numbers)[column] for column in topic.columns)
-            readers = {topic.msgtype: partial(_fields, topic, names)}
-            more = f" and {len(names) - 1} more" * (len(names) > 1)
-            meaning = f"{place}.{names[0]}{more}"
-            angles = tuple(name for name, one in zip(names, topic.fields, strict=True) if one.kind == QUATERNION)
-            key = f"{feature}{topic.topic}"
+            yaws = zip(names, topic.fields, topic.scales.tolist(), strict=True)
+            angles = {name: 2 * np.pi * abs(scale) for name, one, scale in yaws if one.kind == QUATERNION}
+            angles = angles if feature == keys.OBSERVATION_STATE else {}
+            key, readers = f"{feature}{topic.topic}", {topic.msgtype: partial(_fields, topic, names, angles)}
+            meaning = f"{place}.{names[0]}" + f" and {len(names) - 1} more" * (len(names) > 1)
             found.append(Source(key, topic.topic, feature, names, readers, meaning, angles=angles))
         for name, one in section.items():
             if one.beams:
@@ -110,7 +116,9 @@ def mapped_sources(
                 found.append(Source(key, topic_name, feature, names, {SCAN: reader}, meaning, is_turned=True))
     for name, camera in mapping.images.items():
         feature = f"{keys.OBSERVATION_IMAGES}.{name}"
-        found.append(Source(feature, camera.topic, feature, (), dict.fromkeys(_IMAGES, _places), f"images.{name}"))
+        topic_name, size = "/" + camera.topic.lstrip("/"), (camera.height, camera.width)
+        of_images: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
+        found.append(Source(feature, topic_name, feature, (), of_images, f"images.{name}", size=size))
     return found
 
 
@@ -126,7 +134,7 @@ def exported_sources(parts: Mapping[str, Sequence[Part]], cameras: Mapping[str, 
         Source(
             f"{feature}{part.topic}", part.topic, feature, part.names, {part.msgtype: partial(_part, part)}, feature,
             option="/bhd/episode", remedy=remedy,
-            angles=part.names[4:] if isinstance(part, OdometryPart) else (),
+            angles=dict.fromkeys(part.names[4:], 2 * np.pi) if isinstance(part, OdometryPart) else {},
         )
         for feature, several in parts.items()
         for part in several
@@ -187,26 +195,25 @@ def _part(part: Part, reading: Reading) -> Array:
     return part.decode(reading.decoded)
 
 
-def _fields(fields: TopicFields, names: Sequence[str], reading: Reading) -> Array:
+def _fields(fields: TopicFields, names: Sequence[str], angles: Mapping[str, float], reading: Reading) -> Array:
     """Return the fields of messages; a joint state of some joints has some of them."""
-    decoded = reading.decoded
-    values = np.ma.masked_all((len(decoded), len(names)), np.float64)
+    values = np.ma.masked_all((len(reading.decoded), len(names)), np.float64)
     reasons: dict[str, None] = {}
-    for row, message in enumerate(decoded):
+    for row, message in enumerate(reading.decoded):
         try:
             values[row] = fields.read(message)
         except DatasetError as error:
             reasons[str(error)] = None
             values[row] = fields.read_present(message)
     lacking = [name for name, column in zip(names, np.ma.getmaskarray(values).T, strict=True) if column.all()]
-    if lacking and len(decoded):
+    if lacking and len(values):
         raise DatasetError(
             f"No message of {reading.topic} has what {', '.join(lacking)} is read from: {' '.join(list(reasons)[:3])}"
         )
-    for column, place in enumerate(fields.fields):
-        if place.kind == QUATERNION:
-            scale, offset, rows = fields.scales[column], fields.offsets[column], ~values.mask[:, column]
-            values[rows, column] = unwrapped((values.data[rows, column] - offset) / scale) * scale + offset
+    for column, name in enumerate(names):
+        if name in angles:
+            rows = ~np.ma.getmaskarray(values)[:, column]
+            values[rows, column] = unwrapped(values.data[rows, column], angles[name])
     return values
 
 

@@ -97,7 +97,10 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> list[Trac
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
         clocks[topic.name] = (found.received, times)
-        values = source.readers[topic.msgtype](Reading(topic.name, found, content, static, lost > 0, notes))
+        try:
+            values = source.readers[topic.msgtype](Reading(topic.name, found, content, static, lost > 0, notes))
+        except DatasetError as error:
+            raise DatasetError(f"{bag.path}: {error}") from error
         track = Track(source, topic.name, topic.msgtype, times, found.order, values, stamps, source.names)
         tracks += [_finite(bag, one, notes) for one in _complete(track)]
     notes += pace_warnings(paces)

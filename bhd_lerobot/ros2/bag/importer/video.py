@@ -34,6 +34,12 @@ class CameraImages:
         height, width, channels = self._decode(
             self._track, self._first(self._track, range(len(self._track.times)))
         ).shape
+        wanted = self._track.source.size
+        if any(wanted) and wanted != (height, width):
+            raise DatasetError(
+                f"The images of {self._track.topic} have {width} x {height} pixels; the mapping says {wanted[1]} x "
+                f"{wanted[0]}. Give the size that they have, or leave width and height out."
+            )
         return height, width, channels
 
     def blind(self, track: Track, times: Times) -> int:
