@@ -56,8 +56,8 @@ arm: ## resolve what a base needs on 64-bit ARM Linux, with wheels only, and pri
 		--python-platform aarch64-manylinux_2_28 --only-binary :all: --constraint constraints.txt \
 		--no-header --no-annotate --no-emit-index-url pyproject.toml
 
-clean: ## remove .venv, .uv and every cache
-	rm -rf site .venv .uv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+clean: ## remove .venv, .uv, .ros and every cache
+	rm -rf site .venv .uv .ros .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find bhd_lerobot tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 venv:

@@ -1,40 +1,16 @@
-"""`bhd-data export`: episodes as ROS 2 bags, and what is known of our robots beside their data."""
+"""`bhd-data export`: episodes as ROS 2 bags."""
 
 import argparse
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bhd_lerobot.bodies.body import ArmChain, MobileBase, WheelDrive
-from bhd_lerobot.bodies.registry import body_of
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
-from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, counted
 from bhd_lerobot.ros2.bag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.ros2.bag.exporter.export import export_bags
 from bhd_lerobot.ros2.bag.storage.write import FORMATS
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME, TOOL_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
-from bhd_lerobot.ros2.messages.views import JointFrame, RobotView, StaticFrame
-
-_BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
-_CASTER = (-0.081, 0.0, -0.004)  # [m] in base_link, the same
-_WHEEL_TURN = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # their z axes are the axles, the same; it rounds to 1.57 rad
-_WHEELS = {"wheel_left_joint": ("qpos_7", "qvel_6"), "wheel_right_joint": ("qpos_8", "qvel_7")}
-
-# Universal Robots' ROS 2 description, ur_macro.xacro: base_link is as REP-103 wants it, x to the front; the frames
-# of the controller, base and base_link_inertia, look back. The flange's x axis points out of it, as tool0's z does.
-_ORIGIN, _HALF_TURN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-_WRISTS = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
+from bhd_lerobot.ros2.messages.robot_views import robot_view
 
 
 def add_to(commands: Commands) -> None:
@@ -77,123 +53,3 @@ def _run(options: argparse.Namespace) -> int:
     bags = counted(len(report.bags), "bag")
     print(f"{options.output}: {what}, {report.messages} messages, in {bags}. Play one: ros2 bag play {report.bags[0]}")
     return 0
-
-
-def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
-    """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing."""
-    if robot_type == "turtlebot3":
-        robot = (recording or {}).get("robot")
-        return _turtlebot3(is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
-    if robot_type == "ur5":
-        return _ur5()
-    body = body_of(robot_type)
-    return RobotView(lidar=body.lidar) if isinstance(body, MobileBase) else RobotView()
-
-
-def _turtlebot3(*, is_simulated: bool) -> RobotView:
-    body = turtlebot3_burger()
-    model = ElementTree.fromstring(body.mjcf)
-    camera = _find(model, "camera", "front")
-    return RobotView(
-        lidar=body.lidar,
-        noise=_base_noise(body.drive) if is_simulated else None,
-        frames=(
-            StaticFrame(FOOTPRINT_FRAME, "base_link", _BASE_LINK),
-            StaticFrame("base_link", "caster_back_link", _CASTER, _WHEEL_TURN),
-            _on_base_link(SCAN_FRAME, _place(_find(model, "body", "lds"))),
-            _on_base_link(IMU_FRAME, _place(_find(model, "site", "imu"))),
-            _on_base_link("front_optical_frame", _place(camera), _optical(camera)),
-        ),
-        joints=tuple(
-            JointFrame(**vars(_on_base_link(f"{wheel}_link", _place(_find(model, "body", wheel)), _WHEEL_TURN)),
-                       joint=f"{wheel}_joint")
-            for wheel in body.drive.joints
-        ),
-        fovy={"front": math.radians(float(camera.get("fovy", "nan")))},
-        wheels=_WHEELS,
-    )  # fmt: skip
-
-
-def _base_noise(drive: WheelDrive) -> BaseNoise:
-    """Return the noise of the simulated base. Its speed sensors and gyroscope have none but that of single precision.
-
-    Of odometry it is the rounding of the encoders' counts, at the start and now, each uniform over one count. Slip is
-    not in it, as it is not known.
-    """
-    count = 2 * math.pi * drive.wheel_radius / drive.encoder_ticks
-    wheel = count * math.sqrt(2 / 12)
-    rounding = 2.0**-24 / math.sqrt(3)
-    return BaseNoise(
-        distance=wheel / math.sqrt(2),
-        yaw=wheel * math.sqrt(2) / drive.wheel_separation,
-        speed=MAX_LINEAR * rounding,
-        turn=MAX_ANGULAR * rounding,
-        gyro=MAX_ANGULAR * rounding,
-    )
-
-
-def _ur5() -> RobotView:
-    body = ur5()
-    model = ElementTree.fromstring(body.mjcf)
-    camera = _find(model, "camera", "wrist")
-    ahead = _place(camera) - _place(_find(model, "site", "tool"))
-    return RobotView(
-        frames=(
-            StaticFrame("base_link", "base_link_inertia", _ORIGIN, _HALF_TURN),
-            StaticFrame("base_link", ARM_FRAME, _ORIGIN, _HALF_TURN),
-            StaticFrame("wrist_3_link", "flange", _ORIGIN, (0.5, -0.5, -0.5, -0.5)),
-            StaticFrame("flange", "tool0", _ORIGIN, (0.5, 0.5, 0.5, 0.5)),
-            StaticFrame("tool0", TOOL_FRAME, body.chain.tool),
-            StaticFrame(TOOL_FRAME, "wrist_optical_frame", _three(ahead), _optical(camera)),
-        ),
-        joints=_links(body.chain),
-        fovy={"wrist": math.radians(float(camera.get("fovy", "nan")))},
-    )
-
-
-def _links(chain: ArmChain) -> tuple[JointFrame, ...]:
-    """Return the links of an arm as `ur_description` has them: each turns about its own z axis.
-
-    That of joint i is Denavit-Hartenberg frame i - 1, moved along its z axis by d of the joint, and turned.
-    """
-    names = ("base_link_inertia", "shoulder_link", "upper_arm_link", "forearm_link", *_WRISTS)
-    links, length, twist = [], 0.0, 0.0
-    for parent, child, joint, a, d, alpha in zip(
-        names, names[1:], chain.joints, chain.a, chain.d, chain.alpha, strict=False
-    ):
-        place = (length, round(-math.sin(twist) * d, 12), round(math.cos(twist) * d, 12))
-        turn = (math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0)
-        links.append(JointFrame(parent, child, place, turn, joint=f"{joint}_joint"))
-        length, twist = a, alpha
-    return tuple(links)
-
-
-def _find(model: ElementTree.Element, kind: str, name: str) -> ElementTree.Element:
-    found = model.find(f".//{kind}[@name='{name}']")
-    assert found is not None, (kind, name)
-    return found
-
-
-def _place(element: ElementTree.Element) -> NDArray[np.float64]:
-    return np.array([float(number) for number in element.get("pos", "0 0 0").split()])
-
-
-def _three(numbers: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = numbers.tolist()
-    return x, y, z
-
-
-def _on_base_link(
-    child: str, place: NDArray[np.float64], rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-) -> StaticFrame:
-    return StaticFrame("base_link", child, _three(np.round(place - np.array(_BASE_LINK), 9)), rotation)
-
-
-def _optical(camera: ElementTree.Element) -> tuple[float, float, float, float]:
-    """Return how a camera's optical frame (z ahead, x right, y down) is turned, a quaternion wxyz."""
-    axes = np.array([float(number) for number in camera.get("xyaxes", "").split()]).reshape(2, 3)
-    right, up = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    frame = np.eye(4)
-    frame[:3, :3] = np.stack([right, -up, np.cross(up, right)], axis=1)  # MuJoCo's cameras look along -z
-    w, x, y, z = pose_vectors(frame)[3:].tolist()
-    return w, x, y, z

@@ -1,3 +1,17 @@
 """Messages and what they mean for a robot."""
 
-__all__ = ["arm", "base", "fields", "images", "mapping", "parts", "presets", "serialize", "split", "types", "views"]
+__all__ = [
+    "arm",
+    "base",
+    "fields",
+    "images",
+    "mapping",
+    "parts",
+    "presets",
+    "robot_views",
+    "scan",
+    "serialize",
+    "split",
+    "types",
+    "views",
+]

@@ -8,7 +8,6 @@ __all__ = [
     "frames",
     "options",
     "resample",
-    "scan",
     "segments",
     "sources",
     "topics",

@@ -13,12 +13,12 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
-from bhd_lerobot.ros2.bag.importer.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.bag.storage.read import Messages
 from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
 from bhd_lerobot.ros2.messages.mapping import QUATERNION, SCAN, FieldConfig, MappingConfig, TopicFields, topics_of
 from bhd_lerobot.ros2.messages.parts import Part, header_stamps
+from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 
 Array = NDArray[np.float64]
 

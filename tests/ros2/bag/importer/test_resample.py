@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import NANO, apart, clock_jumps, grids, message_times, newest
-from bhd_lerobot.ros2.bag.importer.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
+from bhd_lerobot.ros2.messages.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
 
 MS = 10**6
 START = 1_700_000_000 * NANO

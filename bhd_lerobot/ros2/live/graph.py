@@ -1,0 +1,198 @@
+"""Which nodes, publishers and subscriptions are on the network, and what does not fit together."""
+
+import threading
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+from uuid import UUID
+
+from bhd_lerobot.ros2.live.network import LATCHED, Qos
+from bhd_lerobot.ros2.live.topic_types import ros_type_name
+
+_GID_BYTES = {"humble": 24}  # 16 since Iron
+_PREFIX = "rt/"  # of topics; services have others
+_MOST = 10_000
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or a subscription.
+
+    Attributes:
+        topic: with a slash in front.
+        msgtype: of its messages.
+        qos: how they are kept.
+        is_publisher: whether it is a publisher.
+        node: name of its node with its namespace; empty while that is not known.
+        is_own: whether it is of this process.
+    """
+
+    topic: str
+    msgtype: str
+    qos: Qos
+    is_publisher: bool
+    node: str
+    is_own: bool
+
+
+class Graph:
+    """The nodes on the network.
+
+    ROS 2's nodes share a participant with others of their process, and tell which endpoints are theirs on
+    ``ros_discovery_info``.
+
+    Args:
+        participant: Cyclone DDS' participant.
+        name, namespace: of the only node of this process.
+        distro: whose form of that message is used.
+    """
+
+    def __init__(self, participant: Any, name: str, namespace: str, distro: str) -> None:
+        from cyclonedds.builtin import (
+            BuiltinDataReader,
+            BuiltinTopicDcpsPublication,
+            BuiltinTopicDcpsSubscription,
+        )
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        self._name, self._namespace = name, namespace
+        self._gid_bytes = _GID_BYTES.get(distro, 16)
+        self._participant_guid: UUID = participant.guid
+        self._gid, self._node, self._info = _types(self._gid_bytes)
+        topic = Topic(participant, "ros_discovery_info", self._info)
+        self._writer = DataWriter(participant, topic, LATCHED.of_dds())
+        self._reader = DataReader(participant, topic, Qos(100, transient_local=True).of_dds())
+        self._endpoints = {
+            is_publisher: BuiltinDataReader(participant, kind)
+            for is_publisher, kind in (
+                (True, BuiltinTopicDcpsPublication),
+                (False, BuiltinTopicDcpsSubscription),
+            )
+        }
+        self._own: dict[bool, list[UUID]] = {True: [], False: []}
+        self._owners: dict[bytes, dict[bytes, str]] = {}  # participant -> endpoint -> node
+        self._nodes: dict[bytes, list[str]] = {}
+        self._lock = threading.Lock()
+        self._publish()
+
+    def add(self, guid: UUID, *, is_writer: bool) -> None:
+        """Publish that an endpoint is this node's."""
+        self._own[is_writer].append(guid)
+        self._publish()
+
+    def _publish(self) -> None:
+        readers, writers = ([self._gid_of(guid) for guid in self._own[kind]] for kind in (False, True))
+        node = self._node(self._namespace, self._name, readers, writers)
+        self._writer.write(self._info(self._gid_of(self._participant_guid), [node]))
+
+    def _gid_of(self, guid: UUID) -> Any:
+        return self._gid(list(guid.bytes.ljust(self._gid_bytes, b"\0")))
+
+    def nodes(self) -> list[str]:
+        """Return the names of all nodes with their namespaces, sorted; several of one name are listed as often."""
+        with self._lock:
+            self._update()
+            return sorted(name for names in self._nodes.values() for name in names)
+
+    def endpoints(self) -> list[Endpoint]:
+        """Return all publishers and subscriptions of topics, sorted by topic."""
+        with self._lock:
+            self._update()
+            owners = {gid: name for owned in self._owners.values() for gid, name in owned.items()}
+            found = []
+            for is_publisher, reader in self._endpoints.items():
+                for one in reader.read(_MOST):
+                    if not one.sample_info.valid_data or not one.topic_name.startswith(_PREFIX):
+                        continue
+                    found.append(
+                        Endpoint(
+                            one.topic_name.removeprefix(_PREFIX[:-1]),
+                            ros_type_name(one.type_name),
+                            _qos_of(one.qos),
+                            is_publisher,
+                            owners.get(one.key.bytes, ""),
+                            one.participant_key == self._participant_guid,
+                        )
+                    )
+        return sorted(found, key=lambda one: (one.topic, not one.is_publisher, one.node))
+
+    def _update(self) -> None:
+        for sample in self._reader.take(_MOST):
+            if not hasattr(sample, "gid"):
+                continue  # a participant that has left
+            key = bytes(sample.gid.data)[:16]
+            named = {_full_name(node): node for node in sample.node_entities_info_seq}
+            self._nodes[key] = [_full_name(node) for node in sample.node_entities_info_seq]
+            self._owners[key] = {
+                bytes(gid.data)[:16]: name
+                for name, node in named.items()
+                for gid in (*node.reader_gid_seq, *node.writer_gid_seq)
+            }
+        alive = {one.participant_key.bytes for reader in self._endpoints.values() for one in reader.read(_MOST)}
+        for key in [key for key in self._nodes if key not in alive]:
+            del self._nodes[key], self._owners[key]
+
+    def mismatches(self, topic: str, msgtype: str, qos: Qos, *, is_publisher: bool) -> list[str]:
+        """Return why endpoints of others on a topic do not exchange messages with one of ours, in sentences.
+
+        Args:
+            topic: with a slash in front.
+            msgtype: of our endpoint.
+            qos: of our endpoint.
+            is_publisher: whether ours is a publisher.
+        """
+        ours, theirs = ("publisher", "subscription") if is_publisher else ("subscription", "publisher")
+        found = []
+        for one in self.endpoints():
+            if one.is_own or one.topic != topic or one.is_publisher == is_publisher:
+                continue
+            who = f"The {theirs} of {topic} in {one.node or 'an unnamed node'}"
+            if one.msgtype != msgtype:
+                found.append(f"{who} is of type {one.msgtype}; the {ours} here is of {msgtype}.")
+            else:
+                offered, wanted = (qos, one.qos) if is_publisher else (one.qos, qos)
+                if wanted.reliable > offered.reliable or wanted.transient_local > offered.transient_local:
+                    found.append(f"{who} is {one.qos}; the {ours} here is {qos}, and no message passes.")
+        return found
+
+
+def _full_name(node: Any) -> str:
+    return f"{node.node_namespace.rstrip('/')}/{node.node_name}"
+
+
+def _qos_of(qos: Any) -> Qos:
+    from cyclonedds.qos import Policy
+
+    history = next((policy for policy in qos if isinstance(policy, Policy.History.KeepLast)), None)
+    return Qos(
+        history.depth if history else 0,
+        any(isinstance(policy, Policy.Reliability.Reliable) for policy in qos),
+        any(policy is Policy.Durability.TransientLocal for policy in qos),
+    )
+
+
+def _types(gid_bytes: int) -> tuple[Any, Any, Any]:
+    from cyclonedds.idl import make_idl_struct
+
+    idl: Any = import_module("cyclonedds.idl.types")
+    package = "rmw_dds_common::msg::dds_::"
+    gid: Any = make_idl_struct("Gid", f"{package}Gid_", {"data": idl.array[idl.uint8, gid_bytes]})
+    text = idl.bounded_str[256]
+    node: Any = make_idl_struct(
+        "NodeEntitiesInfo",
+        f"{package}NodeEntitiesInfo_",
+        {
+            "node_namespace": text,
+            "node_name": text,
+            "reader_gid_seq": idl.sequence[gid],
+            "writer_gid_seq": idl.sequence[gid],
+        },
+    )
+    info: Any = make_idl_struct(
+        "ParticipantEntitiesInfo",
+        f"{package}ParticipantEntitiesInfo_",
+        {"gid": gid, "node_entities_info_seq": idl.sequence[node]},
+    )
+    return gid, node, info

@@ -1,0 +1,161 @@
+"""Where other nodes are looked for, and how messages are kept for them."""
+
+import os
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
+
+_DOMAINS = 233  # the ports of further ones lie beyond 65535
+_ADDRESS = re.compile(r"[\w.:%-]+")
+DISTROS = ("humble", "jazzy")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The network of ROS 2 nodes.
+
+    Attributes:
+        domain: number of the ROS domain; by default that of the environment variable ROS_DOMAIN_ID, or 0.
+        interface: network interface or address; by default the loopback interface, on which only nodes of this machine
+            are found. ``auto`` takes the interface that Cyclone DDS prefers.
+        peers: addresses of further machines, for networks without multicast.
+        distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
+    """
+
+    domain: int | None = None
+    interface: str = "lo"
+    peers: tuple[str, ...] = ()
+    distro: str = "jazzy"
+
+    def __post_init__(self) -> None:
+        if self.domain is not None and not 0 <= self.domain < _DOMAINS:
+            raise ConfigError(f"The ROS domain is {self.domain}; domains are numbered from 0 to {_DOMAINS - 1}.")
+        for name in (self.interface, *self.peers):
+            if not _ADDRESS.fullmatch(name):
+                raise ConfigError(f"{name!r} is neither a network interface nor an address.")
+        if self.distro not in DISTROS:
+            raise ConfigError(unknown_name("distro", self.distro, DISTROS))
+
+    @property
+    def domain_number(self) -> int:
+        """The domain's number.
+
+        Raises:
+            ConfigError: ROS_DOMAIN_ID is none.
+        """
+        if self.domain is not None:
+            return self.domain
+        text = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not text.isdecimal() or int(text) >= _DOMAINS:
+            raise ConfigError(
+                f"The environment variable ROS_DOMAIN_ID is {text!r}; it is a number from 0 to {_DOMAINS - 1}."
+            )
+        return int(text)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only nodes of this machine are found."""
+        return self.interface in ("lo", "127.0.0.1")
+
+    def cyclonedds_xml(self) -> str:
+        """Return the configuration of Cyclone DDS.
+
+        Type information is ignored: with it nothing with a sequence or an array arrives from Fast DDS (11.0.1).
+        """
+        peers = (*(("127.0.0.1",) if self.is_local else ()), *self.peers)
+        discovery = "".join(f'<Peer address="{peer}"/>' for peer in peers)
+        by_address = self.interface[:1].isdigit()
+        interface = f'<NetworkInterface {"address" if by_address else "name"}="{self.interface}"/>'
+        if self.interface == "auto":
+            interface = '<NetworkInterface autodetermine="true"/>'
+        multicast = "false" if self.is_local else "true"
+        return (
+            '<CycloneDDS><Domain Id="any"><General>'
+            f"<Interfaces>{interface}</Interfaces><AllowMulticast>{multicast}</AllowMulticast></General>"
+            "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
+            f"<Peers>{discovery}</Peers></Discovery>"
+            "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+            "</Domain></CycloneDDS>"
+        )
+
+
+@dataclass(frozen=True)
+class Ros2Config(NetworkConfig):
+    """A robot on the network.
+
+    Attributes:
+        command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough.
+        timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
+        silence_s: readings that are older are a fault [s].
+    """
+
+    command_hz: float = 50.0
+    timeout_s: float = 0.2
+    silence_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("command_hz", "timeout_s", "silence_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"robot.ros2.{name} is {getattr(self, name)}; it is positive and finite.")
+
+
+@dataclass(frozen=True)
+class Qos:
+    """How messages are kept and delivered, in ROS 2's words.
+
+    Attributes:
+        depth: messages that are kept.
+        reliable: whether what is lost is sent again.
+        transient_local: whether those that come later receive what was sent before.
+    """
+
+    depth: int = 10
+    reliable: bool = True
+    transient_local: bool = False
+
+    def of_dds(self, *user_data: bytes) -> Any:
+        """Return it for Cyclone DDS.
+
+        Args:
+            user_data: what else an endpoint tells the others.
+        """
+        from cyclonedds.qos import Policy
+        from cyclonedds.qos import Qos as DdsQos
+
+        reliability = Policy.Reliability
+        return DdsQos(
+            reliability.Reliable(100_000_000) if self.reliable else reliability.BestEffort,
+            Policy.Durability.TransientLocal if self.transient_local else Policy.Durability.Volatile,
+            Policy.History.KeepLast(self.depth),
+            *[Policy.Userdata(data) for data in user_data],
+        )
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        kept = ", transient local" if self.transient_local else ""
+        return f"{'reliable' if self.reliable else 'best effort'}{kept}"
+
+
+SENSOR_DATA = Qos(5, reliable=False)
+"""ROS 2's SensorDataQoS."""
+LATCHED = Qos(1, transient_local=True)
+"""What is sent once and holds, such as ``/tf_static``."""
+
+
+def require_cyclonedds() -> None:
+    """Raise unless the extra of live ROS 2 is installed.
+
+    Raises:
+        ConfigError: it is not; names the command that installs it.
+    """
+    try:
+        import cyclonedds.core  # noqa: F401
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            "Live ROS 2 needs the packages cyclonedds and rosbags, which cannot be imported "
+            f"({error}). {install_extra('ros2')}"
+        ) from error

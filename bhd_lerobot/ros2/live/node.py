@@ -1,0 +1,190 @@
+"""A ROS 2 node: publishers and subscriptions on serialised messages."""
+
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from bhd_lerobot.errors import RealtimeError, as_text
+from bhd_lerobot.ros2.live.graph import Graph
+from bhd_lerobot.ros2.live.network import NetworkConfig, Qos, require_cyclonedds
+from bhd_lerobot.ros2.live.topic_types import raw, topic_type
+from bhd_lerobot.ros2.messages.serialize import decode
+from bhd_lerobot.ros2.messages.types import type_store
+
+_MOST = 1000  # messages that are taken at once
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message that arrived.
+
+    Attributes:
+        msgtype: its type.
+        data: it, serialised.
+        sent_ns: when it was sent, on the sender's wall clock [ns].
+        arrived_ns: when it was taken, on the monotonic clock of this machine [ns].
+    """
+
+    msgtype: str
+    data: bytes
+    sent_ns: int
+    arrived_ns: int
+
+    def message(self) -> Any:
+        """Return it deserialised.
+
+        Raises:
+            DatasetError: its bytes are not of this type.
+        """
+        return decode(self.msgtype, self.data)
+
+
+class Publisher:
+    """Sends messages of a type on a topic."""
+
+    def __init__(self, writer: Any, made: Any, topic: str, msgtype: str) -> None:
+        self._writer, self._made, self.topic, self.msgtype = writer, made, topic, msgtype
+
+    def send(self, data: bytes) -> None:
+        """Send a serialised message.
+
+        Raises:
+            RealtimeError: Cyclone DDS does not take it.
+        """
+        from cyclonedds.core import DDSException
+
+        try:
+            self._writer.write(raw(self._made, data))
+        except DDSException as error:
+            raise RealtimeError(f"A message for {self.topic} cannot be sent: {as_text(error)}.") from error
+
+    @property
+    def receivers(self) -> int:
+        """How many subscriptions fit, of any node."""
+        return len(self._writer.get_matched_subscriptions())
+
+
+class Subscription:
+    """Receives messages of a type on a topic."""
+
+    def __init__(self, reader: Any, topic: str, msgtype: str) -> None:
+        self.reader, self.topic, self.msgtype = reader, topic, msgtype
+
+    def take(self) -> list[Received]:
+        """Return what has arrived since the last call, oldest first; at most as many as the depth of its QoS."""
+        samples = self.reader.take(_MOST)
+        now = time.monotonic_ns()
+        return [
+            Received(self.msgtype, sample.data, sample.sample_info.source_timestamp, now)
+            for sample in samples
+            if sample.sample_info.valid_data
+        ]
+
+    @property
+    def senders(self) -> int:
+        """How many publishers fit, of any node; one that was killed counts for up to 20 s more."""
+        return len(self.reader.get_matched_publications())
+
+
+class Node:
+    """A node on the network, which `ros2 node list` shows.
+
+    Attributes:
+        graph: who else is there.
+
+    Args:
+        name: the node's.
+        network: where other nodes are looked for.
+        namespace: the node's; topics without a slash in front are in it.
+
+    Raises:
+        ConfigError: Cyclone DDS is not installed.
+        RealtimeError: the network cannot be used.
+    """
+
+    def __init__(self, name: str, network: NetworkConfig, namespace: str = "/") -> None:
+        require_cyclonedds()
+        from cyclonedds.core import DDSException, WaitSet
+        from cyclonedds.domain import Domain, DomainParticipant
+        from cyclonedds.qos import Policy
+        from cyclonedds.qos import Qos as DdsQos
+
+        self.name, self.namespace, self.network = name, "/" + namespace.strip("/"), network
+        try:
+            self._domain = Domain(network.domain_number, network.cyclonedds_xml())
+            self._participant = DomainParticipant(network.domain_number, DdsQos(Policy.Userdata(b"enclave=/;")))
+        except DDSException as error:
+            raise RealtimeError(
+                f"The network interface {network.interface!r} cannot be used for ROS domain {network.domain_number}: "
+                f"{as_text(error)}. `ip address` lists the interfaces."
+            ) from error
+        self._waiting = WaitSet(self._participant)
+        self._entities: list[Any] = []
+        self.graph = Graph(self._participant, self.name, self.namespace, network.distro)
+
+    def full_name(self, topic: str) -> str:
+        """Return a topic's name with the namespace in front, unless it begins with a slash."""
+        return topic if topic.startswith("/") else f"{self.namespace.rstrip('/')}/{topic}"
+
+    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None) -> Publisher:
+        """Return a publisher."""
+        return Publisher(*self._writer(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
+
+    def subscription(self, topic: str, msgtype: str, qos: Qos | None = None) -> Subscription:
+        """Return a subscription."""
+        return Subscription(self._reader(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when a message has arrived on a subscription, or after a time [s]."""
+        self._waiting.wait(max(1, round(timeout_s * 1e9)))
+
+    def _topic(self, name: str, msgtype: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        topic = Topic(self._participant, name, topic_type(msgtype))
+        self._entities.append(topic)
+        return topic
+
+    def _writer(self, name: str, msgtype: str, qos: Qos) -> tuple[Any, Any]:
+        from cyclonedds.pub import DataWriter
+
+        writer = DataWriter(self._participant, self._topic(name, msgtype), qos.of_dds(_type_hash(msgtype)))
+        self._entities.append(writer)
+        self.graph.add(writer.guid, is_writer=True)
+        return writer, topic_type(msgtype)
+
+    def _reader(self, name: str, msgtype: str, qos: Qos) -> Any:
+        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+        from cyclonedds.sub import DataReader
+
+        reader = DataReader(self._participant, self._topic(name, msgtype), qos.of_dds(_type_hash(msgtype)))
+        anything = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
+        self._waiting.attach(anything)
+        self._entities += [reader, anything]
+        self.graph.add(reader.guid, is_writer=False)
+        return reader
+
+    def close(self) -> None:
+        """Leave the network. May be called twice."""
+        # Cyclone DDS deletes an entity with the last reference to it; the domain's participant has to go first.
+        self._entities.clear()
+        self.__dict__.pop("_waiting", None)
+        self.__dict__.pop("graph", None)
+        self.__dict__.pop("_participant", None)
+        self.__dict__.pop("_domain", None)
+
+    def __enter__(self) -> Self:
+        """Return the node."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the network."""
+        self.close()
+
+
+def _type_hash(msgtype: str) -> bytes:
+    """Return what an endpoint says of its type since Iron; ROS 2 warns of an endpoint without it."""
+    return f"typehash={type_store().hash_rihs01(msgtype)};".encode()

@@ -1,0 +1,130 @@
+"""The topics of a TurtleBot3, as `turtlebot3_node`, its lidar's driver and `robot_state_publisher` have them.
+
+Different from the real ones: the IMU has no orientation and no acceleration, the battery is always full, and the robot
+stops by itself when no command comes for `command_timeout_s`, where a real one continues with the last.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages import views
+from bhd_lerobot.ros2.messages.base import (
+    GYRO,
+    TWIST,
+    BareTwistPart,
+    GyroPart,
+    OdometryPart,
+    ScanPart,
+    TwistPart,
+)
+from bhd_lerobot.ros2.messages.parts import Frames, header
+from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
+
+NODE_HZ = 20  # of turtlebot3_node's timer
+_JOINTS = ("wheel_left_joint", "wheel_right_joint")
+_BATTERY = "sensor_msgs/msg/BatteryState"
+_VOLTAGE, _CAPACITY = 11.1, 1.8  # [V], [A h], ROBOTIS e-Manual: LiPo, 11.1 V, 1800 mAh
+_LIPO, _GOOD, _FULL = 3, 1, 4  # BatteryState's constants: technology, health, supply status
+_POLL_NS = 1_000_000  # between two looks for a scan that is due
+
+
+class BaseTopics:
+    """The topics of a base with a scanner.
+
+    Args:
+        host: the robot, with odometry and a gyroscope in its observation.
+        node: the node.
+        counts: what is refused.
+        view: what is known of the robot.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView) -> None:
+        body = host.body
+        if not isinstance(body, MobileBase) or body.lidar is None:
+            raise AssertionError(f"{host.config.type} is no base with a lidar.")
+        self._host, self._counts, self._view, self._drive = host, counts, view, body.drive
+        beams = host.config.beams
+        names = list(host.observation_names)
+        self._gyro = [names.index(name) for name in GYRO]
+        self._ranges = slice(names.index("scan_000.pos"), names.index("scan_000.pos") + beams)
+        self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), body.lidar)
+        self._odometry_part = OdometryPart("/odom", (*TWIST, "x.pos", "y.pos", "theta.pos"))
+        self._gyro_part = GyroPart("/imu", GYRO)
+        self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
+        self._scanned_ns = 0  # when the last scan that was published was taken [ns]
+        self._scan_due_ns = 0
+        self._stamped = node.network.distro != "humble"
+        command = (TwistPart if self._stamped else BareTwistPart).msgtype
+        self._command = node.subscription("/cmd_vel", command)
+        self._odometry = node.publisher("/odom", OdometryPart.msgtype)
+        self._imu = node.publisher("/imu", GyroPart.msgtype)
+        self._joints = node.publisher("/joint_states", views.JOINT_STATE)
+        self._battery = node.publisher("/battery_state", _BATTERY)
+        self._transforms = node.publisher("/tf", views.TF, Qos(100))
+        self._static = node.publisher("/tf_static", views.TF, LATCHED)
+        self._scan = node.publisher("/scan", ScanPart.msgtype, SENSOR_DATA)
+        for message in views.static_transforms(view.frames, State.of(host).stamp_ns):
+            self._static.send(message)
+
+    def outputs(self) -> Iterable[Output]:
+        """Return what is published."""
+        return [Output(NODE_HZ, self._publish)]
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+        return [Input(self._command, self._drive_by)]
+
+    def _drive_by(self, message: Any) -> None:
+        twist = message.twist if self._stamped else message
+        values = np.array([[twist.linear.x, twist.angular.z]])
+        self._counts.add_result(self._command.topic, self._host.bridge.send(values))
+
+    def _publish(self, state: State) -> None:
+        record, stamps = state.record, state.stamps
+        frames = Frames(0, np.zeros(1, np.int64), stamps)
+        twist = record["observation"][:, :2]
+        moved = np.concatenate([twist, record["odometry"]], axis=1)
+        angles, speeds = record["joint_positions"], record["joint_velocities"]
+        joints = {
+            "header": header(stamps, "base_link"),
+            "name": list(_JOINTS),
+            "position": angles,
+            "velocity": speeds * self._drive.wheel_radius,  # turtlebot3_node has them in m/s
+        }
+        self._odometry.send(self._odometry_part.encode(frames, moved)[0])
+        self._imu.send(self._gyro_part.encode(frames, record["observation"][:, self._gyro])[0])
+        self._joints.send(encode(views.JOINT_STATE, joints, 1)[0])
+        battery = {
+            "header": header(stamps),
+            **{"voltage": _VOLTAGE, "temperature": math.nan, "current": math.nan, "charge": math.nan},
+            **{"capacity": math.nan, "design_capacity": _CAPACITY, "percentage": 1.0, "present": True},
+            **{"power_supply_status": _FULL, "power_supply_health": _GOOD, "power_supply_technology": _LIPO},
+        }
+        self._battery.send(encode(_BATTERY, battery, 1)[0])
+        self._transforms.send(views.base_transforms(self._odometry_part, frames, moved)[0])
+        motion = views.Motion(dict(zip(_JOINTS, angles.T, strict=True)))
+        for message in views.moving_transforms(self._view, frames, motion):
+            self._transforms.send(message)
+
+    def poll(self, now_ns: int) -> int:
+        """Publish a scan that was taken; return when the next one is due [ns]."""
+        if now_ns < self._scan_due_ns:
+            return self._scan_due_ns
+        state = State.of(self._host)
+        taken = int(state.record["sensed_ns"] - state.record["oldest_ns"])
+        if taken - self._scanned_ns > self._scan_period_ns // 2:
+            self._scanned_ns = taken
+            stamps = state.stamps - int(state.record["oldest_ns"])
+            ranges = state.record["observation"][:, self._ranges]
+            self._scan.send(self._scan_part.encode(Frames(0, np.zeros(1, np.int64), stamps), ranges)[0])
+        self._scan_due_ns = max(now_ns + _POLL_NS, self._scanned_ns + self._scan_period_ns)
+        return self._scan_due_ns

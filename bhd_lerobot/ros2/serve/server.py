@@ -1,0 +1,169 @@
+"""The loop of a served robot: commands in as they arrive, topics out on fixed grids of time."""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.node import Node, Subscription
+
+_LONGEST_WAIT_S = 0.02
+
+
+@dataclass
+class State:
+    """What the cerebellum published last.
+
+    Attributes:
+        record: it; see `bhd_lerobot.robots.host.state.state_dtype`.
+        stamp_ns: when it was measured, on the wall clock [ns].
+    """
+
+    record: Any
+    stamp_ns: int
+
+    @classmethod
+    def of(cls, host: LiveHost) -> "State":
+        """Return the newest state of a robot."""
+        record = host.bridge.latest
+        return cls(record, int(record["sensed_ns"]) + time.time_ns() - time.monotonic_ns())
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """The stamp [ns], shape (1,)."""
+        return np.array([self.stamp_ns])
+
+
+@dataclass
+class Output:
+    """Something that is published at a fixed rate.
+
+    Attributes:
+        rate_hz: how often [Hz].
+        publish: sends the messages of a state.
+        due_ns: when it is due next, monotonic [ns].
+    """
+
+    rate_hz: float
+    publish: Callable[[State], None]
+    due_ns: int = 0
+
+    def run(self, now_ns: int, host: LiveHost) -> None:
+        """Publish if it is due; times that went by are left out, the grid stays."""
+        if now_ns < self.due_ns:
+            return
+        self.publish(State.of(host))
+        period = round(NANOSECONDS / self.rate_hz)
+        self.due_ns += max(1, (now_ns - self.due_ns) // period + 1) * period
+
+
+@dataclass
+class Input:
+    """A topic that commands the robot.
+
+    Attributes:
+        subscription: where messages come from.
+        take: takes a message, deserialised.
+        every: take all messages in their order, not the newest alone.
+    """
+
+    subscription: Subscription
+    take: Callable[[Any], None]
+    every: bool = False
+
+    def run(self, count: "Counts") -> None:
+        """Take what has arrived."""
+        received = self.subscription.take()
+        for one in received if self.every else received[-1:]:
+            try:
+                message = one.message()
+            except DatasetError as error:
+                count.add(f"{self.subscription.topic}: {error}")
+                continue
+            self.take(message)
+
+
+@dataclass
+class Counts:
+    """What was refused, and why."""
+
+    refused: dict[str, int] = field(default_factory=dict)
+
+    def add(self, reason: str) -> None:
+        """Count one."""
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
+    def add_result(self, topic: str, sent: SendResult) -> None:
+        """Count a command that the cerebellum refused."""
+        reason = Reason(int(sent.reasons[0]))
+        if reason != Reason.ACCEPTED:
+            self.add(f"{topic}: {reason.explanation}")
+
+
+class Topics(Protocol):
+    """The topics of a kind of robot."""
+
+    def outputs(self) -> Iterable[Output]:
+        """Return what is published."""
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+
+    def poll(self, now_ns: int) -> int:
+        """Do what is due at a monotonic time [ns]; return when there is more to do, or a large number."""
+
+
+NEVER_NS = 1 << 62
+
+
+class Server:
+    """Serves a robot.
+
+    Args:
+        host: the robot, whose loop runs.
+        node: the node.
+        parts: its topics.
+        counts: what they refuse.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, parts: Iterable[Topics], counts: Counts) -> None:
+        self._host, self._node, self._parts, self.counts = host, node, list(parts), counts
+        self._outputs = [output for part in self._parts for output in part.outputs()]
+        self._inputs = [one for part in self._parts for one in part.inputs()]
+
+    def run(self, stop: Callable[[], bool], report: Callable[[str], None]) -> None:
+        """Serve until `stop` returns true.
+
+        Args:
+            report: takes a line about what was refused, at most one a second.
+
+        Raises:
+            RealtimeError: a process of the robot has ended.
+        """
+        start = time.monotonic_ns()
+        for output in self._outputs:
+            output.due_ns = start
+        reported, told_ns = dict(self.counts.refused), start
+        while not stop():
+            now = time.monotonic_ns()
+            for one in self._inputs:
+                one.run(self.counts)
+            for output in self._outputs:
+                output.run(now, self._host)
+            due = min([*(output.due_ns for output in self._outputs), *(part.poll(now) for part in self._parts)])
+            if now - told_ns > NANOSECONDS:
+                told_ns = now
+                self._host.link.check()
+                for reason, count in self.counts.refused.items():
+                    if count != reported.get(reason, 0):
+                        report(f"refused {count - reported.get(reason, 0)}: {reason}")
+                reported = dict(self.counts.refused)
+            left = (due - time.monotonic_ns()) / NANOSECONDS
+            if left > 0:
+                self._node.wait(min(left, _LONGEST_WAIT_S))

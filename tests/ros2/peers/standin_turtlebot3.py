@@ -1,0 +1,428 @@
+"""A stand-in for a real TurtleBot3 Burger: its nodes' topics, types, frames, rates and QoS, in a room with pillars.
+
+As the real one does, it goes on with its last command for ever, takes commands in whole hundredths of m/s and rad/s,
+gives wheel positions that are one cycle old, and stamps a scan with the time of its first beam while it publishes it
+after its last.
+
+Faults are named by topic, without its slash: scan, odom, tf, imu, joint_states, battery_state, or all. Times count from
+the start [s]; an option may be given several times.
+"""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import node as peer
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from room import LIDAR_X, MOST_FORWARD, MOST_TURNING, WHEEL_RADIUS, WHEEL_SEPARATION, Base, Room
+from sensor_msgs.msg import BatteryState, Imu, JointState, LaserScan
+from std_srvs.srv import SetBool, Trigger
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # no wheel has it, and there was no compiler: no /tf
+    TFMessage = None
+
+STEP = 0.01  # [s]
+CYCLE = 5  # steps between two publications of turtlebot3_node: 20 Hz
+TICK = math.tau / 4096  # [rad], of a DYNAMIXEL XL430-W250's encoder
+RPM_UNIT = 0.229 * math.tau / 60 * WHEEL_RADIUS  # [m/s], of its velocity
+TURN = 0.2  # [s], of the lidar: 5 Hz
+RESTART = 75  # exit status of a life that ends by --restart
+OLDEST = 0.2  # [s], what is older by the time it could be published is left out, as after SIGCONT
+
+
+def at(kind: str) -> Callable[[str], tuple[Any, ...]]:
+    """Return a parser of options like TOPIC:START:DURATION."""
+    names = kind.split(":")
+
+    def parse(text: str) -> tuple[Any, ...]:
+        parts = text.split(":")
+        if len(parts) != len(names):
+            raise peer.argparse.ArgumentTypeError(f"{text!r} is not {kind}")
+        return tuple(
+            part if name in ("TOPIC", "FRAME") else float(part) for name, part in zip(names, parts, strict=True)
+        )
+
+    return parse
+
+
+parser = peer.options(__doc__)
+parser.add_argument("--lidar", choices=("lds01", "lds02"), default="lds01")
+parser.add_argument("--twist", action="store_true", help="take Twist, as up to Humble, instead of TwistStamped")
+parser.add_argument("--log", help="file for JSON lines: each command, scan and odometry, and the true pose at 20 Hz")
+parser.add_argument("--seed", type=int, default=0, help="of all noise")
+parser.add_argument("--noise", type=float, default=1.0, help="factor of all noise; 0: none")
+parser.add_argument("--pose", type=at("X:Y:YAW"), default=(-1.2, -0.6, 0.0), help="where it starts [m, rad]")
+parser.add_argument("--open", action="store_true", help="no pillars")
+parser.add_argument("--half", type=float, default=2.0, help="half of the room's width [m]")
+parser.add_argument("--acceleration", type=float, default=1.0, help="limit of the acceleration [m/s^2]")
+parser.add_argument("--heading", choices=("wheels", "imu"), default="wheels", help="what the odometry turns by")
+parser.add_argument(
+    "--old-twist", action="store_true", help="/odom's twist is divided by minus the time since 1970, as up to 2024"
+)
+fault = parser.add_argument_group("faults")
+fault.add_argument(
+    "--gap", action="append", default=[], type=at("TOPIC:START:DURATION"), metavar="TOPIC:START:DURATION"
+)
+fault.add_argument("--silence", action="append", default=[], type=at("TOPIC:START"), metavar="TOPIC:START")
+fault.add_argument(
+    "--nan", action="append", default=[], type=at("TOPIC:START:DURATION"), metavar="TOPIC:START:DURATION"
+)
+fault.add_argument("--frame", action="append", default=[], type=at("TOPIC:FRAME"), metavar="TOPIC:FRAME")
+fault.add_argument("--zero-stamp", action="append", default=[], metavar="TOPIC")
+fault.add_argument("--swap", action="append", default=[], type=at("TOPIC:EVERY"), metavar="TOPIC:EVERY")
+fault.add_argument("--clock-offset", type=float, default=0.0, help="[s]")
+fault.add_argument("--clock-drift", type=float, default=0.0, help="[s/s]")
+fault.add_argument("--clock-jump", action="append", default=[], type=at("START:OFFSET"), metavar="START:OFFSET")
+fault.add_argument("--restart", action="append", default=[], type=at("START:DURATION"), metavar="START:DURATION")
+parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # file of what outlives a restart
+args = parser.parse_args()
+
+log_file = open(args.log, "a", buffering=1) if args.log else None  # noqa: SIM115
+
+
+def record(event: str, monotonic: float, **fields: Any) -> None:
+    if log_file is not None:
+        log_file.write(json.dumps({"event": event, "monotonic": monotonic} | fields) + "\n")
+
+
+def quaternion(yaw: float) -> dict[str, float]:
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+
+
+def assign(message: Any, values: dict[str, float]) -> None:
+    for name, value in values.items():
+        setattr(message, name, value)
+
+
+class Outlet:
+    """A publisher with the faults of its topic."""
+
+    def __init__(self, robot: "Robot", node: Node, topic: str, kind: type, *, qos: Any = 10, frame: str = "") -> None:
+        def mine(faults: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+            return [rest for name, *rest in faults if name in (topic, "all")]
+
+        self.robot, self.topic = robot, topic
+        self.gaps = [*mine(args.gap), *((start, math.inf) for (start,) in mine(args.silence))]
+        self.nans = mine(args.nan)
+        self.frame = next((name for (name,) in mine(args.frame)), frame)
+        self.zero = bool({topic, "all"} & set(args.zero_stamp))
+        self.every = int(next((every for (every,) in mine(args.swap)), 0))
+        self.publisher = node.create_publisher(kind, f"/{topic}", qos)
+        self.held: Any = None
+        self.count = 0
+
+    def is_within(self, times: list[tuple[Any, ...]]) -> bool:
+        return any(start <= self.robot.elapsed < start + duration for start, duration in times)
+
+    def publish(self, message: Any, header: Any, stamp: int) -> None:
+        """Publish, but for the faults, with a stamp [ns]."""
+        if self.is_within(self.gaps):
+            return
+        header.stamp = Time() if self.zero else Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
+        header.frame_id = self.frame
+        self.count += 1
+        if self.every and self.count % self.every == 0 and self.held is None:
+            self.held = message
+            return
+        self.publisher.publish(message)
+        if self.held is not None:
+            self.publisher.publish(self.held)
+            self.held = None
+
+
+class Robot:
+    def __init__(self, new_node: Callable[[str], Node]) -> None:
+        before = json.loads(Path(args.resume).read_text()) if args.resume else {}
+        self.start = before.get("start", time.monotonic())
+        self.restarts = before.get("restarts", 0)
+        self.random = np.random.default_rng([args.seed, self.restarts])
+        self.room = Room(args.half, np.zeros((0, 3))) if args.open else Room(args.half)
+        x, y, yaw = before.get("pose", args.pose)
+        self.base = Base(self.room, x, y, yaw, most_acceleration=args.acceleration)
+        self.now = time.monotonic()  # up to which the robot has moved
+        self.steps = 0
+        self.wheels = np.zeros(2)  # [rad], left and right
+        self.old_wheels = np.zeros(2)  # of the last cycle
+        self.odometry = np.zeros(3)  # x, y, yaw [m, rad]
+        self.imu_yaw = self.odometry_imu_yaw = 0.0
+        self.battery = 12.1  # [V]
+        self.commands = 0
+        self.begin_turn()
+
+        main = new_node("turtlebot3_node")
+        drive = new_node("diff_drive_controller")
+        lidar = new_node("hlds_laser_publisher" if args.lidar == "lds01" else "ld08_driver")
+        self.scan = Outlet(self, lidar, "scan", LaserScan, qos=qos_profile_sensor_data, frame="base_scan")
+        self.odom = Outlet(self, drive, "odom", Odometry, frame="odom")
+        self.imu = Outlet(self, main, "imu", Imu, frame="imu_link")
+        self.joints = Outlet(self, main, "joint_states", JointState, frame="base_link")
+        self.power = Outlet(self, main, "battery_state", BatteryState)
+        self.outlets = [self.scan, self.odom, self.imu, self.joints, self.power]
+        self.tf = None
+        if TFMessage is not None:
+            self.tf = Outlet(self, drive, "tf", TFMessage, qos=100, frame="odom")
+            self.outlets.append(self.tf)
+            latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+            self.publish_fixed_frames(
+                new_node("robot_state_publisher").create_publisher(TFMessage, "/tf_static", latched)
+            )
+        main.create_subscription(Twist if args.twist else TwistStamped, "/cmd_vel", self.on_command, 10)
+        main.create_service(SetBool, "/motor_power", self.on_motor_power)
+        main.create_service(Trigger, "/reset", self.on_reset)
+        drive.create_service(Trigger, "/reset_odometry", self.on_reset_odometry)
+        main.create_timer(STEP, self.advance)
+        main.create_timer(1.0, self.report)
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the start, restarts included [s]."""
+        return self.now - self.start
+
+    def stamp(self, monotonic: float) -> int:
+        """Return what the robot's clock shows at a time [ns]."""
+        age = time.monotonic() - monotonic
+        wrong = args.clock_offset + args.clock_drift * (monotonic - self.start)
+        wrong += sum(offset for start, offset in args.clock_jump if monotonic - self.start >= start)
+        return time.time_ns() + round((wrong - age) * 1e9)
+
+    def noise(self, deviation: float, *shape: int) -> Any:
+        return args.noise * self.random.normal(0.0, deviation, shape or None)
+
+    # what comes in
+
+    def on_command(self, message: Any) -> None:
+        twist = message if args.twist else message.twist
+        self.commands += 1
+        given = twist.linear.x, twist.angular.z
+        if all(map(math.isfinite, given)):  # sent to the motors as whole hundredths, cut off
+            forward, turning = (math.trunc(value * 100 + math.copysign(1e-9, value)) / 100 for value in given)
+            self.base.command = (
+                float(np.clip(forward, -MOST_FORWARD, MOST_FORWARD)),
+                float(np.clip(turning, -MOST_TURNING, MOST_TURNING)),
+            )
+        stamp = None if args.twist else message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        record("command", time.monotonic(), given=given, taken=self.base.command, stamp=stamp)
+
+    def on_motor_power(self, request: Any, response: Any) -> Any:
+        self.base.motors_on = request.data
+        response.success, response.message = True, "on" if request.data else "off"
+        record("motor_power", time.monotonic(), on=request.data)
+        return response
+
+    def on_reset(self, _: Any, response: Any) -> Any:
+        self.imu_yaw = self.odometry_imu_yaw = 0.0
+        response.success = True
+        record("reset", time.monotonic())
+        return response
+
+    def on_reset_odometry(self, _: Any, response: Any) -> Any:
+        self.odometry[:] = 0.0
+        response.success = True
+        record("reset_odometry", time.monotonic())
+        return response
+
+    # what happens
+
+    def advance(self) -> None:
+        """Move up to the present, and publish what is due meanwhile."""
+        while self.now + STEP <= time.monotonic():
+            self.now += STEP
+            self.steps += 1
+            driven, turned = self.base.step(STEP)
+            slip = 1 + self.noise(0.01, 2)
+            half = turned * WHEEL_SEPARATION / 2
+            self.wheels += np.array([driven - half, driven + half]) * slip / WHEEL_RADIUS
+            self.imu_yaw = math.remainder(self.imu_yaw + turned + self.noise(1e-4), math.tau)
+            is_late = time.monotonic() - self.now > OLDEST
+            self.turn_lidar(is_late)
+            if self.steps % CYCLE == 0:
+                self.cycle(is_late)
+            for start, duration in sorted(args.restart)[self.restarts :]:
+                if self.elapsed >= start:
+                    self.restart(duration)
+
+    def restart(self, duration: float) -> None:
+        """Vanish as a robot does whose power fails, without a goodbye, and come back after a time."""
+        pose = [self.base.x, self.base.y, self.base.yaw]
+        state = {"start": self.start, "pose": pose, "restarts": self.restarts + 1}
+        Path(args.resume).write_text(json.dumps(state))
+        record("restart", self.now, down=duration)
+        peer.log("restart", down=duration)
+        os._exit(RESTART)
+
+    def begin_turn(self) -> None:
+        self.turn_start = self.now
+        beams = 360 if args.lidar == "lds01" else int(self.random.integers(350, 371))
+        self.increment = math.tau / (beams if args.lidar == "lds01" else beams - 1)
+        self.readings = np.full(beams, math.nan)
+        self.measured = 0
+
+    def turn_lidar(self, is_late: bool) -> None:
+        """Measure the beams of one step, and publish when the lidar has turned once."""
+        beams = len(self.readings)
+        last = min(beams, math.ceil(beams * (self.now - self.turn_start) / TURN - 1e-9))
+        angles = self.increment * np.arange(self.measured, last)
+        cos, sin = math.cos(self.base.yaw), math.sin(self.base.yaw)
+        true = self.room.ranges(self.base.x + LIDAR_X * cos, self.base.y + LIDAR_X * sin, angles + self.base.yaw)
+        self.readings[self.measured : last] = true + self.noise(0.01, len(angles))
+        self.measured = last
+        if last < beams:
+            return
+        if not is_late:
+            self.publish_scan()
+        self.begin_turn()
+
+    def publish_scan(self) -> None:
+        scan = LaserScan(angle_min=0.0, angle_max=math.tau, angle_increment=self.increment)
+        scan.scan_time, scan.time_increment = TURN, TURN / len(self.readings)
+        ranges = self.readings
+        if args.lidar == "lds01":
+            scan.range_min, scan.range_max = 0.12, 3.5
+            ranges = np.where((ranges < scan.range_min) | (ranges > scan.range_max), 0.0, ranges)
+        else:
+            scan.range_min, scan.range_max = 0.0, 100.0
+            lost = (ranges > 8.0) | (self.random.random(len(ranges)) < 0.03 * args.noise)
+            ranges = np.where(lost, math.nan, ranges)
+        if self.scan.is_within(self.scan.nans):
+            ranges = np.full(len(ranges), math.nan)
+        scan.ranges = ranges.astype(np.float32).tolist()
+        scan.intensities = [0.0 if not value > 0 else 200.0 for value in scan.ranges]
+        stamp = self.stamp(self.turn_start)
+        self.scan.publish(scan, scan.header, stamp)
+        finite = ranges[np.isfinite(ranges) & (ranges > 0)]
+        nearest = float(finite.min()) if len(finite) else None
+        record("scan", time.monotonic(), stamp=stamp, first=self.turn_start, beams=len(ranges), nearest=nearest)
+
+    def cycle(self, is_late: bool) -> None:
+        """Publish what turtlebot3_node and diff_drive_controller publish every 50 ms."""
+        stamp, dt = self.stamp(self.now), CYCLE * STEP
+        ticks = np.round(self.wheels / TICK) * TICK
+        difference, shown, self.old_wheels = ticks - self.old_wheels, self.old_wheels, ticks
+        driven = WHEEL_RADIUS * difference.mean()
+        turned = WHEEL_RADIUS * (difference[1] - difference[0]) / WHEEL_SEPARATION
+        if args.heading == "imu":  # no remainder is taken: the rate leaps where the angle does, as the real node's
+            turned, self.odometry_imu_yaw = self.imu_yaw - self.odometry_imu_yaw, self.imu_yaw
+        middle = self.odometry[2] + turned / 2
+        self.odometry += np.array([driven * math.cos(middle), driven * math.sin(middle), turned])
+        self.battery = max(11.0, self.battery - 1e-5)
+        base = self.base
+        record(
+            "pose",
+            self.now,
+            stamp=stamp,
+            pose=[base.x, base.y, base.yaw],
+            twist=[base.forward, base.turning],
+            odometry=self.odometry.tolist(),
+            contacts=base.contacts,
+        )
+        if is_late:
+            return
+        per = -stamp * 1e-9 if args.old_twist else dt
+        odometry = Odometry(child_frame_id="base_footprint")
+        pose, twist = odometry.pose.pose, odometry.twist.twist
+        pose.position.x, pose.position.y = float(self.odometry[0]), float(self.odometry[1])
+        assign(pose.orientation, quaternion(self.odometry[2]))
+        twist.linear.x, twist.angular.z = float(driven / per), float(turned / per)
+        if self.odom.is_within(self.odom.nans):
+            pose.position.x = pose.position.y = twist.linear.x = twist.angular.z = math.nan
+        imu = Imu()
+        assign(imu.orientation, quaternion(self.imu_yaw))
+        imu.angular_velocity.z = base.turning + self.noise(0.005)
+        imu.linear_acceleration.y = base.forward * base.turning + self.noise(0.05)
+        imu.linear_acceleration.z = 9.81 + self.noise(0.05)
+        if self.imu.is_within(self.imu.nans):
+            imu.angular_velocity.z = math.nan
+        half = base.turning * WHEEL_SEPARATION / 2
+        speeds = np.round(np.array([base.forward - half, base.forward + half]) / RPM_UNIT) * RPM_UNIT
+        if self.joints.is_within(self.joints.nans):
+            shown = speeds = np.full(2, math.nan)
+        joints = JointState(name=["wheel_left_joint", "wheel_right_joint"])
+        joints.position, joints.velocity = shown.tolist(), speeds.tolist()
+        power = BatteryState(voltage=self.battery, percentage=100 * (self.battery - 11.0) / 1.1, design_capacity=1.8)
+        power.present = True
+        if self.power.is_within(self.power.nans):
+            power.voltage = math.nan
+        self.power.publish(power, power.header, stamp)
+        self.imu.publish(imu, imu.header, stamp)
+        self.joints.publish(joints, joints.header, stamp)
+        self.odom.publish(odometry, odometry.header, stamp)
+        if self.tf is not None:
+            transform = TransformStamped(child_frame_id="base_footprint")
+            transform.transform.translation.x, transform.transform.translation.y = pose.position.x, pose.position.y
+            transform.transform.rotation = pose.orientation
+            self.tf.publish(TFMessage(transforms=[transform]), transform.header, stamp)
+
+    def publish_fixed_frames(self, publisher: Any) -> None:
+        frames = []
+        for parent, child, x, z in (
+            ("base_footprint", "base_link", 0.0, 0.010),
+            ("base_link", "imu_link", -0.032, 0.068),
+            ("base_link", "base_scan", LIDAR_X, 0.172),
+        ):
+            frame = TransformStamped(child_frame_id=child)
+            frame.header.frame_id = parent
+            frame.transform.translation.x, frame.transform.translation.z = x, z
+            frames.append(frame)
+        publisher.publish(TFMessage(transforms=frames))
+        self.fixed_frames = publisher
+
+    def report(self) -> None:
+        base = self.base
+        peer.log(
+            "report",
+            published={outlet.topic: outlet.count for outlet in self.outlets},
+            commands=self.commands,
+            command=base.command,
+            pose=[base.x, base.y, base.yaw],
+            twist=[base.forward, base.turning],
+            clearance=self.room.clearance(base.x, base.y),
+            contacts=base.contacts,
+        )
+
+
+def supervise() -> int:
+    """Run the stand-in in processes of their own, one after the other: each life is another participant of DDS."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        file.write("{}")
+        file.flush()
+        child: subprocess.Popen[bytes] | None = None
+        stopped = False
+
+        def stop(*_: object) -> None:
+            nonlocal stopped
+            stopped = True
+            if child is not None:
+                child.send_signal(signal.SIGINT)
+
+        signal.signal(signal.SIGINT, stop)
+        peer.end_with_parent()
+        for _, down in [*sorted(args.restart), (0.0, 0.0)]:
+            variables = os.environ | {"BHD_PARENT": str(os.getpid())}
+            child = subprocess.Popen([sys.executable, *sys.argv, "--resume", file.name], env=variables)
+            if (status := child.wait()) != RESTART:
+                return status
+            time.sleep(down)
+            if stopped:
+                break
+        return 0
+
+
+if __name__ == "__main__":
+    if args.restart and not args.resume:
+        sys.exit(supervise())
+    peer.run(lambda new_node: Robot(new_node).report, args.seconds)
