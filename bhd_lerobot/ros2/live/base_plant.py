@@ -125,9 +125,7 @@ class BasePlant(Ros2Plant):
         ]
         if config.imu:
             inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, _NODE_SILENCE_S))
-        super().__init__(
-            body.name, config, tuple(inputs), (OutputSpec("/cmd_vel", writer.msgtype, writer, stop=_STOP),)
-        )
+        super().__init__(body.name, config, tuple(inputs), (OutputSpec("/cmd_vel", writer.msgtype, writer, stop=_STOP),))
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the wheels, the scan and the gyroscope into `out`."""

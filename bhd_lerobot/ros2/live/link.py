@@ -19,7 +19,7 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 
 _START_S = 30.0
 _END_S = 3.0
-SILENCE_S = 0.2  # without a sign of life of the node for so long it counts as stopped
+SILENCE_S = 1.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
 
 
 class NodeLink:
@@ -108,6 +108,11 @@ class NodeLink:
         if self._channel is None:
             raise RealtimeError("The ROS 2 node is not open.")
         return self._channel
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process numbers, of ``node`` and ``guard``."""
+        return {role: process.pid for role, process in self._processes.items()}
 
     @property
     def state(self) -> Any:

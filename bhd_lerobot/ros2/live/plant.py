@@ -23,7 +23,9 @@ class Ros2Plant(Plant):
 
     n = 1
 
-    def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
+    def __init__(
+        self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]
+    ) -> None:
         spec = NodeSpec(
             f"bhd_{name}_{os.getpid()}",
             config.ros2,

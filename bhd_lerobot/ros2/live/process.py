@@ -28,7 +28,7 @@ from bhd_lerobot.ros2.messages.images import decode_image
 _WAIT_S = 0.02
 _CHECK_NS = 1_000_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
-_SILENT_S = 0.1  # so long without a sign of life the node counts as stopped
+_SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
 _TOMORROW_NS = 1_000_000_000  # a stamp further ahead of the one before is of a clock that was set
 
 
@@ -260,6 +260,7 @@ def _run_guard(spec: NodeSpec, channel: Channel, connection: Connection) -> None
     with Node(f"{spec.name}_guard", spec.network) as node:
         publishers = [node.publisher(one.topic, one.msgtype, one.qos) for one in spec.outputs]
         stopper = Stopper(spec, publishers)
+        channel.show_life(Word.GUARD_ALIVE)
         connection.send("ready")
         while True:
             channel.show_life(Word.GUARD_ALIVE)
