@@ -8,7 +8,7 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.ros2.messages.parts import NANO, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.ros2.messages.parts import NANO, Array, FieldsPart, Frames, Part, header
 from bhd_lerobot.ros2.messages.serialize import encode
 
 TWIST = ("x.vel", "theta.vel")
@@ -37,33 +37,19 @@ class BaseNoise:
     gyro: float
 
 
-class TwistPart(Part):
+class TwistPart(FieldsPart):
     """A command of a base."""
 
     msgtype = "geometry_msgs/msg/TwistStamped"
-
-    @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        fields: dict[str, Any] = {"twist": twist_tree(values)}
-        return encode(self.msgtype, {"header": header(frames.stamps, FOOTPRINT_FRAME), **fields}, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return twists([message.twist for message in messages])
+    fields = ("twist.linear.x", "twist.angular.z")
+    frame = FOOTPRINT_FRAME
 
 
-class BareTwistPart(Part):
+class BareTwistPart(FieldsPart):
     """A command of a base, without a stamp: what ROS 2 Humble's robots take."""
 
     msgtype = "geometry_msgs/msg/Twist"
-
-    @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        return encode(self.msgtype, twist_tree(values), len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return twists(messages)
+    fields = ("linear.x", "angular.z")
 
 
 def twists(messages: Sequence[Any]) -> Array:
@@ -138,8 +124,8 @@ def odometry(messages: Sequence[Any]) -> tuple[Array, Array]:
     """
     poses = [message.pose.pose for message in messages]
     yaw = np.array([yaw_of(one.w, one.x, one.y, one.z) for one in (pose.orientation for pose in poses)])
-    place = numbers([pose.position for pose in poses], XYZ)
-    return twists([message.twist.twist for message in messages]), np.stack([*place[:, :2].T, unwrapped(yaw)], axis=1)
+    place = np.array([(pose.position.x, pose.position.y) for pose in poses], np.float64).reshape(-1, 2)
+    return twists([message.twist.twist for message in messages]), np.stack([*place.T, unwrapped(yaw)], axis=1)
 
 
 def yaw_of(w: float, x: float, y: float, z: float) -> float:
@@ -168,7 +154,7 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class GyroPart(Part):
+class GyroPart(FieldsPart):
     """A gyroscope; orientation and acceleration are marked as unknown, as ROS specifies.
 
     Attributes:
@@ -178,24 +164,21 @@ class GyroPart(Part):
     noise: BaseNoise | None = None
 
     msgtype = "sensor_msgs/msg/Imu"
+    fields = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
+    frame = IMU_FRAME
 
     @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+    def rest(self) -> dict[str, Any]:
         unknown = np.array([-1.0, *[0.0] * 8])
-        fields = {
-            "header": header(frames.stamps, IMU_FRAME),
+        known = (
+            {} if self.noise is None else {"angular_velocity_covariance": np.eye(3).reshape(-1) * self.noise.gyro**2}
+        )
+        return {
             "orientation": {"w": 1.0},
             "orientation_covariance": unknown,
-            "angular_velocity": dict(zip(XYZ, values.T, strict=True)),
             "linear_acceleration_covariance": unknown,
+            **known,
         }
-        if self.noise is not None:
-            fields["angular_velocity_covariance"] = np.eye(3).reshape(-1) * self.noise.gyro**2
-        return encode(self.msgtype, fields, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return numbers([message.angular_velocity for message in messages], XYZ)
 
 
 @dataclass(frozen=True)

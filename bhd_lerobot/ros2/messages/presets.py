@@ -7,10 +7,8 @@ from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
 from bhd_lerobot.ros2.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, OdometryPart, TwistPart
 from bhd_lerobot.ros2.messages.images import IMAGE
 from bhd_lerobot.ros2.messages.mapping import SCAN, FieldConfig, ImageConfig, MappingConfig
-from bhd_lerobot.ros2.messages.parts import XYZ
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
 
-_SPEEDS = ("linear.x", "angular.z")
 _POSE = ("position.x", "position.y", "orientation")
 
 
@@ -39,7 +37,7 @@ def turtlebot3(
     observation: dict[str, FieldConfig] = {}
     if odom is not None:
         kind = OdometryPart.msgtype
-        fields = [f"twist.twist.{field}" for field in _SPEEDS]
+        fields = [f"twist.{field}" for field in TwistPart.fields]
         observation |= {name: FieldConfig(odom, kind, field) for name, field in zip(TWIST, fields, strict=True)}
     observation["scan"] = FieldConfig(
         scan, SCAN, "ranges", beams=beams, range_min=lidar.range_min, range_max=lidar.range_max
@@ -48,12 +46,10 @@ def turtlebot3(
         fields = [f"pose.pose.{field}" for field in _POSE]
         observation |= {name: FieldConfig(odom, kind, field) for name, field in zip(ODOMETRY, fields, strict=True)}
     if imu is not None:
-        fields = [f"angular_velocity.{axis}" for axis in XYZ]
-        observation |= {
-            name: FieldConfig(imu, GyroPart.msgtype, field) for name, field in zip(GYRO, fields, strict=True)
-        }
-    kind, prefix = (TwistPart.msgtype, "twist.") if stamped else (BareTwistPart.msgtype, "")
-    action = {name: FieldConfig(cmd, kind, f"{prefix}{field}") for name, field in zip(TWIST, _SPEEDS, strict=True)}
+        kind = GyroPart.msgtype
+        observation |= {name: FieldConfig(imu, kind, field) for name, field in zip(GYRO, GyroPart.fields, strict=True)}
+    part = TwistPart if stamped else BareTwistPart
+    action = {name: FieldConfig(cmd, part.msgtype, field) for name, field in zip(TWIST, part.fields, strict=True)}
     images = {name: ImageConfig(topic, type=IMAGE) for name, topic in (cameras or {}).items()}
     return MappingConfig(observation, action, images)
 
