@@ -1,6 +1,5 @@
 """Which field of which topic is which feature of a robot: one description for bags and for robots on the network."""
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -196,13 +195,15 @@ class TopicFields:
         values = [_number(one, one.read(message)) for one in self.fields]
         return np.array(values, np.float64) * self.scales + self.offsets
 
-    def read_present(self, message: Any) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
-        """Return the features in a message that may have some of them only, masked where it has no such element."""
-        values = np.ma.masked_all(len(self.fields), np.float64)
+    def read_present(self, message: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the features in a message, and which of them it has no element for, shape (len(columns),) each."""
+        values, missing = np.zeros(len(self.fields)), np.zeros(len(self.fields), np.bool_)
         for column, one in enumerate(self.fields):
-            with contextlib.suppress(DatasetError):
+            try:
                 values[column] = _number(one, one.read(message))
-        return values * self.scales + self.offsets
+            except DatasetError:
+                missing[column] = True
+        return values * self.scales + self.offsets, missing
 
     def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
         """Return a serialised message with the features, shape (len(columns),), and the stamp [ns] if it has one."""
@@ -269,8 +270,6 @@ def register_types(types: Mapping[str, str]) -> None:
 
     store = type_store()
     for name, text in types.items():
-        if name in store.fielddefs:
-            continue
         try:
             store.register(get_types_from_msg(text, name))
         except Exception as error:  # whatever rosbags' parser raises

@@ -197,24 +197,25 @@ def _part(part: Part, reading: Reading) -> Array:
 
 def _fields(fields: TopicFields, names: Sequence[str], angles: Mapping[str, float], reading: Reading) -> Array:
     """Return the fields of messages; a joint state of some joints has some of them."""
-    values = np.ma.masked_all((len(reading.decoded), len(names)), np.float64)
+    values = np.zeros((len(reading.decoded), len(names)))
+    missing = np.zeros_like(values, np.bool_)
     reasons: dict[str, None] = {}
     for row, message in enumerate(reading.decoded):
         try:
             values[row] = fields.read(message)
         except DatasetError as error:
             reasons[str(error)] = None
-            values[row] = fields.read_present(message)
-    lacking = [name for name, column in zip(names, np.ma.getmaskarray(values).T, strict=True) if column.all()]
+            values[row], missing[row] = fields.read_present(message)
+    lacking = [name for name, column in zip(names, missing.T, strict=True) if column.all()]
     if lacking and len(values):
         raise DatasetError(
             f"No message of {reading.topic} has what {', '.join(lacking)} is read from: {' '.join(list(reasons)[:3])}"
         )
     for column, name in enumerate(names):
         if name in angles:
-            rows = ~np.ma.getmaskarray(values)[:, column]
-            values[rows, column] = unwrapped(values.data[rows, column], angles[name])
-    return values
+            rows = ~missing[:, column]
+            values[rows, column] = unwrapped(values[rows, column], angles[name])
+    return np.ma.masked_array(values, missing) if missing.any() else values
 
 
 def _odometry(read: Reader, frame: str | None, reading: Reading) -> Array:

@@ -108,7 +108,7 @@ def static_topics(scan: str) -> set[str]:
 def publisher_notes(bag: Bag, wanted: Sequence[tuple[Source, Topic]]) -> list[str]:
     """Return, in sentences, which topics that are read may have more than one publisher."""
     notes = []
-    for source, topic in wanted:
+    for source, topic in {topic.name: (source, topic) for source, topic in wanted}.values():
         counts = "newest command counts, as it did for the robot" if source.is_action else "newest message counts"
         if topic.connections:
             each = " and ".join(str(count) for count in topic.connections)

@@ -5,10 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.ros2.messages.mapping import MappingConfig, topics_of
 from tests.cases import each_case
 from tests.cli.data.import_support import imported, refused
 from tests.ros2.bag import support as bags
@@ -154,8 +158,6 @@ def test_what_happens_later_changes_nothing_before(tmp_path, dataset, mapping):
 
 
 def test_a_mapping_on_the_command_line_is_that_of_the_file(tmp_path, bag, dataset, mapping):
-    import yaml
-
     given = [
         f"--map.{section}.{name}={json.dumps(entry)}"
         for section, entries in yaml.safe_load(MAP).items()
@@ -291,3 +293,68 @@ def test_a_mapping_is_stored_with_the_dataset(dataset, mapping):
     about = json.loads((Path(dataset) / "meta/bhd.json").read_text())["recording"]["imported"]
     assert about["mapping"]["observation"]["hand.pos"]["field"] == "position[name=hand]"
     assert about["mapping"]["observation"]["hand.pos"]["scale"] == 0.001
+
+
+SPEEDS = """
+observation:
+  scan: {topic: /scan, type: sensor_msgs/msg/LaserScan, beams: 4, range_min: 0.2, range_max: 1.2}
+  lag.vel: {topic: /load, type: yard_msgs/msg/Load, field: "parts[id=7].speed"}
+action:
+  x.vel: {topic: /cmd_vel, type: geometry_msgs/msg/Twist, field: linear.x}
+  lag.vel: {topic: load, type: yard_msgs/msg/Load, field: "parts[id=7].speed"}
+types:
+  yard_msgs/msg/Load: "std_msgs/Header header\\nyard_msgs/Part[] parts"
+  yard_msgs/msg/Part: "string id\\nfloat32 speed\\nbool on"
+"""
+
+
+def test_scans_speeds_and_types_of_any_base(tmp_path, capsys):
+    """Without odometry, of a type that only the mapping defines; the action may be what a sensor reads next."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in yaml.safe_load(SPEEDS)["types"].items():
+        store.register(get_types_from_msg(text, name))
+    load, part = store.types["yard_msgs/msg/Load"], store.types["yard_msgs/msg/Part"]
+    messages = [one for one in drive() if one[0] != "/odom" and not (one[0] == "/cmd_vel" and one[1] < START + NANO)]
+    messages = [one for one in messages if not (one[0] == "/cmd_vel" and 3 < (one[1] - START) / NANO < 5)]
+    for number in range(120):
+        at = START + number * NANO // 20
+        parts = [part("3", 9.0, False), part("7", number / 8, True)]
+        messages.append(("/load", at + 10**6, load(bags.header(at, ""), parts)))
+    messages.sort(key=lambda one: one[1])
+    path, source = tmp_path / "base.yaml", tmp_path / "bag"
+    path.write_text(SPEEDS)
+    with Writer(source, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for topic, at, one in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, one.__msgtype__, typestore=store)
+            writer.write(connections[topic], at, store.serialize_cdr(one, one.__msgtype__))
+    imported(source, tmp_path / "d", f"--map={path}", "--command_timeout=0.5")
+    error, columns = capsys.readouterr().err, read_episode(tmp_path / "d", 0)
+    assert "no odometry is read" not in error  # it is no TurtleBot3: whether it has speeds is not known
+    names = dataset_info(tmp_path / "d").features["observation.state"]["names"]
+    assert names == ["scan_000.pos", "scan_001.pos", "scan_002.pos", "scan_003.pos", "lag.vel"]
+    start = json.loads(dataset_info(tmp_path / "d").episodes[0].metadata["source"])["start_ns"]
+    at = start + np.arange(len(columns["action"])) * NANO // 10
+    scan, _ = newest(messages, "/scan", at, lambda one: np.clip(one.ranges[::90], 0.2, 1.2))
+    np.testing.assert_allclose(columns["observation.state"][:, :4], scan, atol=1e-6)
+    lag, _ = newest(messages, "/load", at, lambda one: one.parts[1].speed)
+    after, _ = newest(messages, "/load", at + NANO // 10 - 1, lambda one: one.parts[1].speed)
+    assert np.array_equal(columns["observation.state"][:, 4], lag)
+    assert np.array_equal(columns["action"][:, 1], after)
+    silent = columns["control.mode"] == 2  # before the first command, and long after the newest
+    assert (columns["action"][silent, 0] == 0).all()
+    assert (columns["action"][~silent, 0] != 0).all()
+    assert 20 < silent.sum() < 30
+    assert main.main(["check", str(tmp_path / "d")]) == 0
+
+
+def test_the_manuals_example_is_a_mapping():
+    manual = Path(__file__).resolve().parents[4] / "docs/how_to/ros2_bags.md"
+    (text,) = (block for block in manual.read_text().split("```") if block.startswith("yaml\nobservation:"))
+    mapping = MappingConfig.of(yaml.safe_load(text.removeprefix("yaml")), "the manual")
+    assert [topic.topic for topic in topics_of(mapping.action, mapping.types)] == [
+        "/forward_position_controller/commands"
+    ]
+    assert len(topics_of(mapping.observation, mapping.types)) == 2
+    assert mapping.images["wrist"].topic == "/wrist/image_raw/compressed"
