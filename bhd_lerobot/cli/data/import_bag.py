@@ -94,11 +94,11 @@ def add_to(commands: Commands) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     require_rosbags()
+    mapping = _mapping(options)
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    mapping = _mapping(options)
     exported = [options.robot is None and mapping is None and is_exported(bag) for bag in bags]
     if all(exported):
         episodes = exported_episodes(bags)
@@ -212,7 +212,10 @@ def _mapping(options: argparse.Namespace) -> MappingConfig | None:
     tree: dict[str, dict[str, Any]] = {}
     for name, value in read_line(options.entries).options.items():
         section, _, feature = name.removeprefix("map.").partition(".")
-        tree.setdefault(section, {})[feature] = value
+        if feature:
+            tree.setdefault(section, {})[feature] = value
+        else:
+            tree[section] = value
     if options.map is None and not tree:
         return None
     if options.map is None:
@@ -236,7 +239,12 @@ def _wanted_of_mapping(options: argparse.Namespace, mapping: MappingConfig) -> I
                 f"The mapping has no {section}. Name a field with --map.{section}.NAME='{{topic: …, type: …, "
                 "field: …}'."
             )
-    real, actions = _real(options), features_of(mapping.action)
+    if wrong := [name for name in mapping.images if not name.isidentifier()]:
+        raise ConfigError(f"The camera {wrong[0]!r} of the mapping has no valid name: letters, digits and underscores.")
+    real, observed, actions = _real(options), features_of(mapping.observation), features_of(mapping.action)
+    for names in (observed, actions):
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ConfigError(f"The mapping has the feature {twice[0]} twice; a scan's are NAME_000.pos and so on.")
     held = [name for name in actions if not name.endswith(".vel")]
     if held and not math.isinf(real["command_timeout_s"]):
         raise ConfigError(
@@ -245,7 +253,7 @@ def _wanted_of_mapping(options: argparse.Namespace, mapping: MappingConfig) -> I
         )
     return ImportOptions(
         robot_type=options.robot or Path(options.map or "robot").stem,
-        observation_names=features_of(mapping.observation),
+        observation_names=observed,
         action_names=actions,
         sources=tuple(mapped_sources(mapping, options.scan_frame, options.scan_yaw)),
         max_speed=None,

@@ -16,7 +16,7 @@ from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
 from bhd_lerobot.ros2.bag.storage.read import Messages
 from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
-from bhd_lerobot.ros2.messages.mapping import QUATERNION, SCAN, FieldConfig, MappingConfig, TopicFields, topics_of
+from bhd_lerobot.ros2.messages.mapping import QUATERNION, SCAN, MappingConfig, TopicFields, topics_of
 from bhd_lerobot.ros2.messages.parts import Part, header_stamps
 from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 
@@ -110,7 +110,8 @@ def mapped_sources(
             found.append(Source(key, topic.topic, feature, names, readers, meaning, angles=angles))
         for name, one in section.items():
             if one.beams:
-                reader = partial(_scans, lidar_of(one), scan_frame, scan_yaw)
+                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
+                reader = partial(_scans, lidar, scan_frame, scan_yaw)
                 topic_name, names = "/" + one.topic.lstrip("/"), one.names(name)
                 key, meaning = f"{feature}{topic_name}", f"{place}.{name}"
                 found.append(Source(key, topic_name, feature, names, {SCAN: reader}, meaning, is_turned=True))
@@ -133,7 +134,7 @@ def exported_sources(parts: Mapping[str, Sequence[Part]], cameras: Mapping[str, 
     found = [
         Source(
             f"{feature}{part.topic}", part.topic, feature, part.names, {part.msgtype: partial(_part, part)}, feature,
-            option="/bhd/episode", remedy=remedy,
+            "/bhd/episode", remedy,
             angles=dict.fromkeys(part.names[4:], 2 * np.pi) if isinstance(part, OdometryPart) else {},
         )
         for feature, several in parts.items()
@@ -142,7 +143,7 @@ def exported_sources(parts: Mapping[str, Sequence[Part]], cameras: Mapping[str, 
     for name, topic in cameras.items():
         feature = f"{keys.OBSERVATION_IMAGES}.{name}"
         readers: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
-        found.append(Source(f"camera/{name}", topic, feature, (), readers, feature, remedy=remedy))
+        found.append(Source(f"camera/{name}", topic, feature, (), readers, feature, "/bhd/episode", remedy))
     return found
 
 
@@ -179,11 +180,6 @@ _MEANING = {
     "imu": "the yaw rate of the gyroscope",
     "camera": "the image",
 }
-
-
-def lidar_of(config: FieldConfig) -> LidarSpec:
-    """Return the scanner that a dataset is of."""
-    return LidarSpec("", config.beams, config.range_min, config.range_max, rate_hz=5, noise_std=0.0)
 
 
 def _places(reading: Reading) -> Array:
