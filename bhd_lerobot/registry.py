@@ -33,6 +33,7 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
+from bhd_lerobot.policies.topic.brain import TopicBrain
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.names import names_of_robot
 from bhd_lerobot.tasks.free import FreeConfig
@@ -88,7 +89,7 @@ ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
 
 _CLASSES: tuple[Any, ...] = (
     *(AvoidanceBrain, _Blanked, _Dagger, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain, NoopBrain),
-    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain),
+    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain, TopicBrain),
 )
 BRAINS: Registry[Any] = Registry("brain", {brain.name: brain for brain in _CLASSES}, BrainConfig)
 """The classes of the brains, by name."""
