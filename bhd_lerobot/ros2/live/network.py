@@ -89,12 +89,12 @@ class Ros2Config(NetworkConfig):
         command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
             base, 125 Hz to an arm.
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
-        silence_s: readings that are older are a fault [s].
+        silence_s: readings that are older are a fault [s]; a TurtleBot3 sends every 0.05 s.
     """
 
     command_hz: float = 0.0
     timeout_s: float = 0.2
-    silence_s: float = 0.2
+    silence_s: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
