@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
@@ -26,7 +26,7 @@ class NetworkConfig:
 
     domain: int | None = None
     interface: str = "lo"
-    peers: tuple[str, ...] = ()
+    peers: list[str] = field(default_factory=list)
     distro: str = "jazzy"
 
     def __post_init__(self) -> None:
