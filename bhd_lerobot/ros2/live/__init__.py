@@ -1,3 +1,3 @@
 """Robots on a ROS 2 network, through Cyclone DDS, without a ROS installation."""
 
-__all__ = ["graph", "network", "node", "topic_types"]
+__all__ = ["clients", "graph", "network", "node", "topic_types"]
