@@ -60,7 +60,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
     robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))), mark_keys(config))
+    outcomes = outcomes_of(config.task.get_choice_name(type(config.task)))
+    marks = Marks(n, outcomes, mark_keys(config), hands_over=config.teleop is not None)
     pressed = EstopInputs(robots.estop, marks.on_key)
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from lerobot.robots.config import RobotConfig
@@ -11,7 +11,10 @@ from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.body import MobileBase, Rates
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
+from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
+
+_ROS2_PLANTS = {True: "bhd_lerobot.ros2.live.base_plant:BasePlant", False: "bhd_lerobot.ros2.live.arm_plant:ArmPlant"}
 
 
 @dataclass(kw_only=True)
@@ -24,8 +27,10 @@ class BhdRobotConfig(RobotConfig):
             the wall clock, in processes of its own.
         require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
         realtime: how it runs on the wall clock.
-        plant: what is driven in place of a simulated robot: a class of any package, ``"package.module:Class"``, see
-            "Write a plant for your robot"; needs `clock = "realtime"`.
+        plant: what is driven in place of a simulated robot: ``"ros2"``, a robot of this type on a ROS 2 network; or a
+            class of any package, ``"package.module:Class"``, see "Write a plant for your robot", which needs
+            `clock = "realtime"`.
+        ros2: the network of ``plant = "ros2"``.
         jerk_limits: let accelerations change gradually when setpoints are followed. Off, it moves as in version 0.1.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
@@ -37,13 +42,14 @@ class BhdRobotConfig(RobotConfig):
             them, and are continued with others. A robot type may have some.
     """
 
-    not_recorded: ClassVar[tuple[str, ...]] = ()
+    not_recorded: ClassVar[tuple[str, ...]] = ("ros2",)
 
     fps: int
     clock: str = "lockstep"
     require_realtime: bool = False
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     plant: str = ""
+    ros2: Ros2Config = field(default_factory=Ros2Config)
     jerk_limits: bool = True
     control_hz: int
     physics_hz: int
@@ -58,13 +64,19 @@ class BhdRobotConfig(RobotConfig):
         if self.seed < 0:
             raise ConfigError(f"robot.seed is {self.seed}; seeds start at 0.")
         _ = self.rates
+        if self.plant == "ros2":
+            self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
+            self.clock = "realtime"
+            # The topics of a TurtleBot3 come at 20 Hz; four of them may be lost.
+            timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silence_s)
+            self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
         if self.plant:
             self._check_plant()
 
     def _check_plant(self) -> None:
         module, sign, name = self.plant.partition(":")
         if not (sign and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
-            raise ConfigError(f"robot.plant is {self.plant!r}; name a class as package.module:Class.")
+            raise ConfigError(f"robot.plant is {self.plant!r}; name a class as package.module:Class, or ros2.")
         if self.clock != "realtime":
             raise ConfigError("robot.plant names a robot that goes on by itself: use --robot.clock=realtime with it.")
         if self.realtime.plant_process:

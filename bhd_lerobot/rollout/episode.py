@@ -120,7 +120,9 @@ class EpisodeLoop:
                 if stop():
                     return
                 finished = self._frame()
-                if self.marks.take_again() and not finished:
+                # Also a take that ended by itself before the key was seen: it was not saved yet.
+                ended = [(sim, event) for sim, event in finished if sim or event in (Event.ESTOP, Event.FAULT)]
+                if self.marks.take_again() and not ended:
                     self._take_again(waiting)
                     continue
                 for sim, event in finished:

@@ -73,10 +73,19 @@ class Marks:
         n: number of simulations.
         outcomes: those that the task can have.
         keys: the terminal's keys: `KEYS`, or `TELEOP_KEYS` while a keyboard teleoperator uses the letters.
+        hands_over: whether an intervention hands the robot over to a person: then the brain says in which frames they
+            drove, which are not those of the key where an action takes its time.
     """
 
-    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES, keys: Sequence[MarkKey] = KEYS) -> None:
-        self._n, self._valid, self._keys = n, tuple(outcomes), tuple(keys)
+    def __init__(
+        self,
+        n: int = 1,
+        outcomes: Sequence[str] = OUTCOMES,
+        keys: Sequence[MarkKey] = KEYS,
+        *,
+        hands_over: bool = False,
+    ) -> None:
+        self._n, self._valid, self._keys, self._hands_over = n, tuple(outcomes), tuple(keys), hands_over
         self._lock = threading.Lock()
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
@@ -164,7 +173,7 @@ class Marks:
         with self._lock:
             if not self._outcomes and not self._driving:
                 return event, driven
-            driven[list(self._driving)] = True
+            driven[list(self._driving)] = not self._hands_over
             marked = event.copy()
             for simulation in [sim for sim in self._outcomes if running[sim]]:
                 outcome = self._outcomes.pop(simulation)

@@ -18,6 +18,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError
 from bhd_lerobot.registry import is_ours, make_robot
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.rollout.progress import print_notes
+from bhd_lerobot.rollout.signals import stop_on_signals
 
 
 def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, console: Console) -> float:
@@ -35,7 +36,8 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
 
     Raises:
         DatasetError: the dataset's actions are not those of the robot.
-        RealtimeError: the robot was stopped.
+        ConfigError: the gate lets the robot jump to where the episode began.
+        RealtimeError: the robot was stopped, also by Ctrl-C, SIGTERM or SIGHUP.
     """
     if not is_ours(robot.type) and gate.max_change is None:
         raise ConfigError(
@@ -47,13 +49,18 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
     summary, columns = dataset_info(root), read_episode(root, episode)
     actions = np.asarray(columns[keys.ACTION], np.float64)
     recorded = np.asarray(columns[keys.OBSERVATION_STATE], np.float64)
-    robots = make_robot(robot, fps=summary.fps, gate=gate)
+    robots: Any = make_robot(robot, fps=summary.fps, gate=gate)
     names = tuple(summary.features[keys.ACTION]["names"])
     pressed = EstopInputs(robots.estop)
-    with closing(robots), pressed:
+    with stop_on_signals() as stop, closing(robots), pressed:
         if names != robots.action_names:
             own = ", ".join(robots.action_names)
             raise DatasetError(f"The actions of {root} are {', '.join(names)}; those of {robot.type} are {own}.")
+        if not is_ours(robot.type) and (free := robots.gate.free_to_jump()):
+            raise ConfigError(
+                f"gate.max_change does not limit {', '.join(free)}: there the robot would jump from where it is to "
+                "where the episode began. Set one number for all positions, or one for each."
+            )
         print_notes(robots, console)
         pressed.add_signal(estop_signal("SIGUSR1"))
         key = "space or e, or " if pressed.add_key() else ""
@@ -65,8 +72,8 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
             seen.append(robots.observe().state[0])
             report = robots.step(action[None])
             mode = Mode(int(report.mode[0]))
-            if mode in (Mode.ESTOP, Mode.FAULT):
-                why = robots.problem or ", ".join(pressed.causes) or mode.name
+            if mode in (Mode.ESTOP, Mode.FAULT) or stop:
+                why = robots.problem or ", ".join(pressed.causes) or stop.name or mode.name
                 raise RealtimeError(f"The robot was stopped after {len(seen)} of {len(actions)} frames: {why}.")
         robots.stop(only)
     return _print_differences(np.array(seen), recorded, robots.observation_names, console)

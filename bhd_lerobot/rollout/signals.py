@@ -35,8 +35,10 @@ class StopRequest:
 def stop_on_signals() -> Iterator[StopRequest]:
     """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request that the run's loop reads between two frames.
 
-    A second one acts as it would without us: the loop might hang. The former handlers come back at the end. Python
-    gives signals to its main thread only; a run in another one is not ended by them.
+    A second one acts as it would without us: the loop might hang. A second SIGHUP does nothing: when a session is
+    closed, the shell and the system both send one. A signal that is ignored, as under nohup, stays so. The former
+    handlers come back at the end. Python gives signals to its main thread only; a run in another one is not ended by
+    them.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
@@ -47,10 +49,11 @@ def stop_on_signals() -> Iterator[StopRequest]:
     def handle(number: int, frame: FrameType | None) -> None:
         request.signal = signal.Signals(number)
         for one, handler in former.items():
-            signal.signal(one, handler)
+            signal.signal(one, signal.SIG_IGN if one == number == signal.SIGHUP else handler)
 
     for one in _SIGNALS:
-        former[one] = signal.signal(one, handle)
+        if signal.getsignal(one) is not signal.SIG_IGN:  # as by nohup
+            former[one] = signal.signal(one, handle)
     try:
         yield request
     finally:

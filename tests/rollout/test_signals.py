@@ -17,6 +17,17 @@ def test_the_first_signal_is_a_request_and_the_handlers_come_back() -> None:
         assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == former
 
 
+def test_the_second_hangup_of_a_closed_session_does_not_kill() -> None:
+    with stop_on_signals() as request:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert request.name == "SIGHUP"
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        os.kill(os.getpid(), signal.SIGHUP)
+    with stop_on_signals():
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+
+
 def test_a_run_in_another_thread_changes_no_handler() -> None:
     former, seen = signal.getsignal(signal.SIGINT), []
 
@@ -28,3 +39,14 @@ def test_a_run_in_another_thread_changes_no_handler() -> None:
     thread.start()
     thread.join()
     assert seen == [(False, former)]
+
+
+def test_what_is_ignored_stays_ignored_as_under_nohup() -> None:
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as request:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not request
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, former)

@@ -2,7 +2,7 @@
 
     ROS_PYTHON build_messages.py OUT NAME=FOLDER…
 
-FOLDER/msg holds the .msg files of the package NAME. OUT belongs on PYTHONPATH afterwards, and OUT/lib on LD_LIBRARY_PATH.
+FOLDER/msg holds the .msg files of NAME. Afterwards OUT belongs on PYTHONPATH, and OUT/lib on LD_LIBRARY_PATH.
 """
 
 import json

@@ -178,9 +178,11 @@ class Peer:
 
     def __enter__(self) -> Self:
         self._errors = tempfile.TemporaryFile("w+")
+        self._logs = tempfile.TemporaryDirectory(prefix="bhd-ros-log-")
+        own = {"BHD_PARENT": str(os.getpid()), "ROS_LOG_DIR": self._logs.name}
         self.process = subprocess.Popen(
             [self.environment.python, HERE / "peers" / self.name, *self.options],
-            env=self.environment.variables(self.domain) | {"BHD_PARENT": str(os.getpid())},
+            env=self.environment.variables(self.domain) | own,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -200,6 +202,7 @@ class Peer:
         if error is not None:
             error.add_note(f"{self.name} {' '.join(self.options)} printed at last {self.lines[-3:]}, {self.errors()}")
         self._errors.close()
+        self._logs.cleanup()
 
     def errors(self) -> str:
         """Return the end of what the process wrote to its standard error."""

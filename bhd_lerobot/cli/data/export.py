@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -12,6 +11,7 @@ from bhd_lerobot.ros2.bag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.ros2.bag.exporter.export import export_bags
 from bhd_lerobot.ros2.bag.storage.write import FORMATS
 from bhd_lerobot.ros2.messages.robot_views import robot_view
+
 
 def add_to(commands: Commands) -> None:
     """Add `export`."""

@@ -67,6 +67,8 @@ class EncoderProcess:
         self._made += 1
         encoder = RemoteEncoder(self, self._made, path, size)
         self._encoders[self._made] = encoder
+        if self.problem:  # nobody would answer
+            encoder.answered("failed", None, self.problem)
         self.put(("open", self._made, str(path), fps, size, asdict(settings)))
         return encoder
 

@@ -83,6 +83,8 @@ class TeleopBrain(ConfiguredBrain):
             raise ConfigError(f"n_envs is {n}; a person drives one robot: use --n_envs=1.")
         self._answered_s = time.monotonic()
         self._is_starting = True
+        if self._calls is not None:
+            self._calls.forget()
 
     def act(self, observation: Observation) -> Command:
         """Return what the person does now; None if nothing.
@@ -117,9 +119,16 @@ class TeleopBrain(ConfiguredBrain):
             raise BrainStoppedError(f"the teleoperator {teleop_type} failed: {as_text(error)}") from error
         if action is None:
             return None
-        if missing := [name for name in self._robot.action_names if name not in action]:
-            raise BrainStoppedError(f"the processor {self.config.processor} returned no {missing[0]!r}")
-        return np.array([[action[name] for name in self._robot.action_names]], np.float64)
+        processor, values = f"the processor {self.config.processor}", []
+        for name in self._robot.action_names:
+            if name not in action:
+                raise BrainStoppedError(f"{processor} returned no {name!r}")
+            try:
+                values.append(float(action[name]))
+            except (TypeError, ValueError):
+                what = f"{processor} returned {action[name]!r} for {name!r}, which is not a number"
+                raise BrainStoppedError(what) from None
+        return np.array([values])
 
     def parameters(self) -> dict[str, Any]:
         """Return the type of the teleoperator and how its actions are used; not where it is connected."""

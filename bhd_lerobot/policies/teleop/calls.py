@@ -2,6 +2,7 @@
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,7 @@ class Calls:
     def __init__(self, name: str) -> None:
         self._wanted: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
         self._done: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
-        self._is_busy = False
+        self._is_busy = self._is_stale = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -28,17 +29,25 @@ class Calls:
         Raises:
             Exception: what the call raised.
         """
-        if not self._is_busy:
-            self._wanted.put(function)
-            self._is_busy = True
-        try:
-            result, error = self._done.get(timeout=timeout_s)
-        except queue.Empty:
-            return False, None
-        self._is_busy = False
+        end = time.monotonic() + timeout_s
+        is_newest = False
+        while not is_newest:
+            if not self._is_busy:
+                self._wanted.put(function)
+                self._is_busy = True
+            try:
+                result, error = self._done.get(timeout=max(0.0, end - time.monotonic()))
+            except queue.Empty:
+                return False, None
+            is_newest = not self._is_stale
+            self._is_busy = self._is_stale = False
         if error is not None:
             raise error
         return True, result
+
+    def forget(self) -> None:
+        """Drop what the call that is under way will return: it belongs to what is over."""
+        self._is_stale = self._is_busy
 
     def close(self) -> None:
         """End the thread, after the call that is under way."""

@@ -102,9 +102,9 @@ def _source(action: str, asked: Any, features: Sequence[str]) -> Source:
         raise ConfigError(unknown_name(f"feature of the teleoperator in map.{action}", name, features))
     numbers = []
     for key, default in (("scale", 1.0), ("offset", 0.0)):
-        value = (
-            UNITS.get(entry.get(key, default), entry.get(key, default)) if key == "scale" else entry.get(key, default)
-        )
+        value = entry.get(key, default)
+        if key == "scale" and isinstance(value, str):
+            value = UNITS.get(value, value)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             valid = f"a finite number{', ' + ' or '.join(UNITS) if key == 'scale' else ''}"
             raise ConfigError(f"map.{action}.{key} is {entry.get(key)!r}; it must be {valid}.")

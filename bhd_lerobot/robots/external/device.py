@@ -22,7 +22,8 @@ class Reading:
     Attributes:
         state: the observation's floats, shape (features,).
         images: by camera name, shape (height, width, 3).
-        state_ns: when the motors had answered, monotonic [ns].
+        state_ns: when the motors had answered, or when it was measured if the robot says so (`state_timestamp`),
+            monotonic [ns].
         image_ns: when each image was taken, or had come, monotonic [ns].
     """
 
@@ -89,22 +90,26 @@ class Device:
         got = self.robot.get_observation()
         ended = time.monotonic_ns()
         state = self._floats(got, self.observation_names, "get_observation")
-        if not np.isfinite(state).all():
-            name = self.observation_names[int(np.flatnonzero(~np.isfinite(state))[0])]
-            raise RealtimeError(f"{self.name} reads {got[name]!r} for {name!r}, which is not a finite number")
         images: dict[str, NDArray[np.uint8]] = {}
         for name, shape in self.camera_shapes.items():
-            image = np.asarray(got.get(name)) if name in got else None
+            # A copy: robots may use the array again for the next image, while this one waits for its encoder.
+            image = np.array(got[name]) if name in got else None
             if image is None or image.shape != tuple(shape) or image.dtype != np.uint8:
                 what = "no image" if image is None else f"an image of {image.dtype} {image.shape}"
                 raise RealtimeError(f"The camera {name!r} of {self.name} gave {what}; it must be uint8 {tuple(shape)}")
             images[name] = image
         asked = [stamp.asked_ns for stamp in self._stamps.values() if stamp.asked_ns >= started]
         taken = {name: stamp.taken_ns or ended for name, stamp in self._stamps.items()}
-        return Reading(state, images, min(asked, default=ended), taken)
+        measured = getattr(self.robot, "state_timestamp", None)  # as the cameras' `latest_timestamp`
+        state_ns = round(measured * 1e9) if isinstance(measured, float) else min(asked, default=ended)
+        return Reading(state, images, state_ns, taken)
 
     def send(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Send an action, shape (actions,); return what the robot says that it applied."""
+        """Send an action, shape (actions,); return what the robot says that it applied.
+
+        Raises:
+            RealtimeError: that is not finite.
+        """
         wanted = dict(zip(self.action_names, action.tolist(), strict=True))
         # A copy: robots may return, or change, the very dictionary that they are given.
         returned = self.robot.send_action(dict(wanted))
@@ -121,9 +126,15 @@ class Device:
         if missing := [name for name in names if name not in values]:
             raise RealtimeError(f"{call} of {self.name} returned no {missing[0]!r}; it must return {', '.join(names)}")
         try:
-            return np.array([float(values[name]) for name in names])
+            floats = np.array([float(values[name]) for name in names])
         except (TypeError, ValueError) as error:
             raise RealtimeError(f"{call} of {self.name} returned what is not a number: {error}") from error
+        if not np.isfinite(floats).all():
+            name = names[int(np.flatnonzero(~np.isfinite(floats))[0])]
+            raise RealtimeError(
+                f"{call} of {self.name} returned {values[name]!r} for {name!r}, which is not a finite number"
+            )
+        return floats
 
     def known_ranges(self) -> dict[str, tuple[float, float]]:
         """Return the ranges of actions that follow from the robot's motors and their calibration, by name."""

@@ -212,7 +212,7 @@ class FrameThread:
         number, due, skipped = 0, self.origin_ns, 0
         last: DeviceFrame | None = None
         self._came_ns = self.origin_ns
-        while True:
+        while not self._is_over():  # then the robot holds at once, not after another observation
             self._sleep_until(due)
             started = time.monotonic_ns()
             reading = self._called("get_observation", self._device.observe)
@@ -223,7 +223,7 @@ class FrameThread:
             mode = Mode.HOLD if last.mode == Mode.ESTOP else last.mode
             frame = DeviceFrame(number, due, started, reading, last.requested, last.applied, mode=mode, skipped=skipped)
             with self._changed:
-                if not self._active:
+                if self._is_over():
                     return
                 self._frames.append(frame)
                 self._takes = True
@@ -238,6 +238,9 @@ class FrameThread:
             skipped = max(0, (now - due) // self.period_ns - 1)
             number, due, last = number + 1 + skipped, due + (1 + skipped) * self.period_ns, frame
 
+    def _is_over(self) -> bool:
+        return not self._active
+
     def _next(self, frame: DeviceFrame, end_ns: int) -> Vector | None:
         """Wait for what is to be sent next in a frame, shape (actions,); None when the frame is over."""
         config = self._config
@@ -250,7 +253,7 @@ class FrameThread:
                     if frame.mode != Mode.ESTOP:
                         frame.mode = Mode.ESTOP
                         return self._where_it_is(frame)
-                elif self._command is not None:
+                elif self._command is not None and self._active:  # after a fault nothing more is sent
                     (requested, self._came_ns), self._command = self._command, None
                     frame.mode = Mode.TRACKING
                     passed = self._gate.passed(requested)
@@ -263,7 +266,7 @@ class FrameThread:
                 elif silent > config.brain_timeout_s and not frame.watchdog & Watchdog.COMMAND_AGE:
                     frame.mode = Mode.HOLD
                     frame.watchdog |= Watchdog.COMMAND_AGE
-                    return self._gate.holding()
+                    return self._gate.hold()
                 if now >= end_ns or not self._active:
                     self._takes = False
                     return None

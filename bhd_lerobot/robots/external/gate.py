@@ -1,5 +1,6 @@
 """The last check of actions before another package's robot: what an interface of positions and speeds allows."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,9 @@ from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.robots.external.config import GateConfig
 
 Vector = NDArray[np.float64]
+
+# Speeds as LeRobot's robots and plug-ins name them: x.vel, linear_velocity, mobile_base.vx, mobile_base.vtheta.
+_SPEED = re.compile(r"(^|[._])(vel|velocity|speed|v[xyz]|vtheta|[xyz]_?vel)$")
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,8 @@ class Gate:
     """Makes actions finite, keeps them in range, and bounds their change from one frame to the next.
 
     Args:
-        names: the action's names, in order; those that end in `.vel` are speeds, all others positions.
+        names: the action's names, in order; those of speeds end in `vel`, `velocity`, `speed`, `vx` or the like; all
+            others are positions.
         config: the options.
         known: ranges that the robot's calibration or features say, by name.
 
@@ -47,14 +52,15 @@ class Gate:
     def __init__(self, names: Sequence[str], config: GateConfig, known: Mapping[str, tuple[float, float]]) -> None:
         self.names = tuple(names)
         given = flattened(config.range)
-        by_name = flattened(config.max_change) if isinstance(config.max_change, dict) else {}
+        is_by_name = isinstance(config.max_change, dict)
+        by_name = flattened(config.max_change) if is_by_name else {}
         for option, chosen in (("gate.range", given), ("gate.max_change", by_name)):
             if wrong := [name for name in chosen if name not in self.names]:
                 raise ConfigError(unknown_name(f"action of {option}", wrong[0], self.names))
         ranges = [given.get(name) or known.get(name) or (-np.inf, np.inf) for name in self.names]
         self.lower, self.upper = np.array(ranges, np.float64).reshape(-1, 2).T
-        self._is_speed = np.array([name.endswith(".vel") for name in self.names], np.bool_)
-        every = np.inf if by_name or config.max_change is None else float(config.max_change)
+        self._is_speed = np.array([bool(_SPEED.search(name)) for name in self.names], np.bool_)
+        every = np.inf if is_by_name or config.max_change is None else float(config.max_change)
         change = np.where(self._is_speed, np.inf, every)
         for name, value in by_name.items():
             change[self.names.index(name)] = value
@@ -75,6 +81,11 @@ class Gate:
         last = np.full(len(self.names), np.nan) if self._last is None else self._last
         return np.where(self._is_speed, 0.0, last)
 
+    def hold(self) -> Vector:
+        """Return the action that holds the robot, as `holding`, and remember it as the last one."""
+        self._last = self.holding()
+        return self._last
+
     def passed(self, action: Vector) -> Passed:
         """Return what may be sent of an action, shape (actions,), and remember it as the last one."""
         last = np.full(len(self.names), np.nan) if self._last is None else self._last
@@ -94,6 +105,11 @@ class Gate:
             limits |= Limit.VELOCITY
         self._last = np.where(np.isfinite(near), near, last)
         return Passed(near, int(limits))
+
+    def free_to_jump(self) -> list[str]:
+        """Return the names of positions whose change from one frame to the next is not limited."""
+        is_free = ~(self._is_speed | np.isfinite(self.max_change))
+        return [name for name, free in zip(self.names, is_free, strict=True) if free]
 
     def unlimited(self) -> list[str]:
         """Return the names of actions whose range is not known."""

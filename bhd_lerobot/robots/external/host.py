@@ -178,7 +178,10 @@ class LeRobotHost:
             return None
         first, rows = self._chunk
         # The actions of frames that went by are left out: a brain that took its time does not make the robot hurry.
-        action: NDArray[np.float64] = rows[min(self._frames.newest().number - first, len(rows) - 1)]
+        row = min(self._frames.newest().number - first, len(rows) - 1)
+        if row == len(rows) - 1:
+            self._chunk = None  # it is over: from now on the robot waits for the brain
+        action: NDArray[np.float64] = rows[row]
         return action
 
     def _report(self, frame: DeviceFrame, after: DeviceFrame) -> FrameReport:
@@ -232,11 +235,11 @@ class LeRobotHost:
 
     def close(self) -> None:
         """Disconnect the robot. May be called twice; a call that does not return is not waited for."""
-        if self._frames.close() and self.robot.is_connected:
-            try:
+        try:
+            if self._frames.close() and self.robot.is_connected:
                 self.robot.disconnect()
-            except Exception as error:  # of another package's code: what was recorded is reported all the same
-                words = as_text(error)
-                print(f"warning: {self.device.name} could not be disconnected: {words}", file=sys.stderr)
+        except Exception as error:  # of another package's code: what was recorded is reported all the same
+            words = as_text(error)
+            print(f"warning: {self.device.name} could not be disconnected: {words}", file=sys.stderr)
         if self._lock is not None:
             self._lock.close()

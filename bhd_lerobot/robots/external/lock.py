@@ -4,6 +4,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import Any, Self
@@ -11,6 +12,9 @@ from typing import Any, Self
 import draccus
 
 from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.options.dotted import flattened
+
+_PLACE = re.compile(r"(^|_)(port|ip|host|address|url)(_|$)")  # options that say where a robot is connected
 
 
 class RobotLock:
@@ -19,7 +23,8 @@ class RobotLock:
     A robot of which nothing says where it is is not locked.
 
     Args:
-        config: the robot's configuration: type, id and where it is connected say which robot it is.
+        config: the robot's configuration: where it is connected says which robot it is, whatever it is called; where
+            only a number says that, or nothing, type and id do, too.
 
     Raises:
         RealtimeError: another program uses it.
@@ -27,11 +32,16 @@ class RobotLock:
 
     def __init__(self, config: Any) -> None:
         self._file = -1
-        where = ("id", "ip", "host", "address")
-        places = {key: value for key, value in draccus.encode(config).items() if "port" in key or key in where}
-        if not any(places.values()):
-            return  # nothing says which robot it is
-        name = hashlib.sha256(json.dumps([config.type, places], sort_keys=True, default=str).encode()).hexdigest()[:16]
+        places = {
+            key: os.path.realpath(value) if str(value).startswith("/") else value
+            for key, value in flattened(draccus.encode(config)).items()
+            if value and _PLACE.search(key.rpartition(".")[2]) and not key.startswith("cameras.")
+        }
+        if not any(isinstance(value, str) for value in places.values()):
+            if not (places or config.id):
+                return  # nothing says which robot it is
+            places |= {"type": config.type, "id": config.id}
+        name = hashlib.sha256(json.dumps(places, sort_keys=True, default=str).encode()).hexdigest()[:16]
         self._path = Path(tempfile.gettempdir()) / f"bhd-robot-{os.getuid()}-{name}.lock"
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -40,9 +50,9 @@ class RobotLock:
             owner = os.read(self._file, 32).decode() or "unknown"
             os.close(self._file)
             shown = ", ".join(f"{key} {value}" for key, value in places.items() if value)
+            other = ", or say which robot this is with --robot.id" if "id" in places else ""
             raise RealtimeError(
-                f"The robot {config.type} ({shown or 'no id'}) is used by process {owner}. End that one first, or say "
-                "which robot this is with --robot.id."
+                f"The robot {config.type} ({shown}) is used by process {owner}. End that one first{other}."
             ) from error
         os.truncate(self._file, 0)
         os.pwrite(self._file, str(os.getpid()).encode(), 0)

@@ -1,5 +1,6 @@
 """Makes and connects a robot that is not ours."""
 
+import contextlib
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
@@ -31,6 +32,8 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         lock.close()
         raise
     except Exception as error:  # of another package's code
+        with contextlib.suppress(Exception):  # what it has connected before it failed
+            robot.disconnect()
         lock.close()
         raise RealtimeError(
             f"The robot {config.type!r} cannot be connected: {as_text(error)}. Check its power, its cable and "

@@ -27,6 +27,7 @@ from bhd_lerobot.robots.host.process import LiveSpec
 from bhd_lerobot.robots.host.remote_plant import plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import state_dtype
+from bhd_lerobot.ros2.live.network import NetworkConfig
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
@@ -286,6 +287,6 @@ class LiveLink:
 
 
 def _plain(config: Any) -> dict[str, Any]:
-    """Return the values of a configuration that a simulation reads: those that need no class of LeRobot or ours."""
-    kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating)
+    """Return the values of a configuration that a simulation or a plant reads: those that need no class of LeRobot."""
+    kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating, NetworkConfig)
     return {key: value for key, value in vars(config).items() if isinstance(value, kinds)}

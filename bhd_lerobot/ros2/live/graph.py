@@ -50,6 +50,7 @@ class Graph:
     def __init__(self, participant: Any, name: str, namespace: str, distro: str) -> None:
         from cyclonedds.builtin import (
             BuiltinDataReader,
+            BuiltinTopicDcpsParticipant,
             BuiltinTopicDcpsPublication,
             BuiltinTopicDcpsSubscription,
         )
@@ -71,6 +72,7 @@ class Graph:
                 (False, BuiltinTopicDcpsSubscription),
             )
         }
+        self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
         self._own: dict[bool, list[UUID]] = {True: [], False: []}
         self._owners: dict[bytes, dict[bytes, str]] = {}  # participant -> endpoint -> node
         self._nodes: dict[bytes, list[str]] = {}
@@ -138,7 +140,7 @@ class Graph:
                 for name, node in named.items()
                 for gid in (*node.reader_gid_seq, *node.writer_gid_seq)
             }
-        alive = {one.participant_key.bytes for reader in self._endpoints.values() for one in reader.read(_MOST)}
+        alive = {one.key.bytes for one in self._participants.read(_MOST) if one.sample_info.valid_data}
         for key in [key for key in self._nodes if key not in alive]:
             del self._nodes[key], self._owners[key]
 

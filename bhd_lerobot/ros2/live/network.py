@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
@@ -10,13 +10,6 @@ from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
 _DOMAINS = 233  # the ports of further ones lie beyond 65535
 _ADDRESS = re.compile(r"[\w.:%-]+")
 DISTROS = ("humble", "jazzy")
-
-
-def _domain() -> int:
-    text = os.environ.get("ROS_DOMAIN_ID") or "0"
-    if not text.isdecimal():
-        raise ConfigError(f"The environment variable ROS_DOMAIN_ID is {text!r}; it is a number from 0 to {_DOMAINS - 1}.")
-    return int(text)
 
 
 @dataclass(frozen=True)
@@ -31,19 +24,35 @@ class NetworkConfig:
         distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
     """
 
-    domain: int = field(default_factory=_domain)
+    domain: int | None = None
     interface: str = "lo"
     peers: tuple[str, ...] = ()
     distro: str = "jazzy"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.domain < _DOMAINS:
+        if self.domain is not None and not 0 <= self.domain < _DOMAINS:
             raise ConfigError(f"The ROS domain is {self.domain}; domains are numbered from 0 to {_DOMAINS - 1}.")
         for name in (self.interface, *self.peers):
             if not _ADDRESS.fullmatch(name):
                 raise ConfigError(f"{name!r} is neither a network interface nor an address.")
         if self.distro not in DISTROS:
             raise ConfigError(unknown_name("distro", self.distro, DISTROS))
+
+    @property
+    def domain_number(self) -> int:
+        """The domain's number.
+
+        Raises:
+            ConfigError: ROS_DOMAIN_ID is none.
+        """
+        if self.domain is not None:
+            return self.domain
+        text = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not text.isdecimal() or int(text) >= _DOMAINS:
+            raise ConfigError(
+                f"The environment variable ROS_DOMAIN_ID is {text!r}; it is a number from 0 to {_DOMAINS - 1}."
+            )
+        return int(text)
 
     @property
     def is_local(self) -> bool:
@@ -70,6 +79,30 @@ class NetworkConfig:
             "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
             "</Domain></CycloneDDS>"
         )
+
+
+@dataclass(frozen=True)
+class Ros2Config(NetworkConfig):
+    """A robot on the network.
+
+    Attributes:
+        command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
+            base, 125 Hz to an arm.
+        timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
+        silence_s: readings that are older are a fault [s].
+    """
+
+    command_hz: float = 0.0
+    timeout_s: float = 0.2
+    silence_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.command_hz < float("inf"):
+            raise ConfigError(f"robot.ros2.command_hz is {self.command_hz}; it is finite and not negative.")
+        for name in ("timeout_s", "silence_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"robot.ros2.{name} is {getattr(self, name)}; it is positive and finite.")
 
 
 @dataclass(frozen=True)

@@ -119,11 +119,11 @@ class Node:
 
         self.name, self.namespace, self.network = name, "/" + namespace.strip("/"), network
         try:
-            self._domain = Domain(network.domain, network.cyclonedds_xml())
-            self._participant = DomainParticipant(network.domain, DdsQos(Policy.Userdata(b"enclave=/;")))
+            self._domain = Domain(network.domain_number, network.cyclonedds_xml())
+            self._participant = DomainParticipant(network.domain_number, DdsQos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise RealtimeError(
-                f"The network interface {network.interface!r} cannot be used for ROS domain {network.domain}: "
+                f"The network interface {network.interface!r} cannot be used for ROS domain {network.domain_number}: "
                 f"{as_text(error)}. `ip address` lists the interfaces."
             ) from error
         self._waiting = WaitSet(self._participant)

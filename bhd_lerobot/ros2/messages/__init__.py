@@ -8,10 +8,12 @@ __all__ = [
     "images",
     "mapping",
     "parts",
+    "presets",
     "robot_views",
     "scan",
     "serialize",
     "split",
     "types",
+    "ur",
     "views",
 ]

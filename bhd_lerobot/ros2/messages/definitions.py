@@ -156,19 +156,15 @@ _NO_FIELDS = "uint8 structure_needs_at_least_one_member"  # which ROS sends for 
 def register_types(types: Mapping[str, str]) -> None:
     """Make further types known: messages, services and actions.
 
-    What is known already remains as it is.
-
     Args:
         types: definitions in ROS's own language, those of `.msg`, `.srv` and `.action` files, by name, such as
             ``std_srvs/srv/SetBool``.
 
     Raises:
-        ConfigError: a definition cannot be read.
+        ConfigError: a definition cannot be read, or is another one than that known already.
     """
     store = type_store()
     for name, text in types.items():
-        if _is_known(name):
-            continue
         try:
             store.register(_parsed(name, text))
         except Exception as error:  # whatever rosbags' parser raises
@@ -187,7 +183,8 @@ def find_type(name: str, distro: str = "jazzy") -> None:
     """
     if _is_known(name):
         return
-    register_types({**DEFINITIONS, **(HUMBLE if distro == "humble" else {})})
+    definitions = {**DEFINITIONS, **(HUMBLE if distro == "humble" else {})}
+    register_types({one: text for one, text in definitions.items() if not _is_known(one)})
     if not _is_known(name):
         kind = name.split("/")[1] if name.count("/") == 2 else ""
         known = DEFINITIONS if kind in _PARTS else type_store().fielddefs

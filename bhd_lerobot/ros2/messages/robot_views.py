@@ -28,7 +28,6 @@ _ORIGIN, _HALF_TURN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 _WRISTS = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
 
 
-
 def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
     """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing."""
     if robot_type == "turtlebot3":

@@ -4,12 +4,16 @@ Bags embed the definitions, so that a reader without this package decodes our me
 """
 
 from functools import cache
+from importlib import resources
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, install_extra
 
 FORMAT = 2
 """Version of the messages below; an `Episode` of another one is refused."""
+
+INTERFACES = "bhd_interfaces"
+"""Package of the messages in the folder `msg`: what a brain, a cerebellum and a person send one another."""
 
 EPISODE = "bhd_msgs/msg/Episode"
 STATE = "bhd_msgs/msg/CerebellumState"
@@ -153,6 +157,10 @@ def type_store() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in DEFINITIONS.items():
+    interfaces = resources.files(__package__).joinpath("msg")
+    shipped = {
+        f"{INTERFACES}/msg/{file.name.removesuffix('.msg')}": file.read_text("utf-8") for file in interfaces.iterdir()
+    }
+    for name, text in {**DEFINITIONS, **shipped}.items():
         store.register(get_types_from_msg(text, name))
     return store

@@ -17,7 +17,7 @@ from bhd_lerobot.errors import ActionError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages import views
+from bhd_lerobot.ros2.messages import ur, views
 from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State
@@ -26,12 +26,6 @@ from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 JOINT_STATES_HZ = 125  # of a UR5 (CB3); a UR5e has 500
 _TRANSFORMS_HZ = 50
 _SPEED_SCALING_HZ = 100
-_FLOAT, _FLOATS = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
-_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-TRAJECTORY_TOPIC = "/scaled_joint_trajectory_controller/joint_trajectory"
-POSITION_TOPIC = "/forward_position_controller/commands"
-GRIPPER_TOPIC = "/gripper_position_controller/commands"
-SCALING_TOPIC = "/speed_scaling_state_broadcaster/speed_scaling"
 
 
 class ArmTopics:
@@ -59,15 +53,15 @@ class ArmTopics:
         self._period_ns = NANOSECONDS // host.rates.fps
         self._sent_ns = 0
         self._joint_states = node.publisher("/joint_states", views.JOINT_STATE)
-        self._scaling = node.publisher(SCALING_TOPIC, _FLOAT)
+        self._scaling = node.publisher(ur.SCALING_TOPIC, ur.FLOAT)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
         self._inputs = [
-            Input(node.subscription(TRAJECTORY_TOPIC, _TRAJECTORY), self._follow),
-            Input(node.subscription(POSITION_TOPIC, _FLOATS), self._move),
-            Input(node.subscription(GRIPPER_TOPIC, _FLOATS), self._grip),
+            Input(node.subscription(ur.TRAJECTORY_TOPIC, ur.TRAJECTORY), self._follow),
+            Input(node.subscription(ur.POSITION_TOPIC, ur.FLOATS), self._move),
+            Input(node.subscription(ur.GRIPPER_TOPIC, ur.FLOATS), self._grip),
         ]
-        [self._full_speed] = encode(_FLOAT, {"data": 100.0}, 1)
+        [self._full_speed] = encode(ur.FLOAT, {"data": 100.0}, 1)
         for message in views.static_transforms(view.frames, State.of(host).stamp_ns):
             self._static.send(message)
 
@@ -108,22 +102,22 @@ class ArmTopics:
         try:
             self._trajectory = JointTrajectory(message, self._names, start), time.monotonic_ns()
         except ActionError as error:
-            self._counts.add(f"{TRAJECTORY_TOPIC}: {error}")
+            self._counts.add(f"{ur.TRAJECTORY_TOPIC}: {error}")
 
     def _move(self, message: Any) -> None:
         if len(message.data) != self._count:
-            self._counts.add(f"{POSITION_TOPIC}: {len(message.data)} positions; there are {self._count} joints")
+            self._counts.add(f"{ur.POSITION_TOPIC}: {len(message.data)} positions; there are {self._count} joints")
             return
         self._trajectory = None
-        self._send(POSITION_TOPIC, np.asarray(message.data, np.float64))
+        self._send(ur.POSITION_TOPIC, np.asarray(message.data, np.float64))
 
     def _grip(self, message: Any) -> None:
         if len(message.data) != 1:
-            self._counts.add(f"{GRIPPER_TOPIC}: {len(message.data)} values; it takes the opening [m] alone")
+            self._counts.add(f"{ur.GRIPPER_TOPIC}: {len(message.data)} values; it takes the opening [m] alone")
             return
         before = self._command[0, self._count]
         self._command[0, self._count] = message.data[0]
-        if not self._send(GRIPPER_TOPIC, self._host.bridge.latest["command"][0, : self._count]):
+        if not self._send(ur.GRIPPER_TOPIC, self._host.bridge.latest["command"][0, : self._count]):
             self._command[0, self._count] = before
 
     def _send(self, topic: str, joints: NDArray[np.float64]) -> bool:
@@ -141,7 +135,7 @@ class ArmTopics:
         trajectory, start_ns = self._trajectory
         time_s = (now_ns - start_ns) / NANOSECONDS
         self._sent_ns = now_ns
-        if not self._send(TRAJECTORY_TOPIC, trajectory.at(time_s)) or time_s >= trajectory.duration_s:
+        if not self._send(ur.TRAJECTORY_TOPIC, trajectory.at(time_s)) or time_s >= trajectory.duration_s:
             self._trajectory = None
             return NEVER_NS
         return now_ns + self._period_ns

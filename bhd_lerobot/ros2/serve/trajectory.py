@@ -29,7 +29,9 @@ class JointTrajectory:
     def __init__(self, message: Any, joints: Sequence[str], start: NDArray[np.float64]) -> None:
         names = list(message.joint_names)
         if sorted(names) != sorted(joints):
-            raise ActionError(f"the trajectory has the joints {', '.join(names) or 'none'}; needed: {', '.join(joints)}")
+            raise ActionError(
+                f"the trajectory has the joints {', '.join(names) or 'none'}; needed: {', '.join(joints)}"
+            )
         points = list(message.points)
         if not points:
             raise ActionError("the trajectory has no point")
@@ -51,8 +53,8 @@ class JointTrajectory:
         self._last = positions[-1]
         self._curve: Any = None
         if len(times) > 1:
-            linear = speeds is None
-            self._curve = make_interp_spline(times, positions, 1) if linear else CubicHermiteSpline(times, positions, speeds)
+            curve: Any = make_interp_spline(times, positions, 1)
+            self._curve = curve if speeds is None else CubicHermiteSpline(times, np.asarray(positions), speeds)
 
     def at(self, time_s: float) -> NDArray[np.float64]:
         """Return the positions at a time since its start [rad], shape (joints,)."""

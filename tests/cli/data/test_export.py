@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.features import dataset_features
@@ -28,6 +27,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.ros2.bag.storage import write
 from bhd_lerobot.ros2.messages import types
+from bhd_lerobot.ros2.messages.robot_views import robot_view
 from tests.datasets import support
 from tests.recording.support import run_record
 
@@ -135,6 +135,20 @@ def test_a_recording_comes_back_and_is_valid(request, tmp_path, robot, layout):
     assert (bags / "metadata.yaml").exists() == bool(layout)
     back(bags, tmp_path / "back")
     same_drive(root, tmp_path / "back")
+    assert main.main(["check", str(tmp_path / "back")]) == 0
+
+
+def test_an_arm_comes_back_by_its_preset(ur5, tmp_path):
+    """Without what the bag says of itself: by topics, types and fields."""
+    arguments = ["--map=ur5", "--task=Reach.", "--min_episode_s=0", f"--fps={dataset_info(ur5).fps}"]
+    info = back(export(ur5, tmp_path / "bags", "--format=sqlite3"), tmp_path / "back", *arguments)
+    assert (info.robot_type, info.tasks) == ("ur5", ("Reach.",))
+    for one, other in zip(dataset_info(ur5).episodes, info.episodes, strict=True):
+        assert one.frames == other.frames
+        ours, theirs = read_episode(ur5, one.index), read_episode(tmp_path / "back", one.index)
+        for key in ("observation.state", "action"):
+            assert info.features[key]["names"] == dataset_info(ur5).features[key]["names"]
+            np.testing.assert_allclose(ours[key], theirs[key], atol=1e-6, err_msg=key)
     assert main.main(["check", str(tmp_path / "back")]) == 0
 
 

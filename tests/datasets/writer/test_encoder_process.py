@@ -98,6 +98,18 @@ def test_a_process_that_dies_is_noticed_and_nothing_waits_for_it(tmp_path: Path)
             encoder.finish()
 
 
+def test_an_episode_after_the_process_died_waits_for_nothing(tmp_path: Path) -> None:
+    with closing(EncoderProcess()) as process:
+        os.kill(process.pid, signal.SIGKILL)
+        until(lambda: process.problem)
+        encoder = process.encoder(tmp_path / "a.mp4", 10, SIZE, SETTINGS)
+        with pytest.raises(OSError, match="has ended"):
+            encoder.add(images(1)[0])
+        with pytest.raises(OSError, match="has ended"):
+            encoder.finish()
+        encoder.cancel()
+
+
 def test_it_ends_with_the_process_that_started_it() -> None:
     before = threading.active_count()
     process = EncoderProcess()

@@ -54,6 +54,7 @@ def test_equal_names_are_no_proof_across_projects_and_enough_within_one() -> Non
         ({"x.vel": {"from": "linear_velocity", "factor": 2}}, "factor.*scale"),
         ({"x.vel": {"from": "linear_velocity", "scale": "deg"}}, "map.x.vel.scale is 'deg'.*deg_to_rad"),
         ({"x.vel": {"from": "linear_velocity", "scale": math.inf}}, "map.x.vel.scale"),
+        ({"x.vel": {"from": "linear_velocity", "scale": [1]}}, r"map.x.vel.scale is \[1\]"),
         ({"x.vel": 3}, "map.x.vel is 3"),
         ({}, "It is not known where .*'x.vel'.*linear_velocity"),
     ],

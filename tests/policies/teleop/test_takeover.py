@@ -1,15 +1,28 @@
 """A brain from which a person takes over, and to which they give back."""
 
+import time
 from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
+from bhd_lerobot.registry import make_task
+from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.external.host import LeRobotHost
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.types import EpisodeSpec
+from bhd_lerobot.tasks.free import FreeConfig
+from bhd_lerobot.tasks.task import Event
+from tests.robots.external.mock_devices.devices import JOINTS, MockArm, MockArmConfig
 
 SEEN = Observation(("a.pos",), np.zeros((1, 1)))
 
@@ -68,3 +81,55 @@ def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afres
 def test_nobody_takes_over_from_goals() -> None:
     with pytest.raises(ConfigError, match="gives goals"):
         TakeoverBrain(ReachBrain(ReachBrainConfig()), Counting("teleop", 0.0), lambda: False)  # type: ignore[arg-type]
+
+
+class Driver(Counting):
+    """Takes its time for an action."""
+
+    def act(self, observation: Observation) -> Any:
+        super().act(observation)
+        time.sleep(0.07 if self.name == "policy" else 0.0)
+        if self.name == "policy" and self._count == 3:
+            self.marks.intervention(True)  # a person presses the key while the policy is computing
+        return np.full((1, len(JOINTS)), self._value)
+
+
+class Late(Counting):
+    """Is still computing when the episode's time is up."""
+
+    def act(self, observation: Observation) -> Any:
+        super().act(observation)
+        if self.resets == 1 and self._count == 3:
+            self.marks.again()
+            time.sleep(0.4)
+        return np.ones((1, len(JOINTS)))
+
+
+def test_a_take_that_ends_before_its_discard_is_seen_is_discarded(tmp_path: Path) -> None:
+    brain = Late("policy", 1.0)
+    robot = MockArm(MockArmConfig(id="arm", calibration_dir=tmp_path))
+    robot.connect()
+    with closing(LeRobotHost(robot, 50, GateConfig())) as host:
+        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.3), 1, 50, None), brain)  # type: ignore[arg-type]
+        brain.marks = loop.marks
+        episodes = list(loop.run([EpisodeSpec(0, 0)]))
+    assert len(episodes) == 1
+    assert brain.resets == 2
+
+
+def test_frames_are_flagged_from_the_first_action_of_the_person_on(tmp_path: Path) -> None:
+    marks, brain, person = Marks(hands_over=True), Driver("policy", 1.0), Driver("teleop", 2.0)
+    brain.marks = marks
+    both: Any = TakeoverBrain(brain, person, marks.is_driving)  # type: ignore[arg-type]
+    robot = MockArm(MockArmConfig(id="arm", calibration_dir=tmp_path))
+    robot.connect()
+    with closing(LeRobotHost(robot, 50, GateConfig())) as host:
+        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.6), 1, 50, None), both)
+        loop.marks = marks
+        (episode,) = loop.run([EpisodeSpec(0, 0)])
+    by_person = episode.columns[keys.ACTION][:, 0] == 2.0
+    assert by_person.any()
+    flagged = episode.columns[keys.EVENT][:-1] == Event.INTERVENTION
+    assert flagged.tolist() == by_person[:-1].tolist()
+    (span,) = episode.interventions or []
+    assert span.first == np.flatnonzero(by_person)[0]

@@ -81,3 +81,25 @@ def test_ranges_come_from_the_options_before_the_calibration() -> None:
 def test_wrong_options_are_named(options: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Gate(NAMES, GateConfig(**options), {})
+
+
+@pytest.mark.parametrize("name", ["x.vel", "linear_velocity", "mobile_base.vx", "mobile_base.vtheta", "wheel_speed"])
+def test_a_speed_holds_at_zero_however_its_robot_names_it(name: str) -> None:
+    gate = Gate((name, "level.pos"), GateConfig(), {})
+    gate.begin(np.array([0.4, 2.0]))
+    gate.passed(np.array([0.5, 3.0]))
+    assert gate.has_speeds
+    assert gate.holding().tolist() == [0.0, 3.0]
+
+
+def test_after_a_hold_a_speed_rises_from_zero() -> None:
+    gate = Gate(NAMES, GateConfig(max_change={"x.vel": 0.1}), {})
+    gate.begin(np.array([0.0, 0.0]))
+    for speed in (0.1, 0.2, 0.3):
+        assert gate.passed(np.array([0.0, speed])).action[1] == pytest.approx(speed)
+    assert gate.hold()[1] == 0.0
+    assert gate.passed(np.array([0.0, 0.3])).action[1] == pytest.approx(0.1)
+
+
+def test_no_change_by_name_is_no_limit() -> None:
+    assert np.isinf(Gate(NAMES, GateConfig(max_change={}), {}).max_change).all()

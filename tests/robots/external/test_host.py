@@ -161,7 +161,7 @@ def test_the_emergency_stop_holds_where_the_robot_is_and_latches(tmp_path: Path)
 
 FAULTS = {
     "disconnect": "get_observation raised ConnectionError: the bus does not answer",
-    "nan": "mock_arm reads nan for 'elbow.pos', which is not a finite number",
+    "nan": "get_observation of mock_arm returned nan for 'elbow.pos', which is not a finite number",
     "missing key": "get_observation of mock_arm returned no 'elbow.pos'",
     "image size": "The camera 'front' of mock_arm gave an image of uint8 .* must be uint8",
     "block": "get_observation of mock_arm has not returned for",
@@ -272,10 +272,12 @@ class MockBase(MockArm):
         return dict(action)
 
 
-def base(tmp_path: Path, **options: Any) -> tuple[LeRobotHost, MockBase]:
+def base(
+    tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, **options: Any
+) -> tuple[LeRobotHost, MockBase]:
     robot = MockBase(MockArmConfig(id="base", calibration_dir=tmp_path, **options))
     robot.rows, robot.at = [], 0.0
-    host = LeRobotHost(robot, FPS, GateConfig())
+    host = LeRobotHost(robot, fps, gate or GateConfig())
     robot.connect()
     return host, robot
 
@@ -331,3 +333,116 @@ def test_a_robot_that_cannot_be_disconnected_is_reported_and_hides_nothing(
     monkeypatch.setattr(MockArm, "disconnect", fail)
     make(tmp_path).close()
     assert "mock_arm could not be disconnected: ConnectionError: the bus does not answer" in capsys.readouterr().err
+
+
+def test_an_action_that_waits_behind_a_blocked_call_is_not_sent_after_the_fault(tmp_path: Path) -> None:
+    gate = GateConfig(brain_timeout_s=0.05, call_timeout_s=0.2)
+    with closing(make(tmp_path, gate, fps=4, fault="send blocks", fault_at=2)) as host:
+        start(host)
+        host.observe()
+        host.step(action(1.0))
+        time.sleep(0.1)  # the hold of the late brain blocks for 2 s
+        host.observe()
+        report = host.step(action(50.0))
+        host.stop(ONLY)
+        assert report.mode[0] == Mode.FAULT
+        time.sleep(2.2)
+    assert {row[0] for row in sent(tmp_path)} == {1.0}
+
+
+def test_after_a_hold_a_base_speeds_up_from_rest(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, GateConfig(max_change={"x.vel": 0.1}, brain_timeout_s=0.06))
+    with closing(host):
+        start(host)
+        for _ in range(5):
+            host.observe()
+            host.step(np.array([[0.5, 0.0]]))
+        time.sleep(0.2)
+        host.observe()
+        host.step(np.array([[0.5, 0.0]]))
+        host.stop(ONLY)
+    speeds = [row[0] for row in robot.rows]
+    held = speeds.index(0.0)
+    assert speeds[held - 1] == pytest.approx(0.5)
+    assert next(speed for speed in speeds[held:] if speed) == pytest.approx(0.1)
+
+
+def test_after_the_last_action_of_a_chunk_the_brain_may_fall_silent_no_longer(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, GateConfig(brain_timeout_s=0.06, end_timeout_s=0.4))
+    with closing(host):
+        start(host)
+        host.observe()
+        host.step(Chunk(np.full((3, 1, 2), 0.2)))
+        modes = []
+        for _ in range(2 * FPS):
+            host.observe()
+            modes.append(host.step(None).mode[0])
+            if modes[-1] == Mode.FAULT:
+                break
+    assert Mode.HOLD in modes
+    assert modes[-1] == Mode.FAULT
+    assert robot.rows[-1][0] == 0.0
+
+
+def test_an_applied_action_that_is_not_finite_is_a_fault(tmp_path: Path) -> None:
+    class Broken(MockArm):
+        def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+            return {**super().send_action(action), "elbow.pos": math.nan}
+
+    robot = Broken(MockArmConfig(id="broken", calibration_dir=tmp_path))
+    robot.connect()
+    with closing(LeRobotHost(robot, FPS, GateConfig())) as host:
+        start(host)
+        host.observe()
+        report = host.step(action(1.0))
+        assert report.mode[0] == Mode.FAULT
+        assert np.isfinite(report.applied).all()
+        assert "send_action of mock_arm returned nan for 'elbow.pos'" in host.problem
+
+
+def test_a_robot_may_use_the_array_of_an_image_again(tmp_path: Path) -> None:
+    class Reusing(MockArm):
+        image = np.zeros((48, 64, 3), np.uint8)
+
+        def get_observation(self) -> dict[str, Any]:
+            seen = super().get_observation()
+            self.image[:] = self.observed
+            return {**seen, "front": self.image}
+
+    robot = Reusing(MockArmConfig(id="reusing", calibration_dir=tmp_path, cameras={"front": MockCameraConfig()}))
+    robot.connect()
+    shown: list[int] = []
+    with closing(LeRobotHost(robot, FPS, GateConfig())) as host:
+        start(host)
+        host.observe()
+        time.sleep(4.5 / FPS)
+        report = host.step(action(1.0))
+        for one in report.missed:
+            one.truth()
+            host.render_later(0, "front", lambda image: shown.append(int(image[0, 0, 0])))
+    assert len(shown) >= 3
+    assert shown == sorted(set(shown))
+
+
+def test_a_robot_that_cannot_say_whether_it_is_connected_is_let_go_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(self: MockArm) -> bool:
+        raise ConnectionError("the bus does not answer")
+
+    host = make(tmp_path)
+    monkeypatch.setattr(MockArm, "is_connected", property(fail))
+    host.close()
+    assert "mock_arm could not be disconnected: ConnectionError: the bus does not answer" in capsys.readouterr().err
+
+
+def test_at_the_end_of_an_episode_a_base_stands_at_once(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, fps=2)
+    with closing(host):
+        start(host)
+        host.observe()
+        host.step(np.array([[0.2, 0.0]]))
+        began = time.monotonic()
+        host.stop(ONLY)
+        assert time.monotonic() - began < 0.3  # a frame lasts 0.5 s
+        assert robot.rows[-1][0] == 0.0

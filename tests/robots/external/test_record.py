@@ -29,7 +29,7 @@ from bhd_lerobot.rollout.progress import FAULT_STATUS
 from bhd_lerobot.rollout.replay_robot import replay_on_robot
 from tests.forks import Fork
 from tests.recording.support import saved
-from tests.robots.external import mock_devices  # noqa: F401  registers them
+from tests.robots.external.mock_devices import MockArm
 from tests.waiting import until
 
 CAMERAS = "{front: {type: mock_camera}, wrist: {type: mock_camera}}"
@@ -209,6 +209,38 @@ def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) ->
     assert "elbow.pos" in console.file.getvalue()
     with pytest.raises(ConfigError, match=r"gate.max_change is not set"):
         replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(), console)
+    for change in ({"elbow.pos": 50.0}, {}):
+        with pytest.raises(ConfigError, match=r"gate.max_change does not limit shoulder.pos, .*would jump"):
+            replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=change), console)
+    assert len(np.loadtxt(tmp_path / "log")) == len(sent)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_replay_and_lets_go_of_the_robot(
+    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1)
+    config = parse(RecordConfig, options(tmp_path / "other"))
+    ended = []
+    send, disconnect = MockArm.send_action, MockArm.disconnect
+
+    def interrupted(self: MockArm, action: dict[str, Any]) -> dict[str, Any]:
+        if self.sent == 3:
+            assert signal.getsignal(number) not in (signal.SIG_DFL, signal.default_int_handler)
+            os.kill(os.getpid(), number)
+        return send(self, action)
+
+    def let_go(self: MockArm) -> None:
+        ended.append(self.sent)
+        disconnect(self)
+
+    monkeypatch.setattr(MockArm, "send_action", interrupted)
+    monkeypatch.setattr(MockArm, "disconnect", let_go)
+    console = Console(file=io.StringIO(), width=120)
+    with pytest.raises(RealtimeError, match=rf"stopped after \d+ of 15 frames: {number.name}"):
+        replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
+    assert ended
+    assert ended[0] < 15
 
 
 def test_two_programs_do_not_use_one_robot(tmp_path: Path) -> None:
@@ -216,6 +248,8 @@ def test_two_programs_do_not_use_one_robot(tmp_path: Path) -> None:
     with RobotLock(config):
         with pytest.raises(RealtimeError, match=rf"mock_arm .*is used by process {os.getpid()}"):
             run(tmp_path / "d", robot__id="shared")
+        with pytest.raises(RealtimeError, match="is used by process"):  # a port is one robot, whatever it is called
+            run(tmp_path / "d", robot__id="renamed")
         run(tmp_path / "other", robot__id="another", dataset__num_episodes=1)
     run(tmp_path / "again", robot__id="shared", dataset__num_episodes=1)
 

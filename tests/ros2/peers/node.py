@@ -31,12 +31,17 @@ def options(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def run(make: Callable[[Callable[[str], Node]], Callable[[], None]], seconds: float | None = None) -> None:
-    """Spin the nodes that `make` makes by name until SIGINT, SIGTERM or a time [s]; then call what it returned."""
+def end_with_parent() -> None:
+    """End when the process named by BHD_PARENT does, however it does."""
     if parent := os.environ.get("BHD_PARENT"):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != int(parent):
             sys.exit("the tests have ended")
+
+
+def run(make: Callable[[Callable[[str], Node]], Callable[[], None]], seconds: float | None = None) -> None:
+    """Spin the nodes that `make` makes by name until SIGINT, SIGTERM or a time [s]; then call what it returned."""
+    end_with_parent()
     stopped = False
 
     def stop(*_: object) -> None:
@@ -58,5 +63,6 @@ def run(make: Callable[[Callable[[str], Node]], Callable[[], None]], seconds: fl
     end = None if seconds is None else time.monotonic() + seconds
     while not stopped and (end is None or time.monotonic() < end):
         executor.spin_once(timeout_sec=0.1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # while Python ends, it would be Python's own end by SIGINT
     close()
     rclpy.shutdown()

@@ -74,6 +74,6 @@ class Base:
             self.contacts += not self.touching
             self.touching, self.forward, driven = True, 0.0, 0.0
         else:
-            self.touching = self.touching and not driven
+            self.touching = self.touching and clearance < BODY_RADIUS + 0.01
             self.x, self.y = x, y
         return driven, turned

@@ -11,14 +11,18 @@ the start [s]; an option may be given several times.
 import json
 import math
 import os
+import signal
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import node as peer
 import numpy as np
-from builtin_interfaces.msg import Time
+from faults import Outlet, add_faults, at
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -37,22 +41,8 @@ CYCLE = 5  # steps between two publications of turtlebot3_node: 20 Hz
 TICK = math.tau / 4096  # [rad], of a DYNAMIXEL XL430-W250's encoder
 RPM_UNIT = 0.229 * math.tau / 60 * WHEEL_RADIUS  # [m/s], of its velocity
 TURN = 0.2  # [s], of the lidar: 5 Hz
+RESTART = 75  # exit status of a life that ends by --restart
 OLDEST = 0.2  # [s], what is older by the time it could be published is left out, as after SIGCONT
-
-
-def at(kind: str) -> Callable[[str], tuple[Any, ...]]:
-    """Return a parser of options like TOPIC:START:DURATION."""
-    names = kind.split(":")
-
-    def parse(text: str) -> tuple[Any, ...]:
-        parts = text.split(":")
-        if len(parts) != len(names):
-            raise peer.argparse.ArgumentTypeError(f"{text!r} is not {kind}")
-        return tuple(
-            part if name in ("TOPIC", "FRAME") else float(part) for name, part in zip(names, parts, strict=True)
-        )
-
-    return parse
 
 
 parser = peer.options(__doc__)
@@ -69,22 +59,13 @@ parser.add_argument("--heading", choices=("wheels", "imu"), default="wheels", he
 parser.add_argument(
     "--old-twist", action="store_true", help="/odom's twist is divided by minus the time since 1970, as up to 2024"
 )
-fault = parser.add_argument_group("faults")
-fault.add_argument(
-    "--gap", action="append", default=[], type=at("TOPIC:START:DURATION"), metavar="TOPIC:START:DURATION"
-)
-fault.add_argument("--silence", action="append", default=[], type=at("TOPIC:START"), metavar="TOPIC:START")
-fault.add_argument(
-    "--nan", action="append", default=[], type=at("TOPIC:START:DURATION"), metavar="TOPIC:START:DURATION"
-)
-fault.add_argument("--frame", action="append", default=[], type=at("TOPIC:FRAME"), metavar="TOPIC:FRAME")
-fault.add_argument("--zero-stamp", action="append", default=[], metavar="TOPIC")
-fault.add_argument("--swap", action="append", default=[], type=at("TOPIC:EVERY"), metavar="TOPIC:EVERY")
+parser.add_argument("--wait", action="store_true", help="stand still while this process is not scheduled")
+fault = add_faults(parser)
 fault.add_argument("--clock-offset", type=float, default=0.0, help="[s]")
 fault.add_argument("--clock-drift", type=float, default=0.0, help="[s/s]")
 fault.add_argument("--clock-jump", action="append", default=[], type=at("START:OFFSET"), metavar="START:OFFSET")
 fault.add_argument("--restart", action="append", default=[], type=at("START:DURATION"), metavar="START:DURATION")
-parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # JSON, of what outlives a restart
+parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # file of what outlives a restart
 args = parser.parse_args()
 
 log_file = open(args.log, "a", buffering=1) if args.log else None  # noqa: SIM115
@@ -104,45 +85,9 @@ def assign(message: Any, values: dict[str, float]) -> None:
         setattr(message, name, value)
 
 
-class Outlet:
-    """A publisher with the faults of its topic."""
-
-    def __init__(self, robot: "Robot", node: Node, topic: str, kind: type, *, qos: Any = 10, frame: str = "") -> None:
-        def mine(faults: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-            return [rest for name, *rest in faults if name in (topic, "all")]
-
-        self.robot, self.topic = robot, topic
-        self.gaps = [*mine(args.gap), *((start, math.inf) for (start,) in mine(args.silence))]
-        self.nans = mine(args.nan)
-        self.frame = next((name for (name,) in mine(args.frame)), frame)
-        self.zero = bool({topic, "all"} & set(args.zero_stamp))
-        self.every = int(next((every for (every,) in mine(args.swap)), 0))
-        self.publisher = node.create_publisher(kind, f"/{topic}", qos)
-        self.held: Any = None
-        self.count = 0
-
-    def is_within(self, times: list[tuple[Any, ...]]) -> bool:
-        return any(start <= self.robot.elapsed < start + duration for start, duration in times)
-
-    def publish(self, message: Any, header: Any, stamp: int) -> None:
-        """Publish, but for the faults, with a stamp [ns]."""
-        if self.is_within(self.gaps):
-            return
-        header.stamp = Time() if self.zero else Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
-        header.frame_id = self.frame
-        self.count += 1
-        if self.every and self.count % self.every == 0 and self.held is None:
-            self.held = message
-            return
-        self.publisher.publish(message)
-        if self.held is not None:
-            self.publisher.publish(self.held)
-            self.held = None
-
-
 class Robot:
     def __init__(self, new_node: Callable[[str], Node]) -> None:
-        before = json.loads(args.resume) if args.resume else {}
+        before = json.loads(Path(args.resume).read_text()) if args.resume else {}
         self.start = before.get("start", time.monotonic())
         self.restarts = before.get("restarts", 0)
         self.random = np.random.default_rng([args.seed, self.restarts])
@@ -159,19 +104,18 @@ class Robot:
         self.commands = 0
         self.begin_turn()
 
+        self.outlets: dict[str, Outlet] = {}
         main = new_node("turtlebot3_node")
         drive = new_node("diff_drive_controller")
         lidar = new_node("hlds_laser_publisher" if args.lidar == "lds01" else "ld08_driver")
-        self.scan = Outlet(self, lidar, "scan", LaserScan, qos=qos_profile_sensor_data, frame="base_scan")
-        self.odom = Outlet(self, drive, "odom", Odometry, frame="odom")
-        self.imu = Outlet(self, main, "imu", Imu, frame="imu_link")
-        self.joints = Outlet(self, main, "joint_states", JointState, frame="base_link")
-        self.power = Outlet(self, main, "battery_state", BatteryState)
-        self.outlets = [self.scan, self.odom, self.imu, self.joints, self.power]
+        self.scan = self.outlet(lidar, "scan", LaserScan, qos=qos_profile_sensor_data, frame="base_scan")
+        self.odom = self.outlet(drive, "odom", Odometry, frame="odom")
+        self.imu = self.outlet(main, "imu", Imu, frame="imu_link")
+        self.joints = self.outlet(main, "joint_states", JointState, frame="base_link")
+        self.power = self.outlet(main, "battery_state", BatteryState)
         self.tf = None
         if TFMessage is not None:
-            self.tf = Outlet(self, drive, "tf", TFMessage, qos=100, frame="odom")
-            self.outlets.append(self.tf)
+            self.tf = self.outlet(drive, "tf", TFMessage, qos=100, frame="odom")
             latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
             self.publish_fixed_frames(
                 new_node("robot_state_publisher").create_publisher(TFMessage, "/tf_static", latched)
@@ -182,6 +126,11 @@ class Robot:
         drive.create_service(Trigger, "/reset_odometry", self.on_reset_odometry)
         main.create_timer(STEP, self.advance)
         main.create_timer(1.0, self.report)
+
+    def outlet(self, node: Node, topic: str, kind: type, **options: Any) -> Outlet:
+        outlet = Outlet(args, lambda: self.elapsed, node, f"/{topic}", kind, **options)
+        self.outlets[topic] = outlet
+        return outlet
 
     @property
     def elapsed(self) -> float:
@@ -235,6 +184,8 @@ class Robot:
 
     def advance(self) -> None:
         """Move up to the present, and publish what is due meanwhile."""
+        if args.wait:
+            self.now = max(self.now, time.monotonic() - OLDEST)
         while self.now + STEP <= time.monotonic():
             self.now += STEP
             self.steps += 1
@@ -255,12 +206,10 @@ class Robot:
         """Vanish as a robot does whose power fails, without a goodbye, and come back after a time."""
         pose = [self.base.x, self.base.y, self.base.yaw]
         state = {"start": self.start, "pose": pose, "restarts": self.restarts + 1}
+        Path(args.resume).write_text(json.dumps(state))
         record("restart", self.now, down=duration)
         peer.log("restart", down=duration)
-        if log_file is not None:
-            log_file.close()
-        time.sleep(duration)
-        os.execv(sys.executable, [sys.executable, sys.argv[0], *sys.argv[1:], "--resume", json.dumps(state)])
+        os._exit(RESTART)
 
     def begin_turn(self) -> None:
         self.turn_start = self.now
@@ -295,7 +244,7 @@ class Robot:
             scan.range_min, scan.range_max = 0.0, 100.0
             lost = (ranges > 8.0) | (self.random.random(len(ranges)) < 0.03 * args.noise)
             ranges = np.where(lost, math.nan, ranges)
-        if self.scan.is_within(self.scan.nans):
+        if self.scan.is_nan:
             ranges = np.full(len(ranges), math.nan)
         scan.ranges = ranges.astype(np.float32).tolist()
         scan.intensities = [0.0 if not value > 0 else 200.0 for value in scan.ranges]
@@ -335,24 +284,24 @@ class Robot:
         pose.position.x, pose.position.y = float(self.odometry[0]), float(self.odometry[1])
         assign(pose.orientation, quaternion(self.odometry[2]))
         twist.linear.x, twist.angular.z = float(driven / per), float(turned / per)
-        if self.odom.is_within(self.odom.nans):
+        if self.odom.is_nan:
             pose.position.x = pose.position.y = twist.linear.x = twist.angular.z = math.nan
         imu = Imu()
         assign(imu.orientation, quaternion(self.imu_yaw))
         imu.angular_velocity.z = base.turning + self.noise(0.005)
         imu.linear_acceleration.y = base.forward * base.turning + self.noise(0.05)
         imu.linear_acceleration.z = 9.81 + self.noise(0.05)
-        if self.imu.is_within(self.imu.nans):
+        if self.imu.is_nan:
             imu.angular_velocity.z = math.nan
         half = base.turning * WHEEL_SEPARATION / 2
         speeds = np.round(np.array([base.forward - half, base.forward + half]) / RPM_UNIT) * RPM_UNIT
-        if self.joints.is_within(self.joints.nans):
+        if self.joints.is_nan:
             shown = speeds = np.full(2, math.nan)
         joints = JointState(name=["wheel_left_joint", "wheel_right_joint"])
         joints.position, joints.velocity = shown.tolist(), speeds.tolist()
         power = BatteryState(voltage=self.battery, percentage=100 * (self.battery - 11.0) / 1.1, design_capacity=1.8)
         power.present = True
-        if self.power.is_within(self.power.nans):
+        if self.power.is_nan:
             power.voltage = math.nan
         self.power.publish(power, power.header, stamp)
         self.imu.publish(imu, imu.header, stamp)
@@ -382,7 +331,7 @@ class Robot:
         base = self.base
         peer.log(
             "report",
-            published={outlet.topic: outlet.count for outlet in self.outlets},
+            published={topic: outlet.count for topic, outlet in self.outlets.items()},
             commands=self.commands,
             command=base.command,
             pose=[base.x, base.y, base.yaw],
@@ -392,5 +341,34 @@ class Robot:
         )
 
 
+def supervise() -> int:
+    """Run the stand-in in processes of their own, one after the other: each life is another participant of DDS."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        file.write("{}")
+        file.flush()
+        child: subprocess.Popen[bytes] | None = None
+        stopped = False
+
+        def stop(*_: object) -> None:
+            nonlocal stopped
+            stopped = True
+            if child is not None:
+                child.send_signal(signal.SIGINT)
+
+        signal.signal(signal.SIGINT, stop)
+        peer.end_with_parent()
+        for _, down in [*sorted(args.restart), (0.0, 0.0)]:
+            variables = os.environ | {"BHD_PARENT": str(os.getpid())}
+            child = subprocess.Popen([sys.executable, *sys.argv, "--resume", file.name], env=variables)
+            if (status := child.wait()) != RESTART:
+                return status
+            time.sleep(down)
+            if stopped:
+                break
+        return 0
+
+
 if __name__ == "__main__":
+    if args.restart and not args.resume:
+        sys.exit(supervise())
     peer.run(lambda new_node: Robot(new_node).report, args.seconds)

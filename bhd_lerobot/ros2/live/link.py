@@ -1,0 +1,164 @@
+"""Starts, feeds and ends a node's process and its guard."""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.ros2.live.channel import Channel, Word
+from bhd_lerobot.ros2.live.network import require_cyclonedds
+from bhd_lerobot.ros2.live.spec import NodeSpec
+
+_START_S = 30.0
+_END_S = 3.0
+SILENCE_S = 1.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
+
+
+class NodeLink:
+    """A node in a process of its own.
+
+    Attributes:
+        spec: the node.
+
+    Args:
+        spec: the node.
+    """
+
+    def __init__(self, spec: NodeSpec) -> None:
+        self.spec = spec
+        self._channel: Channel | None = None
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._wake = -1
+        self._record: Any = None
+
+    def open(self, patience_s: float = 10.0) -> None:
+        """Start the processes, and wait until every topic that is received has sent something.
+
+        Args:
+            patience_s: how long at the most [s].
+
+        Raises:
+            ConfigError: Cyclone DDS is not installed.
+            RealtimeError: the processes do not start, or a topic sends nothing; names it, and why.
+        """
+        require_cyclonedds()
+        self.close()
+        channel = self._channel = Channel(self.spec)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK)
+        self._record = np.zeros((), channel.command_dtype)
+        try:
+            needs_guard = any(one.stop is not None for one in self.spec.outputs)
+            for role in ("node", "guard") if needs_guard else ("node",):
+                self._start(role)
+            self._wait_for_topics(time.monotonic() + patience_s)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, role: str) -> None:
+        assert self._channel is not None
+        ours, theirs = socket.socketpair()
+        descriptors = (theirs.fileno(), self._channel.descriptor, self._wake)
+        with theirs:
+            self._processes[role] = subprocess.Popen(
+                [sys.executable, "-m", "bhd_lerobot.ros2.live.process", role, *map(str, descriptors)],
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        with Connection(ours.detach()) as connection:
+            connection.send(self.spec)
+            if not connection.poll(_START_S):
+                raise RealtimeError(f"The process of the ROS 2 node did not start within {_START_S:g} s.")
+            try:
+                answer = connection.recv()
+            except EOFError:
+                answer = f"failed: its process ended with status {self._processes[role].wait()}"
+        if answer != "ready":
+            raise RealtimeError(f"The ROS 2 node {self.spec.name} {answer}")
+
+    def _wait_for_topics(self, end: float) -> None:
+        while True:
+            state = self.state
+            heard = state is not None and all(
+                count or not one.is_required for one, count in zip(self.spec.inputs, state["count"], strict=True)
+            )
+            if (heard or not self.spec.inputs) and all(len(images) for images in self.channel.images):
+                return
+            if time.monotonic() > end:
+                raise RealtimeError(self.problem or "No topic has sent anything yet.")
+            self.check()
+            time.sleep(0.01)
+
+    @property
+    def channel(self) -> Channel:
+        """The shared memory.
+
+        Raises:
+            RealtimeError: the node is not open.
+        """
+        if self._channel is None:
+            raise RealtimeError("The ROS 2 node is not open.")
+        return self._channel
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process numbers, of ``node`` and ``guard``."""
+        return {role: process.pid for role, process in self._processes.items()}
+
+    @property
+    def state(self) -> Any:
+        """The newest state, see `Channel`; None before the first."""
+        return self.channel.states.latest()
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the topics, as text; empty if nothing."""
+        state = self.state
+        return "" if state is None else bytes(state["problem"]).decode(errors="ignore")
+
+    def check(self) -> None:
+        """Raise if the node or its guard has ended or is stopped.
+
+        Raises:
+            RealtimeError: one has.
+        """
+        for role, word in (("node", Word.ALIVE), ("guard", Word.GUARD_ALIVE)):
+            if role in self._processes and self.channel.silence_s(word) > SILENCE_S:
+                process = self._processes[role]
+                how = "is stopped" if process.poll() is None else f"ended with status {process.returncode}"
+                raise RealtimeError(f"The process of the ROS 2 {role} {how}.")
+
+    def write(self, values: NDArray[np.float64]) -> None:
+        """Send a command, shape (numbers of all outputs,); never waits."""
+        record = self._record
+        record["stamp_ns"] = time.monotonic_ns()
+        record["values"] = values
+        self.channel.commands.publish(record)
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_write(self._wake, 1)
+
+    def close(self) -> None:
+        """Stop the robot if it has a stop, and end the processes. May be called twice."""
+        if self._channel is None:
+            return
+        self._channel.words[Word.END] = 1
+        for process in self._processes.values():
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._processes.clear()
+        self._channel.close()
+        self._channel = None
+        os.close(self._wake)
+        self._wake = -1

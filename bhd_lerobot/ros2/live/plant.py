@@ -1,0 +1,88 @@
+"""What plants of ROS 2 robots have in common: a node in a process of its own below the cerebellum."""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.ros2.live.link import NodeLink
+from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec
+
+
+class Ros2Plant(Plant):
+    """A robot on a ROS 2 network.
+
+    Args:
+        name: of the robot.
+        config: the robot's configuration.
+        inputs: what is received.
+        outputs: what is sent.
+    """
+
+    n = 1
+    command_hz: float
+
+    def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
+        spec = NodeSpec(
+            f"bhd_{name}_{os.getpid()}",
+            config.ros2,
+            inputs,
+            outputs,
+            command_hz=config.ros2.command_hz or self.command_hz,
+            timeout_s=config.ros2.timeout_s,
+        )
+        self.link = NodeLink(spec)
+        self._parts = spec.columns
+        self._enabled = False
+
+    def open(self) -> None:
+        """Join the network, and wait for the robot's topics.
+
+        Raises:
+            RealtimeError: a topic sends nothing, or another node commands the robot.
+        """
+        self.link.open()
+
+    def enable(self) -> None:
+        """Let commands through from now on."""
+        self._enabled = True
+
+    def state(self) -> Any:
+        """Return the newest state of the node.
+
+        Raises:
+            RealtimeError: something is wrong with the topics, or the node's process has ended.
+        """
+        self.link.check()
+        state = self.link.state
+        if problem := bytes(state["problem"]).decode(errors="ignore"):
+            raise RealtimeError(problem)
+        return state
+
+    def read(self, out: PlantReading) -> None:
+        """Write the newest readings into `out`.
+
+        Raises:
+            RealtimeError: as for `state`.
+        """
+        self.read_parts(self.state(), out)
+
+    def read_parts(self, state: Any, out: PlantReading) -> None:
+        """Write what the robot's topics say into `out`."""
+        raise NotImplementedError
+
+    def numbers(self, state: Any, index: int) -> Any:
+        """Return the numbers of an input, shape (width,)."""
+        return state["values"][self._parts[index]]
+
+    def write(self, ctrl: np.ndarray) -> None:
+        """Send commands."""
+        if self._enabled:
+            self.link.write(ctrl[0])
+
+    def close(self) -> None:
+        """Stop the robot, and leave the network."""
+        self._enabled = False
+        self.link.close()

@@ -1,0 +1,134 @@
+"""What a node in a process of its own receives and sends."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.ros2.live.network import NetworkConfig, Qos
+
+
+class Reader(Protocol):
+    """Takes numbers from messages of a type."""
+
+    @property
+    def width(self) -> int:
+        """How many."""
+
+    def read(self, message: Any) -> NDArray[np.float64]:
+        """Return the numbers in a deserialised message, shape (width,).
+
+        Raises:
+            DatasetError: they are not there.
+        """
+
+
+class Writer(Protocol):
+    """Makes messages of a type."""
+
+    @property
+    def width(self) -> int:
+        """How many numbers a message is made of."""
+
+    def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
+        """Return the serialised message of some numbers, shape (width,), stamped [ns]."""
+
+
+@dataclass(frozen=True)
+class InputSpec:
+    """A topic that is received.
+
+    Attributes:
+        topic, msgtype, qos: of the subscription.
+        reader: takes the numbers from a message.
+        silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
+            when something changes, which is not waited for either: its numbers are not a number until then.
+        frame: what the header's `frame_id` has to be; any if empty.
+    """
+
+    topic: str
+    msgtype: str
+    reader: Reader
+    qos: Qos = field(default_factory=Qos)
+    silence_s: float = 1.0
+    frame: str = ""
+
+    @property
+    def is_required(self) -> bool:
+        """Whether it is waited for."""
+        return np.isfinite(self.silence_s).item()
+
+
+@dataclass(frozen=True)
+class OutputSpec:
+    """A topic that is sent.
+
+    Attributes:
+        topic, msgtype, qos: of the publisher.
+        writer: makes a message of the command's numbers.
+        stop: the numbers that stop the robot, sent when no command comes any more; None for a robot that stops by
+            itself.
+    """
+
+    topic: str
+    msgtype: str
+    writer: Writer
+    qos: Qos = field(default_factory=Qos)
+    stop: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A topic of images.
+
+    Attributes:
+        name: of the camera.
+        topic, msgtype, qos: of the subscription.
+        width, height: of an image [px].
+        silence_s: without an image for so long it is silent, which is a problem [s].
+    """
+
+    name: str
+    topic: str
+    msgtype: str
+    width: int
+    height: int
+    qos: Qos = field(default_factory=lambda: Qos(2, reliable=False))
+    silence_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """A node.
+
+    Attributes:
+        name: of the node.
+        network: where other nodes are.
+        command_hz: a command is sent at once, but at most so often; without a new one, the last is repeated as often
+            [Hz].
+        timeout_s: without a command for so long the stop is sent instead [s].
+        is_alone: whether another publisher on a topic that is sent is a problem.
+    """
+
+    name: str
+    network: NetworkConfig
+    inputs: tuple[InputSpec, ...] = ()
+    outputs: tuple[OutputSpec, ...] = ()
+    cameras: tuple[CameraSpec, ...] = ()
+    command_hz: float = 50.0
+    timeout_s: float = 0.2
+    is_alone: bool = True
+
+    @property
+    def columns(self) -> tuple[slice, ...]:
+        """Where the numbers of each input are among all of them."""
+        ends = np.cumsum([0, *(one.reader.width for one in self.inputs)]).tolist()
+        return tuple(slice(start, end) for start, end in pairwise(ends))
+
+    @property
+    def command_columns(self) -> tuple[slice, ...]:
+        """The same of the outputs."""
+        ends = np.cumsum([0, *(one.writer.width for one in self.outputs)]).tolist()
+        return tuple(slice(start, end) for start, end in pairwise(ends))

@@ -1,0 +1,106 @@
+"""What a brain in another process exchanges with the robot: commands, results, the state, the emergency stop."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.parts import header
+from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.types import INTERFACES
+from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State
+
+COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
+COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
+ESTOP_TOPIC, RESET_TOPIC = "/emergency_stop", "/emergency_stop/reset"
+_RESULTS_HZ = 50
+
+
+class InterfaceTopics:
+    """The topics of `bhd_interfaces`.
+
+    Args:
+        host: the robot.
+        node: the node.
+        counts: what is refused.
+        state_hz: how often the state is published [Hz].
+        frame: the robot's base frame.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, counts: Counts, state_hz: float, frame: str) -> None:
+        self._host, self._counts, self._state_hz, self._frame = host, counts, state_hz, frame
+        self._refused: list[CommandResult] = []
+        self._result = node.publisher(RESULT_TOPIC, RESULT)
+        self._state = node.publisher(STATE_TOPIC, STATE)
+        self._inputs = [
+            Input(node.subscription(ESTOP_TOPIC, "std_msgs/msg/Bool"), self._stop, every=True),
+            Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
+            Input(node.subscription(COMMAND_TOPIC, COMMAND), self._submit, every=True),
+        ]
+
+    def outputs(self) -> Iterable[Output]:
+        """Return what is published."""
+        return [Output(self._state_hz, self._publish), Output(_RESULTS_HZ, self._publish_results)]
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+        return self._inputs
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing else is due."""
+        return NEVER_NS
+
+    def _stop(self, message: Any) -> None:
+        if message.data:
+            self._host.estop()
+
+    def _reset(self, message: Any) -> None:
+        for request in (self._host.bridge.reset, self._host.bridge.activate):
+            self._counts.add_result(RESET_TOPIC, request())
+
+    def _submit(self, message: Any) -> None:
+        if message.header.frame_id not in ("", self._frame):
+            text = f"The frame is {message.header.frame_id!r}; a target pose is in {self._frame!r}."
+            self._send(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
+            return
+        position, turn = message.target_pose.position, message.target_pose.orientation
+        pose = Pose((position.x, position.y, position.z), (turn.w, turn.x, turn.y, turn.z))
+        command = BrainCommand(
+            message.task_id,
+            target_pose=pose,
+            max_velocity=message.max_velocity or None,
+            max_acceleration=message.max_acceleration or None,
+        )
+        refusal = self._host.bridge.submit(command)
+        if refusal is not None:
+            self._refused.append(refusal)
+            self._send(refusal)
+
+    def _publish_results(self, state: State) -> None:
+        for result in self._host.bridge.take_results():
+            if result in self._refused:
+                self._refused.remove(result)
+            else:
+                self._send(result)
+
+    def _send(self, result: CommandResult) -> None:
+        fields = {
+            "header": header(State.of(self._host).stamps),
+            "task_id": result.task_id,
+            "success": result.success,
+            "message": result.message or result.code.name,
+        }
+        self._result.send(encode(RESULT, fields, 1)[0])
+
+    def _publish(self, state: State) -> None:
+        record = state.record
+        fields = {
+            "header": header(state.stamps, self._frame),
+            "joint_positions": record["joint_positions"],
+            "joint_velocities": record["joint_velocities"],
+            "joint_efforts": record["joint_efforts"],
+            "is_moving": bool(record["is_moving"][0]),
+            "emergency_stop": bool(record["emergency_stop"][0]),
+        }
+        self._state.send(encode(STATE, fields, 1)[0])

@@ -1,0 +1,115 @@
+"""`bhd-ros2 serve`: which robot, on which network, and until when."""
+
+import signal
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.robots.config import RobotConfig
+from rich.console import Console
+
+from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.robots.robot import BhdRobot
+from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.arm import ARM_FRAME
+from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME
+from bhd_lerobot.ros2.messages.robot_views import robot_view
+from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
+from bhd_lerobot.ros2.serve.base import BaseTopics
+from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
+from bhd_lerobot.ros2.serve.interface import InterfaceTopics
+from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
+
+
+@dataclass
+class ServeConfig:
+    """A simulated robot as a ROS 2 robot, on the wall clock. Ctrl-C ends it.
+
+    Attributes:
+        robot: the robot; its type is ``turtlebot3`` or ``ur5``.
+        network: where other nodes are.
+        namespace: of the robot's node; topics keep their names, which begin with a slash.
+        state_hz: how often ``/cerebellum/state`` is published [Hz].
+        joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
+        clock: publish ``/clock`` as well.
+        duration_s: end after this time [s]; 0: run until Ctrl-C.
+    """
+
+    robot: RobotConfig
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    namespace: str = "/"
+    state_hz: float = 50.0
+    joint_states_hz: float = float(JOINT_STATES_HZ)
+    clock: bool = False
+    duration_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("state_hz", "joint_states_hz"):
+            if not 0 < getattr(self, name) <= 1000:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it is above 0 and at most 1000 Hz.")
+        robot: Any = self.robot
+        if not hasattr(robot, "plant") or robot.plant:
+            raise ConfigError(f"robot.type is {robot.type!r}; a simulated robot of this package can be served.")
+        robot.clock = "realtime"
+        if isinstance(robot.body(), MobileBase):
+            robot.odometry = robot.imu = True
+        elif robot.action_space != "joint":
+            raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
+
+
+def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
+    """Serve a robot until SIGINT or SIGTERM.
+
+    Args:
+        robot: the robot of `config.robot`, not connected.
+        console: takes lines about the state.
+
+    Raises:
+        ConfigError: Cyclone DDS is not installed.
+        RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
+    """
+    require_cyclonedds()
+    ended = threading.Event()
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        robot.connect()
+        host = robot.host
+        if not isinstance(host, LiveHost):
+            raise AssertionError("The robot of a served configuration is on the wall clock.")
+        for line in host.notes:
+            console.print(line)
+        with Node(config.robot.type, config.network, config.namespace) as node:
+            counts = Counts()
+            server = Server(host, node, _parts(config, host, node, counts), counts)
+            where = "this machine" if config.network.is_local else config.network.interface
+            console.print(
+                f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
+            )
+            if config.duration_s:
+                timer = threading.Timer(config.duration_s, ended.set)
+                timer.daemon = True
+                timer.start()
+            server.run(ended.is_set, lambda line: console.print(line, markup=False))
+    finally:
+        robot.disconnect()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
+    view = robot_view(config.robot.type)
+    is_arm = isinstance(host.body, Arm)
+    frame = ARM_FRAME if is_arm else FOOTPRINT_FRAME
+    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, frame)]
+    if is_arm:
+        parts.append(ArmTopics(host, node, counts, view, config.joint_states_hz))
+    else:
+        parts.append(BaseTopics(host, node, counts, view))
+    if host.camera_shapes:
+        parts.append(CameraTopics(host, node, view))
+    if config.clock:
+        parts.append(ClockTopic(node))
+    return parts

@@ -1,0 +1,67 @@
+"""The brain `teleop`, at what a teleoperator and a processor of another package may return."""
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import BrainStoppedError
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.teleop.brain import TeleopBrain
+from bhd_lerobot.policies.teleop.config import TeleopConfig
+from tests.robots.external.mock_devices.devices import JOINTS, MockLeaderConfig
+
+ONLY = np.zeros(1, np.intp)
+SEEN = Observation(JOINTS, np.zeros((1, 3)))
+
+
+@pytest.fixture
+def brain() -> Iterator[TeleopBrain]:
+    with closing(TeleopBrain(TeleopConfig(MockLeaderConfig()))) as brain:
+        brain.bind(RobotFeatures(JOINTS, JOINTS, 50, robot_type="mock_arm"))
+        brain.reset(ONLY, [0], 1)
+        yield brain
+
+
+@pytest.mark.parametrize("raises", [False, True])
+def test_what_a_teleoperator_answers_too_late_is_not_of_the_next_episode(
+    brain: TeleopBrain, monkeypatch: pytest.MonkeyPatch, raises: bool
+) -> None:
+    calls = []
+
+    def get_action() -> dict[str, float]:
+        calls.append(0)
+        if len(calls) == 1:
+            time.sleep(0.2)
+            if raises:
+                raise ConnectionError("the bus does not answer")
+        return dict.fromkeys(JOINTS, float(len(calls)))
+
+    monkeypatch.setattr(brain.teleop, "get_action", get_action)
+    assert brain.act(SEEN) is None
+    time.sleep(0.3)
+    brain.reset(ONLY, [0], 1)
+    assert brain.act(SEEN).tolist() == [[2.0] * 3]  # type: ignore[union-attr]
+
+
+def test_what_a_teleoperator_answers_late_within_an_episode_counts(
+    brain: TeleopBrain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def get_action() -> dict[str, float]:
+        time.sleep(0.05)
+        return dict.fromkeys(JOINTS, 1.0)
+
+    monkeypatch.setattr(brain.teleop, "get_action", get_action)
+    actions: list[Any] = [brain.act(SEEN) for _ in range(10)]
+    assert any(action is not None for action in actions)
+
+
+@pytest.mark.parametrize("value", [None, "fast", [1.0, 2.0]])
+def test_a_processor_that_returns_no_number_ends_the_episode(brain: TeleopBrain, value: object) -> None:
+    brain._process = lambda action, observation: dict.fromkeys(JOINTS, value)
+    brain._map = dict
+    with pytest.raises(BrainStoppedError, match=r"the processor .* for .shoulder.pos., which is not a number"):
+        brain.act(SEEN)

@@ -1,0 +1,65 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.ros2 import peer_env
+
+MAKE_TWICE_AT_ONCE = """
+import sys, time
+from pathlib import Path
+from tests.ros2 import peer_env
+
+peer_env.CACHE = Path(sys.argv[1])
+def make(folder):
+    folder.mkdir()
+    time.sleep(0.3)
+    with open(sys.argv[1] + "/makers", "a") as makers:
+        print("made", file=makers)
+    (folder / "last").touch()
+assert (peer_env._made("name", [Path(__file__ if "__file__" in globals() else sys.executable)], make) / "last").exists()
+"""
+
+
+def test_two_that_ask_at_once_get_what_one_of_them_makes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MAKE_TWICE_AT_ONCE, str(tmp_path)]
+    both = [subprocess.Popen(command, cwd=peer_env.ROOT) for _ in range(2)]
+    assert [process.wait() for process in both] == [0, 0]
+    assert (tmp_path / "makers").read_text().splitlines() == ["made"]
+
+
+def test_what_older_or_interrupted_makers_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peer_env, "CACHE", tmp_path)
+    source = tmp_path / "source.txt"
+    for text in ("one", "two"):
+        source.write_text(text)
+        (tmp_path / "name-0123456789ab.new").mkdir()
+        made = peer_env._made("name", [source], Path.mkdir)
+        other = peer_env._made("name-messages", [source], Path.mkdir)
+        assert sorted(path for path in tmp_path.iterdir() if path.is_dir()) == sorted([made, other])
+
+
+def test_a_peer_inherits_nothing_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE"):
+        monkeypatch.setenv(name, "99")
+    variables = peer_env.RosEnvironment(Path("python"), None).variables(7)
+    assert "99" not in variables.values()
+    assert variables["ROS_DOMAIN_ID"] == "7"
+    assert variables["PATH"] == os.environ["PATH"]
+
+
+def test_no_two_get_the_same_domain() -> None:
+    with peer_env.free_domain() as one, peer_env.free_domain() as other:
+        assert one != other
+
+
+@pytest.mark.parametrize(("required", "outcome"), [("0", pytest.skip.Exception), ("1", pytest.fail.Exception)])
+def test_without_ros_a_test_is_skipped_and_fails_in_ci(
+    required: str, outcome: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peer_env, "_environment", lambda _: peer_env.UnavailableError("no network"))
+    monkeypatch.setenv(peer_env.REQUIRE, required)
+    with pytest.raises(outcome, match="no ROS 2 kilted: no network"):
+        peer_env.environment("kilted")
