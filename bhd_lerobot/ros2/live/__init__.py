@@ -1,12 +1,10 @@
 """Robots on a ROS 2 network, through Cyclone DDS, without a ROS installation."""
 
-<<<<<<< HEAD
-__all__ = ["clients", "graph", "network", "node", "topic_types"]
-=======
 __all__ = [
     "arm_plant",
     "base_plant",
     "channel",
+    "clients",
     "clock_offset",
     "graph",
     "link",
@@ -17,4 +15,3 @@ __all__ = [
     "spec",
     "topic_types",
 ]
->>>>>>> main

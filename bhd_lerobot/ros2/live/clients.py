@@ -138,7 +138,7 @@ class ServiceClient:
             ]
         network = self._node.network
         return (
-            f"{unknown_name(kind, name, there)} These are in ROS domain {network.domain} on {network.interface!r}, "
+            f"{unknown_name(kind, name, there)} These are in ROS domain {network.domain_number} on {network.interface!r}, "
             f"after {timeout_s:g} s."
         )
 
