@@ -14,4 +14,5 @@ __all__ = [
     "process",
     "spec",
     "topic_types",
+    "topics",
 ]

@@ -138,8 +138,8 @@ class ServiceClient:
             ]
         network = self._node.network
         return (
-            f"{unknown_name(kind, name, there)} These are in ROS domain {network.domain_number} on {network.interface!r}, "
-            f"after {timeout_s:g} s."
+            f"{unknown_name(kind, name, there)} These are in ROS domain {network.domain_number} on "
+            f"{network.interface!r}, after {timeout_s:g} s."
         )
 
 

@@ -163,7 +163,7 @@ class Graph:
                 found.append(f"{who} is of type {one.msgtype}; the {ours} here is of {msgtype}.")
             else:
                 offered, wanted = (qos, one.qos) if is_publisher else (one.qos, qos)
-                if wanted.reliable > offered.reliable or wanted.transient_local > offered.transient_local:
+                if not offered.serves(wanted):
                     found.append(f"{who} is {one.qos}; the {ours} here is {qos}, and no message passes.")
         return found
 
