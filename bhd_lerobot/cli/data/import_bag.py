@@ -177,7 +177,8 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
     robot = options.robot or ROBOTS[0]
     if robot not in ROBOTS:
         raise ConfigError(
-            f"{unknown_name('robot', robot, ROBOTS)} Bags of other robots need --map, which names the fields to read."
+            f"{unknown_name('robot', robot, ROBOTS)} Bags of other robots need --map, which names the fields to read: "
+            f"a YAML file, or {' or '.join(presets.PRESETS)}."
         )
     real, body = _real(options), turtlebot3_burger()
     from bhd_lerobot.robots.base_host import observation_names
