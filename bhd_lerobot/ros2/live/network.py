@@ -136,6 +136,10 @@ class Qos:
             *[Policy.Userdata(data) for data in user_data],
         )
 
+    def serves(self, wanted: "Qos") -> bool:
+        """Return whether messages that a publisher keeps like this pass to a subscription that wants them so."""
+        return self.reliable >= wanted.reliable and self.transient_local >= wanted.transient_local
+
     def __str__(self) -> str:
         """Return it in words."""
         kept = ", transient local" if self.transient_local else ""
