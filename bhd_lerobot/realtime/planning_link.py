@@ -171,11 +171,15 @@ class PlanningLink:
 class PlanServer:
     """The planner's side, for one thread.
 
+    Attributes:
+        newest: the trajectory of the last plan that was answered with; None before there is one.
+
     Args:
         duration_s: the longest trajectory [s]; the same on both sides.
     """
 
     def __init__(self, buffer: Any, planner: GoalPlanner, *, duration_s: float = MAX_DURATION_S) -> None:
+        self.newest: Trajectory | None = None
         self._planner = planner
         self._memory = memory = _Memory(buffer, planner.dof, planner.hz, duration_s)
         self._header: Any = memory.header[0]
@@ -210,6 +214,7 @@ class PlanServer:
             used = rows[: trajectory.ticks]
             used[:, 0], used[:, 1], used[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
             header["code"], header["rows"], header["target"] = ResultCode.SUCCEEDED, trajectory.ticks, answer.target
+            self.newest = trajectory
         self._answered[0] = number
         return True
 

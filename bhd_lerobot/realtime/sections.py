@@ -51,6 +51,7 @@ class BrainSide:
 
     Attributes:
         client: sends requests for modes and goals.
+        planner: plans goals; None for a robot that takes no goals.
         serve: plans goals until its argument returns true, for a thread; None for a robot that takes no goals.
 
     Args:
@@ -63,8 +64,9 @@ class BrainSide:
         requests = Mailbox(request_dtype(_dof(cerebellum)), _REQUESTS, block.section("requests"))
         self.client = RequestClient(requests, Mailbox(EVENT_DTYPE, _EVENTS, block.section("events")), wait)
         self.serve: Callable[[Callable[[], bool]], None] | None = None
+        self.planner: PlanServer | None = None
         if isinstance(cerebellum.controller, ArmController):
-            server = PlanServer(block.section("plan"), cerebellum.controller.goals.planner)
+            server = self.planner = PlanServer(block.section("plan"), cerebellum.controller.goals.planner)
 
             def serve(stop: Callable[[], bool]) -> None:
                 server.serve(stop, lambda: time.sleep(_REST_S))

@@ -22,7 +22,8 @@ class Reading:
     Attributes:
         state: the observation's floats, shape (features,).
         images: by camera name, shape (height, width, 3).
-        state_ns: when the motors had answered, monotonic [ns].
+        state_ns: when the motors had answered, or when it was measured if the robot says so (`state_timestamp`),
+            monotonic [ns].
         image_ns: when each image was taken, or had come, monotonic [ns].
     """
 
@@ -99,7 +100,9 @@ class Device:
             images[name] = image
         asked = [stamp.asked_ns for stamp in self._stamps.values() if stamp.asked_ns >= started]
         taken = {name: stamp.taken_ns or ended for name, stamp in self._stamps.items()}
-        return Reading(state, images, min(asked, default=ended), taken)
+        measured = getattr(self.robot, "state_timestamp", None)  # as the cameras' `latest_timestamp`
+        state_ns = round(measured * 1e9) if isinstance(measured, float) else min(asked, default=ended)
+        return Reading(state, images, state_ns, taken)
 
     def send(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Send an action, shape (actions,); return what the robot says that it applied.

@@ -7,6 +7,7 @@ __all__ = [
     "images",
     "mapping",
     "parts",
+    "presets",
     "robot_views",
     "scan",
     "serialize",

@@ -77,6 +77,10 @@ class ArmTopics:
         """Return what commands the robot."""
         return self._inputs
 
+    def trajectory(self) -> JointTrajectory | None:
+        """Return the joint trajectory that is followed, or None."""
+        return self._trajectory[0] if self._trajectory is not None else None
+
     def _publish(self, state: State) -> None:
         record, count = state.record, self._count
         fields = {

@@ -62,8 +62,7 @@ class BaseTopics:
         self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
-        self._stamped = node.network.distro != "humble"
-        command = (TwistPart if self._stamped else BareTwistPart).msgtype
+        command = (BareTwistPart if node.network.distro == "humble" else TwistPart).msgtype
         self._command = node.subscription("/cmd_vel", command)
         self._odometry = node.publisher("/odom", OdometryPart.msgtype)
         self._imu = node.publisher("/imu", GyroPart.msgtype)
@@ -84,7 +83,7 @@ class BaseTopics:
         return [Input(self._command, self._drive_by)]
 
     def _drive_by(self, message: Any) -> None:
-        twist = message.twist if self._stamped else message
+        twist = getattr(message, "twist", message)
         values = np.array([[twist.linear.x, twist.angular.z]])
         self._counts.add_result(self._command.topic, self._host.bridge.send(values))
 

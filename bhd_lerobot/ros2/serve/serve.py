@@ -20,7 +20,9 @@ from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
 from bhd_lerobot.ros2.serve.base import BaseTopics
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
+from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics
+from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
 
 
@@ -35,6 +37,7 @@ class ServeConfig:
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
         clock: publish ``/clock`` as well.
+        foxglove_port: serve all topics to the Foxglove app on this TCP port of this machine; 0: off.
         duration_s: end after this time [s]; 0: run until Ctrl-C.
     """
 
@@ -44,12 +47,15 @@ class ServeConfig:
     state_hz: float = 50.0
     joint_states_hz: float = float(JOINT_STATES_HZ)
     clock: bool = False
+    foxglove_port: int = 0
     duration_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("state_hz", "joint_states_hz"):
             if not 0 < getattr(self, name) <= 1000:
                 raise ConfigError(f"{name} is {getattr(self, name)}; it is above 0 and at most 1000 Hz.")
+        if not 0 <= self.foxglove_port <= 65535:
+            raise ConfigError(f"foxglove_port is {self.foxglove_port}; it is from 1 to 65535, or 0 for no Foxglove.")
         robot: Any = self.robot
         if not hasattr(robot, "plant") or robot.plant:
             raise ConfigError(f"robot.type is {robot.type!r}; a simulated robot of this package can be served.")
@@ -68,10 +74,11 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
         console: takes lines about the state.
 
     Raises:
-        ConfigError: Cyclone DDS is not installed.
+        ConfigError: Cyclone DDS is not installed, or Foxglove cannot be served.
         RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
     """
     require_cyclonedds()
+    foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
     ended = threading.Event()
     before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -81,13 +88,16 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
             raise AssertionError("The robot of a served configuration is on the wall clock.")
         for line in host.notes:
             console.print(line)
-        with Node(config.robot.type, config.network, config.namespace) as node:
+        named = config.robot.type, config.network, config.namespace
+        with MirroredNode(*named, foxglove) if foxglove else Node(*named) as node:
             counts = Counts()
             server = Server(host, node, _parts(config, host, node, counts), counts)
             where = "this machine" if config.network.is_local else config.network.interface
             console.print(
                 f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
             )
+            if foxglove:
+                console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
             if config.duration_s:
                 timer = threading.Timer(config.duration_s, ended.set)
                 timer.daemon = True
@@ -95,6 +105,8 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
             server.run(ended.is_set, lambda line: console.print(line, markup=False))
             console.print(_summary(host, counts))
     finally:
+        if foxglove:
+            foxglove.close()
         robot.disconnect()
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -112,9 +124,10 @@ def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> l
     frame = ARM_FRAME if is_arm else FOOTPRINT_FRAME
     parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, frame)]
     if is_arm:
-        parts.append(ArmTopics(host, node, counts, view, config.joint_states_hz))
+        arm = ArmTopics(host, node, counts, view, config.joint_states_hz)
+        parts += [arm, PlannedPath(host, node, arm.trajectory)]
     else:
-        parts.append(BaseTopics(host, node, counts, view))
+        parts += [BaseTopics(host, node, counts, view), DrivenPath(node)]
     if host.camera_shapes:
         parts.append(CameraTopics(host, node, view))
     if config.clock:

@@ -1,0 +1,212 @@
+"""Any ROS 2 robot as a LeRobot `Robot`: a mapping says which fields of which topics are its features."""
+
+import os
+import time
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from lerobot.robots.robot import Robot
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError, unknown_name
+from bhd_lerobot.ros2.live.base_plant import ScanReader
+from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.live.link import NodeLink
+from bhd_lerobot.ros2.live.network import SENSOR_DATA
+from bhd_lerobot.ros2.live.spec import CameraSpec, InputSpec, NodeSpec, OutputSpec
+from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, features_of, topics_of
+
+_COMMAND_HZ = 50.0
+
+
+class Ros2Robot(Robot):
+    """A robot on a ROS 2 network.
+
+    Observation and action are the features of its mapping, the images those of its cameras. An observation is the
+    newest message of each topic; the time at which the oldest of them was measured is `state_timestamp`.
+
+    Attributes:
+        state_timestamp: when the oldest number of the last observation was measured, on `time.perf_counter` [s].
+
+    Args:
+        config: the configuration.
+
+    Raises:
+        ConfigError: the mapping cannot be used.
+    """
+
+    config_class = Ros2RobotConfig
+    name = "ros2"
+
+    def __init__(self, config: Ros2RobotConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        mapping = self._mapping = MappingConfig.load(config.mapping)
+        if sizeless := [name for name, one in mapping.images.items() if not (one.width and one.height)]:
+            raise ConfigError(
+                f"{config.mapping}: images.{sizeless[0]} has no width and height [px]; a live camera needs both."
+            )
+        if unknown := [name for name in config.stop if name not in mapping.action]:
+            raise ConfigError(unknown_name("action in robot.stop", unknown[0], mapping.action))
+        self._names, self._actions = features_of(mapping.observation), tuple(mapping.action)
+        inputs, self._places = self._inputs(mapping)
+        self._acted = topics_of(mapping.action, mapping.types)
+        self._link = NodeLink(
+            NodeSpec(
+                f"bhd_{os.getpid()}",
+                config.ros2,
+                inputs,
+                tuple(OutputSpec(one.topic, one.msgtype, one, stop=self._stop_of(one)) for one in self._acted),
+                tuple(
+                    CameraSpec(name, one.topic, one.type, one.width, one.height, silence_s=config.topic_timeout_s)
+                    for name, one in mapping.images.items()
+                ),
+                command_hz=config.ros2.command_hz or _COMMAND_HZ,
+                timeout_s=config.ros2.timeout_s,
+            )
+        )
+        self.cameras = {name: Ros2Camera(self._link, index) for index, name in enumerate(mapping.images)}
+        self.state_timestamp = 0.0
+        self._is_connected = False
+
+    def _inputs(self, mapping: MappingConfig) -> tuple[tuple[InputSpec, ...], list[list[int]]]:
+        """Return what is received, and where its numbers are in the observation."""
+        found, places = [], []
+        numbers = {name: one for name, one in mapping.observation.items() if not one.beams}
+        for topic in topics_of(numbers, mapping.types):
+            found.append(InputSpec(topic.topic, topic.msgtype, topic, SENSOR_DATA, self.config.topic_timeout_s))
+            places.append([self._names.index(list(numbers)[column]) for column in topic.columns])
+        for name, one in mapping.observation.items():
+            if one.beams:
+                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
+                reader = ScanReader(one.topic, lidar, one.beams)
+                found.append(InputSpec(one.topic, SCAN, reader, SENSOR_DATA, self.config.topic_timeout_s))
+                places.append([self._names.index(feature) for feature in one.names(name)])
+        return tuple(found), places
+
+    def _stop_of(self, topic: TopicFields) -> tuple[float, ...] | None:
+        names = [self._actions[column] for column in topic.columns]
+        if not any(name in self.config.stop for name in names) and not all(name.endswith(".vel") for name in names):
+            return None
+        return tuple(self.config.stop.get(name, 0.0) for name in names)
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """LeRobot's description of an observation: floats first, then images."""
+        images = {name: (one.height, one.width, 3) for name, one in self._mapping.images.items()}
+        return {**dict.fromkeys(self._names, float), **images}
+
+    @cached_property
+    def action_features(self) -> dict[str, Any]:
+        """LeRobot's description of an action."""
+        return dict.fromkeys(self._actions, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether it is on the network."""
+        return self._is_connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        """There is nothing to calibrate."""
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Join the network, and wait for the robot's topics.
+
+        Raises:
+            DeviceAlreadyConnectedError: it is connected already.
+            ConfigError: Cyclone DDS is not installed.
+            RealtimeError: a topic sends nothing; names it, and why.
+        """
+        if self._is_connected:
+            raise DeviceAlreadyConnectedError("The ROS 2 robot is already connected.")
+        self._link.open()
+        self._is_connected = True
+
+    def calibrate(self) -> None:
+        """Nothing to calibrate."""
+
+    def configure(self) -> None:
+        """Nothing to configure beyond the configuration."""
+
+    def get_observation(self) -> dict[str, Any]:
+        """Return the newest values of all features: floats, and images of shape (height, width, 3), uint8 RGB.
+
+        Raises:
+            DeviceNotConnectedError: it is not connected.
+            RealtimeError: a topic is silent, or another node commands the robot.
+        """
+        state = self._state()
+        values = np.empty(len(self._names))
+        for place, part in zip(self._places, self._link.spec.columns, strict=True):
+            values[place] = state["values"][part]
+        measured = state["measured_ns"]
+        self.state_timestamp = (int(measured.min()) if len(measured) else time.monotonic_ns()) / 1e9
+        observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))
+        return observation | {name: camera.read_latest() for name, camera in self.cameras.items()}
+
+    def _state(self) -> Any:
+        if not self._is_connected:
+            raise DeviceNotConnectedError("The ROS 2 robot is not connected. Call connect() first.")
+        self._link.check()
+        if problem := self._link.problem:
+            raise RealtimeError(problem)
+        return self._link.state
+
+    def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
+        """Send an action; return it.
+
+        Raises:
+            DeviceNotConnectedError: it is not connected.
+            ActionError: an action is missing, or is not a finite number; nothing is sent.
+            RealtimeError: as for `get_observation`.
+        """
+        self._state()
+        missing = [name for name in self._actions if name not in action]
+        if missing:
+            raise ActionError(f"The action lacks {', '.join(missing)}. It needs {', '.join(self._actions)}.")
+        values = np.array([float(action[name]) for name in self._actions])
+        if not np.isfinite(values).all():
+            raise ActionError(f"The action {dict(action)} has a value that is not finite.")
+        sent = np.concatenate([values[list(topic.columns)] for topic in self._acted]) if self._acted else values
+        self._link.write(sent)
+        return dict(zip(self._actions, values.tolist(), strict=True))
+
+    def disconnect(self) -> None:
+        """Stop the robot if it has a stop, and leave the network. May be called twice."""
+        self._is_connected = False
+        self._link.close()
+
+
+class Ros2Camera:
+    """The images of a topic.
+
+    Attributes:
+        latest_timestamp: when the last image was taken, on `time.perf_counter` [s]; None before the first.
+
+    Args:
+        link: the node.
+        index: of the camera.
+    """
+
+    def __init__(self, link: NodeLink, index: int) -> None:
+        self._link, self._index = link, index
+        self.latest_timestamp: float | None = None
+
+    def read_latest(self) -> NDArray[np.uint8]:
+        """Return the newest image, shape (height, width, 3).
+
+        Raises:
+            RealtimeError: there is none.
+        """
+        record = self._link.channel.images[self._index].latest()
+        if record is None:
+            raise RealtimeError("The camera has sent no image.")
+        self.latest_timestamp = int(record["measured_ns"]) / 1e9
+        image: NDArray[np.uint8] = record["pixels"]
+        return image
