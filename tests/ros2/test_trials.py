@@ -4,6 +4,7 @@ With BHD_TRIALS=full the first lasts ten minutes: `BHD_TRIALS=full pytest tests/
 """
 
 import os
+import signal
 import re
 import signal
 import signal
@@ -117,3 +118,40 @@ def check_source(
     return used
 
 
+KILLED = {  # a part of its command line, None for bhd-record itself; what is said of it
+    "robot": ("", "/joint_states has sent no message for"),
+    "recording": (None, ""),
+    "cerebellum": ("robots.host.process", "The cerebellum's process was killed by signal 9"),
+    "node": ("ros2.live.process node", "The process of the ROS 2 node ended with status -9"),
+}
+
+
+@pytest.mark.parametrize("killed", KILLED)
+@pytest.mark.thorough(but=2)
+def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
+    killed: str, domain: int, tmp_path: Path
+) -> None:
+    part, cause = KILLED[killed]
+    log = tmp_path / "robot.jsonl"
+    with (
+        Peer("standin_turtlebot3.py", "--open", "--log", log, domain=domain) as robot,
+        Recording(
+            "turtlebot3", *DRIVE, "--dataset.num_episodes=9", domain=domain, folder=tmp_path, silence_s=0.4
+        ) as recording,
+    ):
+        recording.wait_for_episode(2)
+        until(lambda: log_of(log, "pose")[-1]["twist"][0] > 0.1, "the robot moves")
+        if killed == "robot":
+            robot.signal(signal.SIGKILL)
+        else:
+            os.kill(recording.pid if part is None else recording.pid_of(part), signal.SIGKILL)
+            until(lambda: log_of(log, "pose")[-1]["twist"] == [0.0, 0.0], "the robot stands")
+        assert recording.process.wait() != 0
+        if part is not None:
+            assert cause in recording.text
+    if killed == "recording":
+        assert data(["repair", str(recording.root)]) == 0
+    outcomes = outcomes_of(recording.root)
+    assert outcomes[0] == "timeout"
+    assert outcomes[1:] in ([], ["fault"])
+    assert data(["check", str(recording.root)]) == 0
