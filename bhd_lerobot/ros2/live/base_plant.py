@@ -112,20 +112,21 @@ class BasePlant(Ros2Plant):
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
+        node_silence = max(_NODE_SILENCE_S, config.ros2.silence_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
-            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), silence_s=_NODE_SILENCE_S),
+            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), silence_s=node_silence),
             InputSpec(
                 "/scan",
                 ScanPart.msgtype,
                 ScanReader("/scan", body.lidar, beams),
                 SENSOR_DATA,
-                _SCAN_SILENCE_S,
+                max(_SCAN_SILENCE_S, config.ros2.silence_s),
                 SCAN_FRAME,
             ),
         ]
         if config.imu:
-            inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, _NODE_SILENCE_S))
+            inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, node_silence))
         super().__init__(
             body.name, config, tuple(inputs), (OutputSpec("/cmd_vel", writer.msgtype, writer, stop=_STOP),)
         )

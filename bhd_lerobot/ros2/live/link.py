@@ -126,14 +126,17 @@ class NodeLink:
         state = self.state
         return "" if state is None else bytes(state["problem"]).decode(errors="ignore")
 
-    def check(self) -> None:
+    def check(self, silence_s: float = SILENCE_S) -> None:
         """Raise if the node or its guard has ended or is stopped.
+
+        Args:
+            silence_s: so long without a sign of life one counts as stopped [s].
 
         Raises:
             RealtimeError: one has.
         """
         for role, word in (("node", Word.ALIVE), ("guard", Word.GUARD_ALIVE)):
-            if role in self._processes and self.channel.silence_s(word) > SILENCE_S:
+            if role in self._processes and self.channel.silence_s(word) > silence_s:
                 process = self._processes[role]
                 how = "is stopped" if process.poll() is None else f"ended with status {process.returncode}"
                 raise RealtimeError(f"The process of the ROS 2 {role} {how}.")

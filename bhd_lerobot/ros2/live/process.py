@@ -29,7 +29,7 @@ _WAIT_S = 0.02
 _CHECK_NS = 1_000_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
-_TOMORROW_NS = 1_000_000_000  # a stamp further ahead of the one before is of a clock that was set
+_TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
 
 
 class Stopper:
@@ -108,7 +108,8 @@ class Receiver:
         self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
         self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
-        self._stamps = [0] * len(self._inputs)
+        self._stamps = [0] * len(self._inputs)  # newest of each [ns]
+        self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
@@ -150,10 +151,14 @@ class Receiver:
         if one.frame and header is not None and header.frame_id != one.frame:
             self._wrong[one.topic] = f"it is in the frame {header.frame_id!r}, not {one.frame!r}"
             return False
-        if stamp and stamp <= self._stamps[index] < stamp + _TOMORROW_NS:
-            record["dropped"][index] += 1
-            return False  # out of order; a stamp that is far behind is of a clock that was set
-        self._stamps[index] = stamp
+        if stamp:
+            newest = self._stamps[index]
+            if any(stamp <= other < stamp + _TOMORROW_NS for other in (newest, self._old_stamps[index])):
+                record["dropped"][index] += 1
+                return False  # out of order; a stamp that is far behind is of a clock that was set
+            if abs(stamp - newest) > _TOMORROW_NS:
+                self._old_stamps[index] = newest
+            self._stamps[index] = stamp
         self._wrong.pop(one.topic, None)
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
