@@ -12,7 +12,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.plant import Ros2Plant
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
-from bhd_lerobot.ros2.messages.base import SCAN_FRAME, BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
+from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -122,7 +122,7 @@ class BasePlant(Ros2Plant):
                 ScanReader("/scan", body.lidar, beams),
                 SENSOR_DATA,
                 max(_SCAN_SILENCE_S, config.ros2.silence_s),
-                SCAN_FRAME,
+                config.ros2.scan_frame,
             ),
         ]
         if config.imu:

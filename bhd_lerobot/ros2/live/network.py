@@ -90,11 +90,19 @@ class Ros2Config(NetworkConfig):
             base, 125 Hz to an arm.
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
         silence_s: readings that are older are a fault [s]; a TurtleBot3 sends every 0.05 s.
+        namespace: in front of the robot's topics, such as ``/tb3_1``.
+        scan_frame: the frame of a base's scans; their beam 0 is taken to point ahead.
     """
 
     command_hz: float = 0.0
     timeout_s: float = 0.2
     silence_s: float = 0.5
+    namespace: str = ""
+    scan_frame: str = "base_scan"
+
+    def in_namespace(self, topic: str) -> str:
+        """Return a topic's full name."""
+        return f"/{self.namespace.strip('/')}{topic}" if self.namespace.strip("/") else topic
 
     def __post_init__(self) -> None:
         super().__post_init__()

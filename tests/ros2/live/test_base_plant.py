@@ -150,6 +150,13 @@ def test_another_node_that_commands_the_robot_is_named(robot: Peer, plant: BaseP
         until(lambda: [plant.read(reading()), False][1], "it is noticed")
 
 
+def test_a_namespace_and_another_scanner(domain: int) -> None:
+    plant = make(domain, namespace="tb3_1", scan_frame="laser")  # type: ignore[arg-type]
+    assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
+    assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
+    assert plant.link.spec.inputs[1].frame == "laser"
+
+
 def test_a_network_with_nobody_is_named(domain: int) -> None:
     plant = make(domain)
     with pytest.raises(RealtimeError, match=r"Nobody publishes /joint_states .*No node publishes anything"):
