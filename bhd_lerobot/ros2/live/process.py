@@ -26,7 +26,7 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 from bhd_lerobot.ros2.messages.images import decode_image
 
 _WAIT_S = 0.02
-_CHECK_NS = 1_000_000_000  # between two looks at who else is there
+_CHECK_NS = 500_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
 _TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
@@ -224,6 +224,8 @@ class Receiver:
         }
         # One that has just appeared may not have told its name yet, and may be the guard.
         self._intruders, self._others = now & self._others, now
+        self._channel.words[Word.OTHERS] = len(self._intruders)
+        self._channel.words[Word.CHECKS] += 1
         if not self._intruders:
             return ""
         return (

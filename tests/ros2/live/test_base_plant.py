@@ -157,6 +157,16 @@ def test_a_namespace_and_another_scanner(domain: int) -> None:
     assert plant.link.spec.inputs[1].frame == "laser"
 
 
+def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant: BasePlant, domain: int) -> None:
+    second = make(domain)
+    with pytest.raises(
+        RealtimeError, match=f"Another program of this machine commands /cmd_vel in ROS domain {domain}"
+    ):
+        second.open()
+    drive(plant, lambda: moves(robot), "the robot moves")
+    plant.read(reading())
+
+
 def test_a_network_with_nobody_is_named(domain: int) -> None:
     plant = make(domain)
     with pytest.raises(RealtimeError, match=r"Nobody publishes /joint_states .*No node publishes anything"):
