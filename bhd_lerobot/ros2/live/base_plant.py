@@ -115,7 +115,13 @@ class BasePlant(Ros2Plant):
         node_silence = max(_NODE_SILENCE_S, config.ros2.silence_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
-            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), silence_s=node_silence),
+            InputSpec(
+                "/joint_states",
+                JOINT_STATE,
+                WheelReader(body.drive.wheel_radius),
+                silence_s=node_silence,
+                has_one_source=True,
+            ),
             InputSpec(
                 "/scan",
                 ScanPart.msgtype,
@@ -123,6 +129,7 @@ class BasePlant(Ros2Plant):
                 SENSOR_DATA,
                 max(_SCAN_SILENCE_S, config.ros2.silence_s),
                 config.ros2.scan_frame,
+                has_one_source=True,
             ),
         ]
         if config.imu:

@@ -167,6 +167,14 @@ def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant:
     plant.read(reading())
 
 
+def test_two_robots_of_one_name_are_named(robot: Peer, plant: BasePlant, domain: int) -> None:
+    with (
+        Peer("standin_turtlebot3.py", domain=domain),
+        pytest.raises(RealtimeError, match=r"Several nodes send /(joint_states|scan) at a time: .*two robots"),
+    ):
+        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
+
 def test_a_network_with_nobody_is_named(domain: int) -> None:
     plant = make(domain)
     with pytest.raises(RealtimeError, match=r"Nobody publishes /joint_states .*No node publishes anything"):
