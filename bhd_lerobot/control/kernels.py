@@ -15,8 +15,10 @@ import numpy as np
 class Kernel[**P, R]:
     """A function of numbers and arrays; other kernels may call it.
 
+    Called as it is, it runs as plain Python.
+
     Args:
-        function: the function. Called through this object, it runs as plain Python.
+        function: the function.
         signature: the types of its arguments, in numba's words; empty for what only other kernels call.
     """
 
@@ -24,7 +26,7 @@ class Kernel[**P, R]:
         self.function, self.signature = function, signature
         update_wrapper(self, function)
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:  # noqa: D102
         return self.function(*args, **kwargs)
 
     @cached_property

@@ -27,8 +27,8 @@ Counts = NDArray[np.int64]
 
 
 @kernel(
-    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[::1], i8[::1], b1[::1], i8[::1], f8, f8, f8, "
-    "f8, f8, i8, i8, f8[:,::1], f8[:,::1], f8[:,::1], i8)"
+    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[::1], i8[::1], b1[::1], i8[::1], "
+    "f8, f8, f8, f8, f8, i8, i8, f8[:,::1], f8[:,::1], f8[:,::1], i8)"
 )
 def drive_wheels(
     command: Array,
@@ -137,7 +137,9 @@ class BaseController(Controller):
         self._target, self._before, self._rate = np.zeros((3, n, width))
         self._hard = np.zeros(n, np.bool_)  # brakes as hard as it can
         self._limited_velocity, self._limited_change = np.zeros((2, n, width), np.bool_)
-        self._not_finite, self._limited_wheels, self._limited_effort, self._limited_clearance = np.zeros((4, n), np.bool_)
+        self._not_finite, self._limited_wheels, self._limited_effort, self._limited_clearance = np.zeros(
+            (4, n), np.bool_
+        )
         # Of the wheels since the last look at their progress: how far they were to turn, and where they were.
         self._period = max(1, round(body.stalled_s / _STALL_CHECKS * control_hz))
         # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
