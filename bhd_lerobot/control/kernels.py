@@ -34,20 +34,21 @@ class Kernel[**P, R]:
         """The machine code, compiled at the first access, or loaded from the user's cache; it takes no other types."""
         import numba
 
-        if numba.config.DISABLE_JIT:
+        config: Any = numba.config
+        if config.DISABLE_JIT:
             return self.function
         if not self.signature:
             return numba.njit(error_model="numpy")(self.function)
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
             return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
         except OSError:  # a full disk: compiled again at the next start
             return numba.njit(self.signature, error_model="numpy")(self.function)
         finally:
-            numba.config.CACHE_DIR = before
+            config.CACHE_DIR = before
 
     @property
     def _numba_type_(self) -> Any:

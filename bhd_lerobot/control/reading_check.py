@@ -113,8 +113,8 @@ class ReadingCheck:
             self._names, speed = body.drive.joints, np.full(2, body.drive.max_wheel_speed)
         speed = _FASTER * speed / NANOSECONDS  # [rad/ns]
         self._near = np.full((n, len(speed)), np.nan)  # follows the positions no faster than joints can turn
-        self._elapsed, self._now, self._wrong = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_)
-        self._beyond = np.zeros_like(self._near)
+        self._elapsed, self._stamp = np.zeros((2, n), np.int64)
+        self._wrong, self._beyond = np.zeros(n, np.bool_), np.zeros_like(self._near)
         self._follow = partial(
             follow_positions.compiled,
             self._near,
@@ -138,11 +138,8 @@ class ReadingCheck:
 
         None if there are none. Their positions in `reading` become the last that were measurements.
         """
-        stamp_ns = reading.stamp_ns
-        if stamp_ns is None:
-            stamp_ns = self._now
-            stamp_ns.fill(now_ns)
-        if not self._follow(reading.position, stamp_ns, reading.safety):
+        self._stamp[:] = now_ns if reading.stamp_ns is None else reading.stamp_ns
+        if not self._follow(reading.position, self._stamp, reading.safety):
             return None
         if np.count_nonzero(self._beyond) and not self.problem:
             sim, joint = (int(index) for index in np.argwhere(self._beyond)[0])

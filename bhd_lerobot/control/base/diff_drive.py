@@ -1,7 +1,5 @@
 """Twist to wheel speeds and back, and odometry, for a base with two driven wheels on one axis."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,8 +28,8 @@ def integrate(
         encoder[sim, 0], encoder[sim, 1] = left, right
         distance, turn = (moved_left + moved_right) * per_count, (moved_right - moved_left) * yaw_per_count
         heading = turn * 0.5 + odometry[sim, 2]
-        odometry[sim, 0] += math.cos(heading) * distance
-        odometry[sim, 1] += math.sin(heading) * distance
+        odometry[sim, 0] += np.cos(heading) * distance
+        odometry[sim, 1] += np.sin(heading) * distance
         odometry[sim, 2] += turn
 
 
