@@ -99,7 +99,7 @@ class WireLimits:
 
 
 @kernel("b1(f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,:], f8[:,:], f8, b1)")
-def check_commands(
+def check_commands(  # noqa: PLR0917
     written: Array,
     rate: Array,
     unsafe: NDArray[np.bool_],
@@ -112,11 +112,7 @@ def check_commands(
     ticks: float,
     is_sparse: bool,
 ) -> bool:
-    """Take safe commands over into `written`; let those of other robots continue from the last, at a falling speed.
-
-    Returns:
-        Whether any robot's command was not safe.
-    """
+    """Take safe commands over into `written`; let others continue from there, at a falling speed. Return if any do."""
     any_unsafe = False
     for sim in range(len(written)):
         unsafe[sim] = False

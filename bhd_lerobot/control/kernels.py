@@ -45,7 +45,7 @@ class Kernel[**P, R]:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
             return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
-        except OSError:  # a full disk: compiled again at the next start
+        except Exception:  # a full disk, or a damaged file: compiled at every start
             return numba.njit(self.signature, error_model="numpy")(self.function)
         finally:
             config.CACHE_DIR = before

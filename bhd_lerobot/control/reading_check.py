@@ -26,7 +26,7 @@ _TURN = 2 * math.pi
     "b1(f8[:,::1], f8[:,::1], i8[::1], i8[::1], b1[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], i8[::1], "
     "i1[::1])"
 )
-def follow_positions(
+def follow_positions(  # noqa: PLR0917
     near: Array,
     last: Array,
     time_ns: Times,
@@ -40,24 +40,9 @@ def follow_positions(
     stamp_ns: Times,
     safety: NDArray[np.int8],
 ) -> bool:
-    """Follow positions no faster than joints can turn, and put the last measurements in the place of wrong ones.
+    """Follow positions no faster than joints can turn; return whether any robot's are `wrong`.
 
-    Args:
-        near: what follows the positions, shape (n, joints).
-        last: the last positions that were measurements, shape (n, joints).
-        time_ns: of the reading before, which becomes that of this one [ns], shape (n,).
-        elapsed_ns: becomes the time between them [ns], shape (n,).
-        wrong: becomes True for robots whose positions are not finite or changed too fast, shape (n,).
-        beyond: becomes the ways of those joints that changed too fast, and 0 elsewhere [rad], shape (n, joints).
-        speed: largest speeds [rad/ns], shape (joints,).
-        step: how far joints turn in a period [rad], shape (joints,).
-        slack: how far the positions may be from `near` [rad], shape (joints,).
-        position: the positions, shape (n, joints).
-        stamp_ns: when they were measured [ns], shape (n,).
-        safety: a `SafetyStatus` of each robot, shape (n,).
-
-    Returns:
-        Whether any robot's positions were wrong.
+    Those become the `last` that were measurements. `beyond` becomes the ways of joints that changed too fast, else 0.
     """
     any_wrong = False
     for sim in range(len(near)):

@@ -29,9 +29,9 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 1e-300)
 
 
 def drawn(kind: str, rng: np.random.Generator) -> Any:
-    """Return an argument of a type in numba's words, large enough for two robots with up to three values."""
+    """Return an argument of a type in numba's words, large enough for two robots with up to six values."""
     name, _, dimensions = kind.partition("[")
-    shape = (2, 3)[-1 - dimensions.count(",") :] if dimensions else ()
+    shape = (2, 6)[-1 - dimensions.count(",") :] if dimensions else ()
     if name in ("i8", "i1"):
         return rng.integers(-1, 3, shape).astype(name) if shape else int(rng.integers(-1, 2))
     if name == "b1":

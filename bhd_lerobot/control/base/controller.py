@@ -16,10 +16,10 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
-_STALL_CHECKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
+_LOOKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
 _LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
 _LEAST_TURN = 0.3  # [rad/s] by which wheels and gyroscope may differ: several times what a cheap one drifts
-_BLOCKED, _IMPLAUSIBLE = int(Watchdog.BLOCKED), int(Watchdog.PLANT)
+_BLOCKED, _IMPLAUSIBLE, _EFFORT = int(Watchdog.BLOCKED), int(Watchdog.PLANT), int(Limit.EFFORT)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,25 +27,20 @@ Counts = NDArray[np.int64]
 
 
 @kernel(
-    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[::1], i8[::1], b1[::1], i8[::1], "
-    "f8, f8, f8, f8, f8, i8, i8, f8[:,::1], f8[:,::1], f8[:,::1], i8)"
+    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[::1], i8[::1], i8[::1], f8[::1], i8, i8, "
+    "f8[:,::1], f8[:,::1], f8[:,::1], i8)"
 )
-def drive_wheels(
+def drive_wheels(  # noqa: PLR0917
     command: Array,
     wheels: Array,
     start: Array,
     asked: Array,
     turned: Array,
-    stalls: Counts,
-    contradictions: Counts,
+    looks: Counts,
     look_at: Counts,
-    limited_effort: Mask,
+    limits: Counts,
     protective_stop: Counts,
-    per_speed: float,
-    per_yaw: float,
-    yaw_per_turn: float,
-    largest_error: float,
-    hz: float,
+    numbers: Array,
     period: int,
     gyro: int,
     position: Array,
@@ -53,14 +48,19 @@ def drive_wheels(
     sensors: Array,
     ticks: int,
 ) -> None:
-    """Go from commands to wheel speeds, and each `period` compare how the wheels turned with them and a gyroscope."""
+    """Go from commands to wheel speeds, and each `period` compare how the wheels turned with them and a gyroscope.
+
+    `looks` counts, of the two wheels and the gyroscope, the looks that found them wrong, shape (n, 3).
+    """
+    per_speed, per_yaw, yaw_per_turn, largest_error, hz = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     wheels_from_twist(command, per_speed, per_yaw, wheels)
     dt, least_way = 1.0 / hz, _LEAST_SPEED * period / hz
     for sim in range(len(command)):
         protective_stop[sim] = 0
         for k in range(2):
             # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
-            limited_effort[sim] |= abs(wheels[sim, k] - velocity[sim, k]) > largest_error
+            if abs(wheels[sim, k] - velocity[sim, k]) > largest_error:
+                limits[sim] |= _EFFORT
             asked[sim, k] += wheels[sim, k]
         if gyro >= 0:
             turned[sim] += sensors[sim, gyro]
@@ -70,17 +70,17 @@ def drive_wheels(
         for k in range(2):
             way, done = asked[sim, k] * dt, position[sim, k] - start[sim, k]
             is_slow = abs(way) > least_way and (done if way > 0.0 else -done) < 0.5 * abs(way)
-            stalls[sim, k] = stalls[sim, k] + 1 if is_slow else 0
-        if max(stalls[sim, 0], stalls[sim, 1]) >= _STALL_CHECKS:
-            protective_stop[sim], stalls[sim, 0], stalls[sim, 1] = _BLOCKED, 0, 0
+            looks[sim, k] = looks[sim, k] + 1 if is_slow else 0
+        if max(looks[sim, 0], looks[sim, 1]) >= _LOOKS:
+            protective_stop[sim], looks[sim, 0], looks[sim, 1] = _BLOCKED, 0, 0
         if gyro >= 0:
             # Wheels and gyroscope that do not agree about how far the base turned: one of them lies, or slips.
             yaw = ((position[sim, 1] - start[sim, 1]) - (position[sim, 0] - start[sim, 0])) * yaw_per_turn
             apart, largest = abs(yaw - turned[sim] * dt), max(abs(yaw), abs(turned[sim] * dt))
             is_apart = apart > _LEAST_TURN * period * dt and apart > 0.5 * largest
-            contradictions[sim] = contradictions[sim] + 1 if is_apart else 0
-            if contradictions[sim] >= _STALL_CHECKS:
-                protective_stop[sim], contradictions[sim] = _IMPLAUSIBLE, 0
+            looks[sim, 2] = looks[sim, 2] + 1 if is_apart else 0
+            if looks[sim, 2] >= _LOOKS:
+                protective_stop[sim], looks[sim, 2] = _IMPLAUSIBLE, 0
         turned[sim], look_at[sim] = 0.0, ticks + period
         for k in range(2):
             asked[sim, k], start[sim, k] = 0.0, position[sim, k]
@@ -136,59 +136,25 @@ class BaseController(Controller):
             )
         self._target, self._before, self._rate = np.zeros((3, n, width))
         self._hard = np.zeros(n, np.bool_)  # brakes as hard as it can
-        self._limited_velocity, self._limited_change = np.zeros((2, n, width), np.bool_)
-        self._not_finite, self._limited_wheels, self._limited_effort, self._limited_clearance = np.zeros(
-            (4, n), np.bool_
-        )
-        # Of the wheels since the last look at their progress: how far they were to turn, and where they were.
-        self._period = max(1, round(body.stalled_s / _STALL_CHECKS * control_hz))
-        # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
-        self._ticks, self._dt, self._look_at = 0, 1 / control_hz, np.full(n, self._period)
+        self._limits = np.zeros(n, np.int64)
+        # Of the wheels since the last look at their progress: how far they were to turn, where they were, and how far
+        # the gyroscope states that the bases turned; and looks that found otherwise.
         self._asked, self._start = np.zeros((2, n, self.joints))
-        self._stalls = np.zeros((n, self.joints), np.int64)
-        # How far the gyroscope states that the bases turned since the last look, and looks that found otherwise.
-        self._turned, self._contradictions = np.zeros(n), np.zeros(n, np.int64)
-        per_speed = 1.0 / drive.wheel_radius
-        self._limit = partial(
-            limit_command.compiled,
-            self._target,
-            self.command,
-            self._before,
-            self._rate,
-            self._hard,
-            np.zeros((n, width)),
-            np.asarray(limits.velocity),
-            np.asarray(limits.acceleration) / control_hz,
-            np.tile(np.asarray(limits.stop_deceleration) / control_hz, (n, 1)),
-            np.asarray(limits.jerk) / control_hz**2,
-            per_speed,
-            per_yaw,
-            drive.max_wheel_speed,
-            self._not_finite,
-            self._limited_velocity,
-            self._limited_change,
-            self._limited_wheels,
-        )
-        self._drive_wheels = partial(
-            drive_wheels.compiled,
-            self.command,
-            self._wheel_speeds,
-            self._start,
-            self._asked,
-            self._turned,
-            self._stalls,
-            self._contradictions,
-            self._look_at,
-            self._limited_effort,
-            self.protective_stop,
-            per_speed,
-            per_yaw,
-            drive.wheel_radius / drive.wheel_separation,
-            drive.max_torque / drive.servo_gain,
-            float(control_hz),
-            self._period,
-            -1 if gyro is None else gyro,
-        )
+        self._turned, self._looks = np.zeros(n), np.zeros((n, 3), np.int64)
+        # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
+        self._ticks, self._dt = 0, 1 / control_hz
+        self._period = max(1, round(body.stalled_s / _LOOKS * control_hz))
+        self._look_at = np.full(n, self._period)
+        wheels = 1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed
+        turn, error = drive.wheel_radius / drive.wheel_separation, drive.max_torque / drive.servo_gain
+        change = np.array([limits.acceleration, limits.stop_deceleration]) / control_hz
+        jerk = np.asarray(limits.jerk) / control_hz**2
+        largest = np.asarray(limits.velocity), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
+        state = self._target, self.command, self._before, self._rate, self._hard, self._limits
+        self._limit = partial(limit_command.compiled, *state, *largest)
+        looks = self._start, self._asked, self._turned, self._looks, self._look_at, self._limits, self.protective_stop
+        numbers = np.array([*wheels[:2], turn, error, control_hz]), self._period, -1 if gyro is None else gyro
+        self._drive_wheels = partial(drive_wheels.compiled, self.command, self._wheel_speeds, *looks, *numbers)
 
     def set_setpoint(self, values: Array, mask: Mask) -> None:
         """Head for new twists, with the normal accelerations."""
@@ -217,7 +183,7 @@ class BaseController(Controller):
             self._watch(reading, self._monitor)
             near = self._monitor.limit(self.command, self._before, self.drive.odometry)
             if near is not None:
-                self._limited_clearance |= near.any(axis=1)
+                self._limits[near.any(axis=1)] |= Limit.CLEARANCE
                 self._rate[near] = 0.0  # the next change starts anew: such a large one could not end in time
         self._ticks += 1
         self._drive_wheels(reading.position, reading.velocity, reading.sensors, self._ticks)
@@ -240,34 +206,23 @@ class BaseController(Controller):
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start odometry here."""
-        self._stalls[ids] = self._contradictions[ids] = 0
         self._asked[ids], self._turned[ids], self._start[ids] = 0.0, 0.0, reading.position[ids]
-        self._look_at[ids] = self._ticks + self._period
+        self._looks[ids], self._look_at[ids] = 0, self._ticks + self._period
         self.drive.reset_odometry(ids, reading.position[ids])
         if self._monitor is not None:
             self._monitor.forget(ids)  # what it remembers is where odometry was before
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self._wheel_speeds, self._rate):
-            array[ids] = 0.0
-        self._hard[ids] = False
+        for array in (self.command, self._target, self._wheel_speeds, self._rate, self._hard, self._limits):
+            array[ids] = 0
         if self._monitor is not None:
             self._monitor.forget(ids)
-        for flags in self._flags():
-            flags[ids] = False
 
     def take_limits(self) -> Counts:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        limits = (
-            self._not_finite * int(Limit.NON_FINITE)
-            + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
-            + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
-            + self._limited_effort * int(Limit.EFFORT)
-            + self._limited_clearance * int(Limit.CLEARANCE)
-        )
-        for flags in self._flags():
-            flags[:] = False
+        limits = self._limits.copy()
+        self._limits[:] = 0
         return limits
 
     def efforts(self, reading: PlantReading) -> Array:
@@ -282,13 +237,3 @@ class BaseController(Controller):
     def measured(self, reading: PlantReading) -> Array:
         """Return the twist that the wheels' speeds mean, shape (n, 2)."""
         return self.drive.twist_from_wheels(reading.velocity)
-
-    def _flags(self) -> tuple[Mask, ...]:
-        return (
-            self._limited_velocity,
-            self._limited_change,
-            self._limited_wheels,
-            self._limited_effort,
-            self._not_finite,
-            self._limited_clearance,
-        )

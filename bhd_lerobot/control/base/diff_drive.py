@@ -18,7 +18,7 @@ def wheels_from_twist(twist: Array, per_speed: float, per_yaw: float, out: Array
 
 
 @kernel("void(f8[:,:], f8[:,::1], f8[:,::1], f8, f8, f8)")
-def integrate(
+def integrate(  # noqa: PLR0917
     angles: Array, encoder: Array, odometry: Array, count: float, per_count: float, yaw_per_count: float
 ) -> None:
     """Add the motion since the last update to `odometry`, and take the encoders' counts over into `encoder`."""

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.kernels import clamp, kernel, largest_change
+from bhd_lerobot.control.messages import Limit
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _ARRIVED = 1e-12  # nearer than this it is there
+_NON_FINITE, _VELOCITY, _ACCELERATION = int(Limit.NON_FINITE), int(Limit.VELOCITY), int(Limit.ACCELERATION)
 
 
 @kernel()
@@ -53,7 +55,7 @@ def limit_change(requested: Array, previous: Array, largest: Array, out: Array, 
 
 
 @kernel()
-def limit_jerk(
+def limit_jerk(  # noqa: PLR0917
     requested: Array, previous: Array, rate: Array, largest: Array, jerk: Array, out: Array, changed: Mask
 ) -> Mask:
     """Bring commands to what was requested with changes that change gradually, and arrive without overshoot.
@@ -114,70 +116,53 @@ def limit_wheel_speed(twist: Array, per_speed: float, per_yaw: float, limit: flo
 
 
 @kernel(
-    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], "
-    "f8, f8, f8, b1[::1], b1[:,::1], b1[:,::1], b1[::1])"
+    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], i8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1])"
 )
-def limit_command(
+def limit_command(  # noqa: PLR0917
     target: Array,
     command: Array,
     before: Array,
     rate: Array,
     hard: Mask,
-    clipped: Array,
+    limits: NDArray[np.int64],
     velocity: Array,
     change: Array,
     stop_change: Array,
     jerk: Array,
-    per_speed: float,
-    per_yaw: float,
-    wheel_limit: float,
-    not_finite: Mask,
-    limited_velocity: Mask,
-    limited_change: Mask,
-    limited_wheels: Mask,
+    wheels: Array,
 ) -> None:
-    """Bring commands nearer to their targets, as near as one tick may.
+    """Bring commands as near to their targets as one tick may, each of shape (n, 2); note why no nearer in `limits`.
 
-    Args:
-        target: shape (n, 2); what is not finite becomes rest.
-        command: what was applied a tick ago and becomes what is applied now, shape (n, 2).
-        before: becomes what was applied a tick ago, shape (n, 2).
-        rate: the last change, shape (n, 2); replaced by this one.
-        hard: which robots brake as hard as they can, shape (n,).
-        clipped: becomes the targets within the limits, shape (n, 2).
-        velocity: largest magnitudes, shape (2,).
-        change: largest changes in one tick, shape (2,).
-        stop_change: those of robots that brake hard, shape (n, 2).
-        jerk: largest differences of two changes, shape (2,).
-        per_speed: see `limit_wheel_speed`, as the next two.
-        per_yaw: wheel speed of a yaw rate [rad/rad].
-        wheel_limit: largest wheel speed [rad/s].
-        not_finite: set to True where a target was not finite, shape (n,).
-        limited_velocity: see `limit_velocity`.
-        limited_change: see `limit_change`.
-        limited_wheels: see `limit_wheel_speed`.
+    `before` becomes what the commands were a tick ago. `hard` are the robots that brake as hard as they can, with
+    `stop_change`, shape (n, 2). `wheels` are the three numbers of `limit_wheel_speed`.
     """
     for sim in range(len(target)):
         # Commands are checked when they are sent; a queue in shared memory is written by another process.
         if not (math.isfinite(target[sim, 0]) and math.isfinite(target[sim, 1])):
-            target[sim, 0], target[sim, 1], not_finite[sim] = 0.0, 0.0, True
+            target[sim, 0] = target[sim, 1] = 0.0
+            limits[sim] |= _NON_FINITE
         for k in range(2):
             before[sim, k] = command[sim, k]
-    limit_velocity(target, velocity, clipped, limited_velocity)
-    limit_wheel_speed(clipped, per_speed, per_yaw, wheel_limit, limited_wheels)
-    limit_jerk(clipped, before, rate, change, jerk, command, limited_change)
-    braking, held, limited = np.empty_like(command), np.zeros(command.shape, np.bool_), np.zeros(len(hard), np.bool_)
+    clipped, braking = np.empty_like(target), np.empty_like(target)
+    too_fast, turning = np.zeros(target.shape, np.bool_), np.zeros(len(hard), np.bool_)
+    too_sudden, held, limited = too_fast.copy(), too_fast.copy(), turning.copy()
+    limit_velocity(target, velocity, clipped, too_fast)
+    limit_wheel_speed(clipped, wheels[0], wheels[1], wheels[2], turning)
+    limit_jerk(clipped, before, rate, change, jerk, command, too_sudden)
     limit_change(clipped, before, stop_change, braking, held)
     for sim in range(len(target)):
         for k in range(2):
             if hard[sim]:
                 command[sim, k] = braking[sim, k]
-                limited_change[sim, k] |= held[sim, k]
+                too_sudden[sim, k] |= held[sim, k]
     # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions change at
     # different rates.
-    limit_wheel_speed(command, per_speed, per_yaw, wheel_limit, limited)
+    limit_wheel_speed(command, wheels[0], wheels[1], wheels[2], limited)
     for sim in range(len(target)):
-        limited_wheels[sim] |= limited[sim]
         for k in range(2):
             if hard[sim] or limited[sim]:
                 rate[sim, k] = command[sim, k] - before[sim, k]
+            if too_fast[sim, k] or turning[sim] or limited[sim]:
+                limits[sim] |= _VELOCITY
+            if too_sudden[sim, k]:
+                limits[sim] |= _ACCELERATION

@@ -137,7 +137,7 @@ class GoalManager:
         """Plan with something in an arm's gripper from now on; with nothing if None."""
         self._held[sim] = held
 
-    def stop(
+    def stop(  # noqa: PLR0917  the reference is three arrays
         self,
         mask: NDArray[np.bool_],
         code: ResultCode,

@@ -32,7 +32,7 @@ class Planning(Protocol):
     lead: int
     timeout: int
 
-    def request(
+    def request(  # noqa: PLR0917
         self,
         sim: int,
         command: BrainCommand,
@@ -70,7 +70,7 @@ class InlinePlanning:
         self._planner = planner
         self._answers: dict[int, Plan | PlanFailure] = {}
 
-    def request(
+    def request(  # noqa: PLR0917
         self,
         sim: int,
         command: BrainCommand,
@@ -150,7 +150,7 @@ class PlanOrders:
             self._orders[sim] = None
             self._planning.drop(sim)
 
-    def ask(
+    def ask(  # noqa: PLR0917
         self,
         sim: int,
         command: BrainCommand,
@@ -191,7 +191,7 @@ class PlanOrders:
         self._order(sim, command, 2 * order.lead, ahead, opening, held)
         return None
 
-    def _order(
+    def _order(  # noqa: PLR0917
         self,
         sim: int,
         command: BrainCommand,
