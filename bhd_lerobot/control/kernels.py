@@ -41,7 +41,7 @@ class Kernel[**P, R]:
             return numba.njit(error_model="numpy")(self.function)
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
-            _announce()
+            print(f"Compiling {self.function.__name__} for this processor: some seconds, once", file=sys.stderr)
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
             return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
@@ -77,11 +77,6 @@ def _folder() -> Path | None:
     except (OSError, RuntimeError):
         return None
     return folder
-
-
-@cache
-def _announce() -> None:
-    print("Compiling the control loops for this processor, which takes some seconds once", file=sys.stderr, flush=True)
 
 
 @kernel()

@@ -1,4 +1,8 @@
-"""From what was requested to what is applied, with the reasons. No clock, no plant; see `control.kernels`."""
+"""From what was requested to what is applied, with the reasons. No clock, no plant.
+
+Commands, their changes and what is said of them have shape (n, width), limits (width,). `out` may be `previous` and not
+`requested`. `changed` becomes True where a value was held back, and is left alone elsewhere.
+"""
 
 import math
 
@@ -17,14 +21,7 @@ _NON_FINITE, _VELOCITY, _ACCELERATION = int(Limit.NON_FINITE), int(Limit.VELOCIT
 
 @kernel()
 def limit_velocity(requested: Array, limit: Array, out: Array, changed: Mask) -> None:
-    """Clip commands to the velocity limits.
-
-    Args:
-        requested: shape (n, width).
-        limit: largest magnitudes, shape (width,).
-        out: where the result goes, shape (n, width).
-        changed: set to True where a value was clipped and left alone elsewhere, shape (n, width).
-    """
+    """Clip commands to their largest magnitudes."""
     for sim in range(len(requested)):
         for k in range(len(limit)):
             out[sim, k] = clamp(requested[sim, k], -limit[k], limit[k])
@@ -33,14 +30,10 @@ def limit_velocity(requested: Array, limit: Array, out: Array, changed: Mask) ->
 
 @kernel()
 def limit_change(requested: Array, previous: Array, largest: Array, out: Array, changed: Mask) -> bool:
-    """Keep commands within the largest change from the previous ones, which is the acceleration limit.
+    """Keep commands within the largest change from the previous ones, shape (n, width): the acceleration limit.
 
-    Args:
-        requested: shape (n, width).
-        previous: what was applied a tick ago, shape (n, width).
-        largest: largest change in one tick, shape (n, width).
-        out: where the result goes, shape (n, width); may be `previous`, may not be `requested`.
-        changed: set to True where a value was held back and left alone elsewhere, shape (n, width).
+    Returns:
+        Whether all are what was requested.
     """
     arrived = True
     for sim in range(len(requested)):
@@ -63,15 +56,7 @@ def limit_jerk(  # noqa: PLR0917
     The change of each tick is the largest from which the changes can still fall, by `jerk` from tick to tick, so that
     their sum ends at what was requested.
 
-    Args:
-        requested: shape (n, width).
-        previous: what was applied a tick ago, shape (n, width).
-        rate: the last change, shape (n, width); replaced by this one.
-        largest: largest change in one tick, shape (width,).
-        jerk: largest difference of two changes, shape (width,).
-        out: where the result goes, shape (n, width); may be `previous`, may not be `requested`.
-        changed: set to True where `largest` alone would have held a value back, and left alone elsewhere, shape (n,
-            width).
+    `rate` is the last change and becomes this one. `changed` is set where `largest` alone would have held a value back.
 
     Returns:
         Which values arrived at what was requested, and rest there, shape (n, width).
