@@ -11,6 +11,7 @@ from lerobot.robots.config import RobotConfig
 
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
+import bhd_lerobot.ros2.live.config_robot
 import bhd_lerobot.tasks.avoid
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
@@ -32,6 +33,7 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
+from bhd_lerobot.policies.topic.brain import TopicBrain
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.names import names_of_robot
 from bhd_lerobot.tasks.free import FreeConfig
@@ -87,7 +89,7 @@ ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
 
 _CLASSES: tuple[Any, ...] = (
     *(AvoidanceBrain, _Blanked, _Dagger, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain, NoopBrain),
-    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain),
+    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain, TopicBrain),
 )
 BRAINS: Registry[Any] = Registry("brain", {brain.name: brain for brain in _CLASSES}, BrainConfig)
 """The classes of the brains, by name."""

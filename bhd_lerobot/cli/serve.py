@@ -3,13 +3,13 @@
 import sys
 from collections.abc import Sequence
 
-from lerobot.robots.utils import make_robot_from_config
 from rich.console import Console
 
 import bhd_lerobot.registry  # noqa: F401 - its robots can be named
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
+from bhd_lerobot.stock import make_robot_from_config
 
 
 def _serve(config: ServeConfig) -> None:

@@ -130,8 +130,14 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
-        """Return what a command line asks for; end with status 2 if it has what is not known."""
+        """Return what a command line asks for; end with status 2 if it has what is not known.
+
+        Of a command whose default `entries_of` is the name of an option, what begins with ``--NAME.`` is in `entries`.
+        """
         options, unknown = self.parse_known_args(arguments)
+        if entries_of := getattr(options, "entries_of", ""):
+            options.entries = [argument for argument in unknown if argument.startswith(f"--{entries_of}.")]
+            unknown = [argument for argument in unknown if argument not in options.entries]
         if unknown:
             command: argparse.ArgumentParser = getattr(options, "command_parser", self)
             if not unknown[0].startswith("-"):

@@ -15,6 +15,7 @@ __all__ = [
     "pixels",
     "start_pose",
     "teleop",
+    "topic",
     "trained",
     "trained_steps",
 ]

@@ -12,6 +12,7 @@ from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
+from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.recording.live_view import check_options
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
@@ -181,9 +182,10 @@ class RecordConfig:
                 raise ConfigError("Nothing drives the robot; set --brain.type, or --teleop.type for a person.")
             self.brain, self.teleop, self.map, self.processor = person, None, {}, ""
         check_brain("brain", self.brain, self.robot)
-        if (self.teleop is not None or isinstance(self.brain, TeleopConfig)) and not self.is_live:
+        if (self.teleop is not None or isinstance(self.brain, TeleopConfig | TopicConfig)) and not self.is_live:
+            who = "Another node" if isinstance(self.brain, TopicConfig) else "A person"
             raise ConfigError(
-                "A person drives on the wall clock, and robot.clock is 'lockstep', on which time advances as fast as "
+                f"{who} drives on the wall clock, and robot.clock is 'lockstep', on which time advances as fast as "
                 "this machine can simulate. Add --robot.clock=realtime."
             )
 

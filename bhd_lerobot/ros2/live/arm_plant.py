@@ -85,7 +85,9 @@ class ArmPlant(Ros2Plant):
         self._count = len(joints)
         self._opening = body.home[-1]
         inputs = (
-            InputSpec("/joint_states", JOINT_STATE, JointReader(joints), silence_s=_SILENCE_S),
+            InputSpec(
+                "/joint_states", JOINT_STATE, JointReader(joints), silence_s=max(_SILENCE_S, config.ros2.silence_s)
+            ),
             InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), silence_s=_FOREVER),
             InputSpec(ur.SAFETY_TOPIC, ur.SAFETY_MODE, NumberReader("mode"), LATCHED, silence_s=_FOREVER),
         )

@@ -3,47 +3,24 @@
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError, unknown_name
+from bhd_lerobot.ros2.live.base_plant import ScanReader
+from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.live.link import NodeLink
-from bhd_lerobot.ros2.live.network import SENSOR_DATA, Ros2Config
+from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import CameraSpec, InputSpec, NodeSpec, OutputSpec
-from bhd_lerobot.ros2.messages.mapping import MappingConfig, TopicFields, topics_of
+from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, features_of, topics_of
 
 _COMMAND_HZ = 50.0
-
-
-@RobotConfig.register_subclass("ros2")
-@dataclass(kw_only=True)
-class Ros2RobotConfig(RobotConfig):
-    """Configuration of the robot type ``ros2``: any robot on a ROS 2 network.
-
-    Attributes:
-        mapping: YAML file that says which field of which topic is which feature, see "Use ROS 2".
-        ros2: the network.
-        stop: values of actions that stop the robot, sent when no action comes for `ros2.timeout_s`; by default 0 for
-            the topics whose actions all are speeds (``.vel``), and nothing for the others, which hold their positions.
-        topic_timeout_s: a topic that sends nothing for so long is a fault [s].
-    """
-
-    mapping: str
-    ros2: Ros2Config = field(default_factory=Ros2Config)
-    stop: dict[str, float] = field(default_factory=dict)
-    topic_timeout_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.topic_timeout_s < float("inf"):
-            raise ConfigError(f"robot.topic_timeout_s is {self.topic_timeout_s}; it is positive and finite.")
 
 
 class Ros2Robot(Robot):
@@ -69,19 +46,20 @@ class Ros2Robot(Robot):
         super().__init__(config)
         self.config = config
         mapping = self._mapping = MappingConfig.load(config.mapping)
+        if sizeless := [name for name, one in mapping.images.items() if not (one.width and one.height)]:
+            raise ConfigError(
+                f"{config.mapping}: images.{sizeless[0]} has no width and height [px]; a live camera needs both."
+            )
         if unknown := [name for name in config.stop if name not in mapping.action]:
             raise ConfigError(unknown_name("action in robot.stop", unknown[0], mapping.action))
-        self._observed = topics_of(mapping.observation, mapping.types)
+        self._names, self._actions = features_of(mapping.observation), tuple(mapping.action)
+        inputs, self._places = self._inputs(mapping)
         self._acted = topics_of(mapping.action, mapping.types)
-        self._names, self._actions = tuple(mapping.observation), tuple(mapping.action)
         self._link = NodeLink(
             NodeSpec(
                 f"bhd_{os.getpid()}",
                 config.ros2,
-                tuple(
-                    InputSpec(one.topic, one.msgtype, one, SENSOR_DATA, config.topic_timeout_s)
-                    for one in self._observed
-                ),
+                inputs,
                 tuple(OutputSpec(one.topic, one.msgtype, one, stop=self._stop_of(one)) for one in self._acted),
                 tuple(
                     CameraSpec(name, one.topic, one.type, one.width, one.height, silence_s=config.topic_timeout_s)
@@ -94,6 +72,21 @@ class Ros2Robot(Robot):
         self.cameras = {name: Ros2Camera(self._link, index) for index, name in enumerate(mapping.images)}
         self.state_timestamp = 0.0
         self._is_connected = False
+
+    def _inputs(self, mapping: MappingConfig) -> tuple[tuple[InputSpec, ...], list[list[int]]]:
+        """Return what is received, and where its numbers are in the observation."""
+        found, places = [], []
+        numbers = {name: one for name, one in mapping.observation.items() if not one.beams}
+        for topic in topics_of(numbers, mapping.types):
+            found.append(InputSpec(topic.topic, topic.msgtype, topic, SENSOR_DATA, self.config.topic_timeout_s))
+            places.append([self._names.index(list(numbers)[column]) for column in topic.columns])
+        for name, one in mapping.observation.items():
+            if one.beams:
+                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
+                reader = ScanReader(one.topic, lidar, one.beams)
+                found.append(InputSpec(one.topic, SCAN, reader, SENSOR_DATA, self.config.topic_timeout_s))
+                places.append([self._names.index(feature) for feature in one.names(name)])
+        return tuple(found), places
 
     def _stop_of(self, topic: TopicFields) -> tuple[float, ...] | None:
         names = [self._actions[column] for column in topic.columns]
@@ -150,8 +143,8 @@ class Ros2Robot(Robot):
         """
         state = self._state()
         values = np.empty(len(self._names))
-        for topic, part in zip(self._observed, self._link.spec.columns, strict=True):
-            values[list(topic.columns)] = state["values"][part]
+        for place, part in zip(self._places, self._link.spec.columns, strict=True):
+            values[place] = state["values"][part]
         measured = state["measured_ns"]
         self.state_timestamp = (int(measured.min()) if len(measured) else time.monotonic_ns()) / 1e9
         observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))

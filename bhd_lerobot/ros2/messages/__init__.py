@@ -3,10 +3,12 @@
 __all__ = [
     "arm",
     "base",
+    "definitions",
     "fields",
     "images",
     "mapping",
     "parts",
+    "presets",
     "robot_views",
     "scan",
     "serialize",

@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, override
 
-import numpy as np
-
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.messages.parts import WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.ros2.messages.parts import Array, FieldsPart, Frames, Part, header
 from bhd_lerobot.ros2.messages.serialize import encode
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
@@ -39,30 +37,9 @@ class JointsPart(Part):
         return self.table([[*message.position, *(message.velocity if with_speeds else ())] for message in messages])
 
 
-class PosePart(Part):
+class PosePart(FieldsPart):
     """The pose of the tool in the base frame. Our quaternions are w, x, y, z; ROS's fields have names."""
 
     msgtype = "geometry_msgs/msg/PoseStamped"
-
-    @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        fields = {"header": header(frames.stamps, ARM_FRAME), "pose": pose_tree(values)}
-        return encode(self.msgtype, fields, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return np.concatenate(
-            [
-                numbers([message.pose.position for message in messages], XYZ),
-                numbers([message.pose.orientation for message in messages], WXYZ),
-            ],
-            axis=1,
-        )
-
-
-def pose_tree(values: Array) -> dict[str, Any]:
-    """Return `geometry_msgs/msg/Pose` of positions and quaternions wxyz, shape (n, 7)."""
-    return {
-        "position": dict(zip(XYZ, values[:, :3].T, strict=True)),
-        "orientation": dict(zip(WXYZ, values[:, 3:].T, strict=True)),
-    }
+    fields = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "wxyz"))
+    frame = ARM_FRAME

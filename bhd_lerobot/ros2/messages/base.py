@@ -1,5 +1,6 @@
 """The messages of a base with a scanner: LaserScan, Odometry, Imu, TwistStamped and Twist."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, override
@@ -7,7 +8,7 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.ros2.messages.parts import NANO, WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.ros2.messages.parts import NANO, Array, FieldsPart, Frames, Part, header
 from bhd_lerobot.ros2.messages.serialize import encode
 
 TWIST = ("x.vel", "theta.vel")
@@ -36,33 +37,19 @@ class BaseNoise:
     gyro: float
 
 
-class TwistPart(Part):
+class TwistPart(FieldsPart):
     """A command of a base."""
 
     msgtype = "geometry_msgs/msg/TwistStamped"
-
-    @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        fields: dict[str, Any] = {"twist": twist_tree(values)}
-        return encode(self.msgtype, {"header": header(frames.stamps, FOOTPRINT_FRAME), **fields}, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return twists([message.twist for message in messages])
+    fields = ("twist.linear.x", "twist.angular.z")
+    frame = FOOTPRINT_FRAME
 
 
-class BareTwistPart(Part):
+class BareTwistPart(FieldsPart):
     """A command of a base, without a stamp: what ROS 2 Humble's robots take."""
 
     msgtype = "geometry_msgs/msg/Twist"
-
-    @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        return encode(self.msgtype, twist_tree(values), len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return twists(messages)
+    fields = ("linear.x", "angular.z")
 
 
 def twists(messages: Sequence[Any]) -> Array:
@@ -136,21 +123,29 @@ def odometry(messages: Sequence[Any]) -> tuple[Array, Array]:
     The yaw of a quaternion that was never set, all zeros, is not a number.
     """
     poses = [message.pose.pose for message in messages]
-    w, x, y, z = numbers([pose.orientation for pose in poses], WXYZ).T
-    flat = (x == 0) & (y == 0)
-    # Half the angle is precise also where a yaw of exactly zero, or one with its sign, has to come back.
-    yaw = np.where(flat, 2 * np.arctan2(z, w), np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    yaw[(w == 0) & flat & (z == 0)] = np.nan
-    place = numbers([pose.position for pose in poses], XYZ)
-    return twists([message.twist.twist for message in messages]), np.stack([*place[:, :2].T, _unwrapped(yaw)], axis=1)
+    yaw = np.array([yaw_of(one.w, one.x, one.y, one.z) for one in (pose.orientation for pose in poses)])
+    place = np.array([(pose.position.x, pose.position.y) for pose in poses], np.float64).reshape(-1, 2)
+    return twists([message.twist.twist for message in messages]), np.stack([*place.T, unwrapped(yaw)], axis=1)
 
 
-def _unwrapped(yaw: Array) -> Array:
+def yaw_of(w: float, x: float, y: float, z: float) -> float:
+    """Return the yaw of a unit quaternion [rad]; that of one that was never set, all zeros, is not a number."""
+    if x == y == 0:  # half the angle is precise also where a yaw of zero, or one with its sign, has to come back
+        return 2 * math.atan2(z, w) if w or z else math.nan
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def unwrapped(yaw: Array, turn: float = 2 * np.pi) -> Array:
+    """Return angles without jumps by whole turns, shape (n,); those that are not finite stay.
+
+    Args:
+        turn: a whole one, in the angles' unit.
+    """
     finite = np.isfinite(yaw)
     result = yaw.copy()
     # An angle is changed by whole turns only: what needs none stays as it is, to the last bit.
-    turns = np.round((np.unwrap(yaw[finite]) - yaw[finite]) / (2 * np.pi))
-    result[finite] = np.where(turns == 0, yaw[finite], yaw[finite] + turns * 2 * np.pi)
+    turns = np.round((np.unwrap(yaw[finite], period=turn) - yaw[finite]) / turn)
+    result[finite] = np.where(turns == 0, yaw[finite], yaw[finite] + turns * turn)
     return result
 
 
@@ -159,7 +154,7 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class GyroPart(Part):
+class GyroPart(FieldsPart):
     """A gyroscope; orientation and acceleration are marked as unknown, as ROS specifies.
 
     Attributes:
@@ -169,24 +164,21 @@ class GyroPart(Part):
     noise: BaseNoise | None = None
 
     msgtype = "sensor_msgs/msg/Imu"
+    fields = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
+    frame = IMU_FRAME
 
     @override
-    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+    def rest(self) -> dict[str, Any]:
         unknown = np.array([-1.0, *[0.0] * 8])
-        fields = {
-            "header": header(frames.stamps, IMU_FRAME),
+        known = (
+            {} if self.noise is None else {"angular_velocity_covariance": np.eye(3).reshape(-1) * self.noise.gyro**2}
+        )
+        return {
             "orientation": {"w": 1.0},
             "orientation_covariance": unknown,
-            "angular_velocity": dict(zip(XYZ, values.T, strict=True)),
             "linear_acceleration_covariance": unknown,
+            **known,
         }
-        if self.noise is not None:
-            fields["angular_velocity_covariance"] = np.eye(3).reshape(-1) * self.noise.gyro**2
-        return encode(self.msgtype, fields, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return numbers([message.angular_velocity for message in messages], XYZ)
 
 
 @dataclass(frozen=True)

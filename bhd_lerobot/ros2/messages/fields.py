@@ -81,12 +81,17 @@ class Field:
         return message
 
     def put(self, tree: dict[str, Any], value: float | NDArray[np.float64]) -> None:
-        """Set the value in a tree of fields of one message, as `encode` takes it; other elements of an array are 0."""
+        """Set the value in a tree of fields, as `encode` takes it; other elements of an array are 0.
+
+        Args:
+            value: of one message, or where it is a number, of n messages, shape (n,).
+        """
         *path, last = self._resolved[0]
         for step in path:
             tree = _child(tree, step)
+        values = np.atleast_1d(np.asarray(value, np.float64))
         if last.index is None and not last.key:
-            tree[last.name] = np.asarray(value, np.float64)[None] if self.kind == "array" else np.array([value])
+            tree[last.name] = values[None] if self.kind == "array" else values
             return
         place = last.index
         if place is None:
@@ -94,10 +99,10 @@ class Field:
             if last.value not in names:
                 names.append(last.value)
             place = names.index(last.value)
-        numbers = tree.get(last.name, np.zeros((1, 0)))
-        grown = np.zeros((1, max(place + 1, numbers.shape[1])))
+        numbers = tree.get(last.name, np.zeros((len(values), 0)))
+        grown = np.zeros((len(values), max(place + 1, numbers.shape[1])))
         grown[:, : numbers.shape[1]] = numbers
-        grown[0, place] = value
+        grown[:, place] = values
         tree[last.name] = grown
 
     @cached_property

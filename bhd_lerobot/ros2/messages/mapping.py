@@ -9,7 +9,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError, as_text, unknown_name
+from bhd_lerobot.errors import ConfigError, DatasetError, as_text, unknown_name
+from bhd_lerobot.ros2.messages.base import yaw_of
+from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -18,6 +20,7 @@ from bhd_lerobot.ros2.messages.types import type_store
 QUATERNION = "geometry_msgs/msg/Quaternion"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 HEADER = "std_msgs/msg/Header"
+SCAN = "sensor_msgs/msg/LaserScan"
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,9 @@ class FieldConfig:
         field: in a message, see `Field`. A quaternion is read as its yaw [rad].
         scale: the feature is the field times this, plus `offset`; an action is taken back by the inverse.
         offset: see `scale`.
+        beams: of a LaserScan, how many features it becomes: ``NAME_000.pos`` … [m], the first straight ahead,
+            counter-clockwise. 0 for one feature.
+        range_min, range_max: of these features [m]; no return is `range_max`.
     """
 
     topic: str
@@ -37,10 +43,26 @@ class FieldConfig:
     field: str = ""
     scale: float = 1.0
     offset: float = 0.0
+    beams: int = 0
+    range_min: float = 0.0
+    range_max: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite([self.scale, self.offset]).all() and self.scale):
             raise ConfigError(f"scale is {self.scale}, offset {self.offset}; they are finite, and scale is not 0.")
+        if not self.beams:
+            return
+        is_scan = self.type == SCAN and self.field in ("", "ranges")
+        if not is_scan or not isinstance(self.beams, int) or self.beams < 0:
+            raise ConfigError(f"beams is {self.beams!r}; it is a whole number, of the ranges of a {SCAN}.")
+        if not 0 <= self.range_min < self.range_max < np.inf:
+            raise ConfigError(
+                f"range_min is {self.range_min}, range_max {self.range_max}; beams need both, and the second is larger."
+            )
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the features of an entry of this name."""
+        return tuple(f"{name}_{beam:03d}.pos" for beam in range(self.beams)) if self.beams else (name,)
 
 
 @dataclass(frozen=True)
@@ -50,12 +72,12 @@ class ImageConfig:
     Attributes:
         topic: its topic.
         type: of the topic's messages, ``sensor_msgs/msg/CompressedImage`` or ``sensor_msgs/msg/Image``.
-        width, height: of an image [px].
+        width, height: of an image [px]; 0 for those of the first image of a bag.
     """
 
     topic: str
-    width: int
-    height: int
+    width: int = 0
+    height: int = 0
     type: str = IMAGES[0]
 
     def __post_init__(self) -> None:
@@ -92,19 +114,36 @@ class MappingConfig:
             raise ConfigError(
                 f"The mapping {path} cannot be read: {as_text(error)}. In YAML a value with [ in it needs quotes."
             ) from error
+        return cls.of(tree, str(path))
+
+    @classmethod
+    def of(cls, tree: Any, where: str) -> Self:
+        """Return the mapping in nested values, as a file holds them.
+
+        Args:
+            where: they are from, for messages.
+
+        Raises:
+            ConfigError: there are other keys, or values.
+        """
         kinds: dict[str, Any] = {"observation": FieldConfig, "action": FieldConfig, "images": ImageConfig, "types": str}
         if not isinstance(tree, dict):
-            raise ConfigError(f"The mapping {path} is not a mapping of {', '.join(kinds)}.")
+            raise ConfigError(f"{where} is not a mapping of {', '.join(kinds)}.")
         parts: dict[str, dict[str, Any]] = {}
         for section, entries in tree.items():
             if section not in kinds:
-                raise ConfigError(f"{path}: {unknown_name('section', section, kinds)}")
+                raise ConfigError(f"{where}: {unknown_name('section', section, kinds)}")
             if not isinstance(entries, dict):
-                raise ConfigError(f"{path}: {section} is not a mapping of names.")
+                raise ConfigError(f"{where}: {section} is not a mapping of names.")
             parts[section] = {
-                str(name): _entry(f"{path}: {section}.{name}", kinds[section], entry) for name, entry in entries.items()
+                str(name): _entry(f"{where}: {section}.{name}", kinds[section], entry)
+                for name, entry in entries.items()
             }
         return cls(**parts)
+
+    def over(self, other: "MappingConfig") -> "MappingConfig":
+        """Return another mapping with the entries of this one added, or in their place."""
+        return MappingConfig(**{one.name: getattr(other, one.name) | getattr(self, one.name) for one in fields(self)})
 
 
 def _entry(where: str, kind: Any, entry: Any) -> Any:
@@ -151,8 +190,7 @@ class TopicFields:
     @property
     def has_header(self) -> bool:
         """Whether a message begins with a header, and so with a stamp."""
-        first = type_store().fielddefs[self.msgtype][1][:1]
-        return bool(first) and first[0][1][1] == HEADER
+        return has_header(self.msgtype)
 
     def read(self, message: Any) -> NDArray[np.float64]:
         """Return the features in a deserialised message, shape (len(columns),).
@@ -163,12 +201,33 @@ class TopicFields:
         values = [_number(one, one.read(message)) for one in self.fields]
         return np.array(values, np.float64) * self.scales + self.offsets
 
+    def read_present(self, message: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the features in a message, and which of them it has no element for, shape (len(columns),) each."""
+        values, missing = np.zeros(len(self.fields)), np.zeros(len(self.fields), np.bool_)
+        for column, one in enumerate(self.fields):
+            try:
+                values[column] = _number(one, one.read(message))
+            except DatasetError:
+                missing[column] = True
+        return values * self.scales + self.offsets, missing
+
     def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
         """Return a serialised message with the features, shape (len(columns),), and the stamp [ns] if it has one."""
         tree: dict[str, Any] = {"header": header(np.array([stamp_ns]))} if self.has_header else {}
         for one, value in zip(self.fields, (features - self.offsets) / self.scales, strict=True):
             one.put(tree, value)
         return encode(self.msgtype, tree, 1)[0]
+
+
+def features_of(section: Mapping[str, FieldConfig]) -> tuple[str, ...]:
+    """Return the names of a section's features."""
+    return tuple(feature for name, one in section.items() for feature in one.names(name))
+
+
+def has_header(msgtype: str) -> bool:
+    """Return whether a type's messages begin with a header, and so with a stamp."""
+    first = type_store().fielddefs[msgtype][1][:1]
+    return bool(first) and first[0][1][1] == HEADER
 
 
 def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> list[TopicFields]:
@@ -207,26 +266,7 @@ def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> l
     return found
 
 
-def register_types(types: Mapping[str, str]) -> None:
-    """Make further message types known.
-
-    Raises:
-        ConfigError: a definition cannot be read.
-    """
-    from rosbags.typesys import get_types_from_msg
-
-    store = type_store()
-    for name, text in types.items():
-        if name in store.fielddefs:
-            continue
-        try:
-            store.register(get_types_from_msg(text, name))
-        except Exception as error:  # whatever rosbags' parser raises
-            raise ConfigError(f"The definition of {name} cannot be read: {as_text(error)}.") from error
-
-
 def _number(place: Field, value: Any) -> float:
     if place.kind == QUATERNION:
-        w, x, y, z = value.w, value.x, value.y, value.z
-        return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+        return yaw_of(value.w, value.x, value.y, value.z)
     return float(value)

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.messages import types
+from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.serialize import encode
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000
-
-XYZ, WXYZ = ("x", "y", "z"), ("w", "x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -100,6 +99,34 @@ class Part(ABC):
         return len(self.names)
 
 
+class FieldsPart(Part):
+    """Numbers of which each is a field of a standard message."""
+
+    fields: ClassVar[tuple[str, ...]]
+    """Where each of the names is in a message."""
+
+    frame: ClassVar[str | None] = None
+    """Of the header; None of messages without one."""
+
+    @override
+    def encode(self, frames: Frames, values: Array) -> list[bytes]:
+        tree = self.rest()
+        if self.frame is not None:
+            tree["header"] = header(frames.stamps, self.frame)
+        for field, column in zip(self.fields, values.T, strict=True):
+            Field(self.msgtype, field).put(tree, column)
+        return encode(self.msgtype, tree, len(values))
+
+    @override
+    def decode(self, messages: Sequence[Any]) -> Array:
+        fields = [Field(self.msgtype, field) for field in self.fields]
+        return self.table([[field.read(message) for field in fields] for message in messages])
+
+    def rest(self) -> dict[str, Any]:
+        """Return the other fields that are not zero."""
+        return {}
+
+
 class NumbersPart(Part):
     """Numbers that no standard message is made for."""
 
@@ -118,11 +145,6 @@ class IntegersPart(NumbersPart):
     """Whole numbers, or truths."""
 
     msgtype = types.INTEGERS
-
-
-def numbers(parts: Sequence[Any], names: Sequence[str]) -> Array:
-    """Return attributes of parts of messages, such as of vectors, shape (n, len(names))."""
-    return np.array([[getattr(part, name) for name in names] for part in parts], np.float64).reshape(-1, len(names))
 
 
 def own_topic(key: str) -> str:

@@ -106,12 +106,19 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threadi
                 timer.daemon = True
                 timer.start()
             server.run(end.is_set, lambda line: console.print(line, markup=False))
+            console.print(_summary(host, counts))
     finally:
         if foxglove:
             foxglove.close()
         robot.disconnect()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _summary(host: LiveHost, counts: Counts) -> str:
+    state = host.bridge.latest
+    touched, ticks = int(state["touches"].sum()), int(state["executed"])
+    return f"Ended. Contact in {touched} of {ticks} control ticks; commands refused: {sum(counts.refused.values())}."
 
 
 def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:

@@ -138,6 +138,20 @@ def test_a_recording_comes_back_and_is_valid(request, tmp_path, robot, layout):
     assert main.main(["check", str(tmp_path / "back")]) == 0
 
 
+def test_an_arm_comes_back_by_its_preset(ur5, tmp_path):
+    """Without what the bag says of itself: by topics, types and fields."""
+    arguments = ["--map=ur5", "--task=Reach.", "--min_episode_s=0", f"--fps={dataset_info(ur5).fps}"]
+    info = back(export(ur5, tmp_path / "bags", "--format=sqlite3"), tmp_path / "back", *arguments)
+    assert (info.robot_type, info.tasks) == ("ur5", ("Reach.",))
+    for one, other in zip(dataset_info(ur5).episodes, info.episodes, strict=True):
+        assert one.frames == other.frames
+        ours, theirs = read_episode(ur5, one.index), read_episode(tmp_path / "back", one.index)
+        for key in ("observation.state", "action"):
+            assert info.features[key]["names"] == dataset_info(ur5).features[key]["names"]
+            np.testing.assert_allclose(ours[key], theirs[key], atol=1e-6, err_msg=key)
+    assert main.main(["check", str(tmp_path / "back")]) == 0
+
+
 @pytest.mark.parametrize("layout", [[], ["--one_bag"]])
 def test_episodes_that_turn_round_come_back_whatever_the_one_before_did(tmp_path, layout):
     features = dataset_features(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, topics_of
+from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, register_types, topics_of
 from bhd_lerobot.ros2.messages.serialize import decode, encode
 
 ODOMETRY, JOINTS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
@@ -116,3 +116,11 @@ def test_a_file_with_a_mistake_is_refused(tmp_path: Path, old: str, new: str, te
     path.write_text(YAML.replace(old, new, 1))
     with pytest.raises(ConfigError, match=text):
         MappingConfig.load(path)
+
+
+def test_a_type_has_one_definition() -> None:
+    types = {"twice_msgs/msg/A": "float64 x"}
+    for _ in range(2):
+        register_types(types)
+    with pytest.raises(ConfigError, match="already present with different definition"):
+        register_types({"twice_msgs/msg/A": "float32 x"})

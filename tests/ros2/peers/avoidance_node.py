@@ -18,6 +18,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
 parser = peer.options(__doc__)
+parser.add_argument("--command-topic", default="/cmd_vel")
 parser.add_argument("--twist", action="store_true", help="publish Twist, as up to Humble, instead of TwistStamped")
 parser.add_argument("--hz", type=float, help="publish at this rate, not at each scan [Hz]")
 parser.add_argument("--report", type=float, default=1.0, help="time between two lines of the log [s]")
@@ -49,7 +50,7 @@ def command(distance: float) -> tuple[float, float]:
 class Avoidance:
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.publisher = node.create_publisher(Twist if args.twist else TwistStamped, "/cmd_vel", 10)
+        self.publisher = node.create_publisher(Twist if args.twist else TwistStamped, args.command_topic, 10)
         node.create_subscription(LaserScan, "/scan", self.on_scan, qos_profile_sensor_data)
         if args.hz:
             node.create_timer(1 / args.hz, self.publish)

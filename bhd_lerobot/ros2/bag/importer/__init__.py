@@ -9,6 +9,7 @@ __all__ = [
     "options",
     "resample",
     "segments",
+    "sources",
     "topics",
     "tracks",
     "video",

@@ -1,6 +1,6 @@
 """What is in the frames of an episode that is made of a robot's bag: every column but the images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ _MOVES = 0.01
 
 
 def frame_columns(
-    options: ImportOptions, tracks: Mapping[str, Track], times: Times, ages: Times, outcome: str | None
+    options: ImportOptions, tracks: Sequence[Track], times: Times, ages: Times, outcome: str | None
 ) -> dict[str, NDArray[Any]]:
     """Return the columns of an episode.
 
@@ -74,7 +74,7 @@ def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) ->
     lacking = "come before the first command" if for_ever else (
         f"have no command that is younger than {options.command_timeout_s:g} s"
     )  # fmt: skip
-    moving = int((silent & _moves(options, columns[keys.OBSERVATION_STATE])).sum())
+    moving = int((silent & _moves(options.observation_names, columns[keys.OBSERVATION_STATE])).sum())
     drove = f", though the robot moved in {moving} of them" if moving else ""
     if moving and not for_ever:
         drove += ": --command_timeout=inf is for robots that continue with the last command"
@@ -82,8 +82,8 @@ def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) ->
 
 
 def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
-    driven = (np.abs(columns[keys.ACTION]) > _MOVES).any(axis=1)
-    against = int((driven & ~_moves(options, columns[keys.OBSERVATION_STATE])).sum())
+    driven = _moves(options.action_names, columns[keys.ACTION])
+    against = int((driven & ~_moves(options.observation_names, columns[keys.OBSERVATION_STATE])).sum())
     if against <= MOST_UNEXPLAINED * len(driven):
         return None
     return (
@@ -93,7 +93,7 @@ def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) 
 
 
 def unexplained_frames(
-    options: ImportOptions, tracks: Mapping[str, Track], times: Times, timeout_s: float
+    options: ImportOptions, tracks: Sequence[Track], times: Times, timeout_s: float
 ) -> tuple[int, int]:
     """Return in how many frames the robot moves without a command, and in how many it stands against one.
 
@@ -101,57 +101,69 @@ def unexplained_frames(
         times: of the frames [ns], shape (n,).
     """
     commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
-    moves = _moves(options, _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times))
-    driven = (np.abs(commands) > _MOVES).any(axis=1)
+    observed = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    moves, driven = _moves(options.observation_names, observed), _moves(options.action_names, commands)
     return int((moves & (age < 0)).sum()), int((~moves & driven).sum())
 
 
-def _moves(options: ImportOptions, state: NDArray[Any]) -> NDArray[np.bool_]:
-    names = list(options.observation_names)
-    return (np.abs(state[:, [names.index(name) for name in TWIST if name in names]]) > _MOVES).any(axis=1)
+def _moves(names: tuple[str, ...], values: NDArray[Any]) -> NDArray[np.bool_]:
+    return (np.abs(values[:, [names.index(name) for name in TWIST if name in names]]) > _MOVES).any(axis=1)
 
 
-def _commands(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:
+def unanswered(options: ImportOptions, tracks: Sequence[Track], times: Times) -> int:
+    """Return how many frames at the beginning end before the first command of a position.
+
+    Speeds are 0 without a command; a position that nothing commands is not.
+
+    Args:
+        times: of the frames [ns], shape (n,).
+    """
+    ends = times + round(NANO / options.fps)
+    waits = [track for track in tracks if track.is_action and not all(name.endswith(".vel") for name in track.names)]
+    return max((int((newest(track.times, ends - 1) < 0).sum()) for track in waits), default=0)
+
+
+def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> tuple[Array, Times]:
     """Return the command in force at the end of each frame, shape (n, d), and its age then [ns]; 0 and -1 if none.
 
     An action is the command over the frame that an observation begins. What answers the observation comes after
     it: the command in force when the observation was taken is the answer to the one before.
     """
     ends = times + round(NANO / options.fps)
-    if "cmd" not in tracks:
-        parts = [track for role, track in tracks.items() if role.startswith(f"{keys.ACTION}/")]
-        ages = [ends - track.times[newest(track.times, ends - 1)] for track in parts]
-        oldest = np.maximum.reduce(ages) if ages else np.zeros_like(ends)
-        return _vector(options.action_names, keys.ACTION, tracks, ends - 1), oldest
-    track = tracks["cmd"]
-    place = newest(track.times, ends - 1)
-    known = np.maximum(place, 0)
-    if not len(track.times):
-        return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
-    age = np.where(place < 0, -1, ends - track.times[known])
-    if np.isfinite(options.command_timeout_s):
-        age = np.where(age > round(options.command_timeout_s * NANO), -1, age)
-    order = [TWIST.index(name) for name in options.action_names]
-    return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
+    age = np.zeros_like(ends)
+    columns: dict[str, Array] = {}
+    for track in tracks:
+        if not track.is_action:
+            continue
+        place = newest(track.times, ends - 1)
+        since = np.where(place < 0, -1, ends - track.times[place]) if len(track.times) else np.full(len(ends), -1)
+        if np.isfinite(options.command_timeout_s):
+            since = np.where(since > round(options.command_timeout_s * NANO), -1, since)
+        rows = track.values[place] if len(track.times) else np.zeros((len(ends), len(track.names)))
+        columns |= dict(zip(track.names, np.where(since[:, None] >= 0, rows, 0.0).T, strict=True))
+        age = np.where((age < 0) | (since < 0), -1, np.maximum(age, since))
+    values = [columns[name] for name in options.action_names]
+    return np.stack(values, axis=1) if values else np.zeros((len(ends), 0)), age
 
 
-def _state(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> Array:
+def _state(options: ImportOptions, tracks: Sequence[Track], times: Times) -> Array:
     state = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
     names = list(options.observation_names)
-    if "odom" in tracks and options.pose:
+    if options.pose:
         pose = [names.index(name) for name in ODOMETRY]
         state[:, pose] = _since_start(state[:, pose])
-    elif ODOMETRY[2] in names:  # unwrapped over a bag, which may hold several episodes
-        yaw = state[:, names.index(ODOMETRY[2])]
-        yaw -= 2 * np.pi * np.round(yaw[0] / (2 * np.pi))
+        return state
+    for angle, turn in {name: turn for track in tracks for name, turn in track.source.angles.items()}.items():
+        yaw = state[:, names.index(angle)]  # unwrapped over a bag, which may hold several episodes
+        yaw -= turn * np.round(yaw[0] / turn)
     return state
 
 
-def _vector(names: tuple[str, ...], feature: str, tracks: Mapping[str, Track], at: Times) -> Array:
+def _vector(names: tuple[str, ...], feature: str, tracks: Sequence[Track], at: Times) -> Array:
     """Return what the newest messages at some times say of a feature, shape (n, len(names))."""
     columns: dict[str, Array] = {}
-    for role, track in tracks.items():
-        if role.startswith(f"{feature}/") or (feature == keys.OBSERVATION_STATE and role in ("scan", "odom", "imu")):
+    for track in tracks:
+        if track.source.feature == feature:
             columns |= dict(zip(track.names, track.values[newest(track.times, at)].T, strict=True))
     return np.stack([columns[name] for name in names], axis=1) if names else np.zeros((len(at), 0))
 

@@ -20,6 +20,7 @@ from bhd_lerobot.ros2.bag.importer.columns import (
     MOST_UNEXPLAINED,
     command_note,
     frame_columns,
+    unanswered,
     unexplained_frames,
 )
 from bhd_lerobot.ros2.bag.importer.exported import ExportedEpisode
@@ -27,7 +28,7 @@ from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
 from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
-from bhd_lerobot.ros2.bag.importer.video import CAMERA, CameraImages
+from bhd_lerobot.ros2.bag.importer.video import CameraImages
 from bhd_lerobot.ros2.bag.storage.place import complete_or_not
 from bhd_lerobot.ros2.bag.storage.read import Bag
 from bhd_lerobot.ros2.messages.base import TWIST
@@ -76,8 +77,8 @@ def import_bags(
         DatasetWriteError: the dataset cannot be written.
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
-    if "scan" in options.topics and "odom" not in options.topics:
-        names = options.observation_names
+    names = options.observation_names
+    if not exported and {*TWIST} <= {*options.action_names} and not {*TWIST} & {*names}:
         report.notes.append(
             f"no odometry is read: the state is {names[0]} to {names[-1]}, without {' and '.join(TWIST)}. Whether the "
             "robot obeyed is not known, and a policy that learns from it needs a robot that observes the same"
@@ -97,7 +98,7 @@ def import_bags(
             report.problems += bag.problems
             report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
         if not report.episodes:
-            sensors = ", ".join(topic for role, topic in options.topic_of.items() if role != "cmd")
+            sensors = ", ".join(source.topic for source in options.sources if not source.is_action)
             reasons = "; ".join([*report.problems, *report.notes][:_LISTED])
             raise DatasetError(
                 f"No episode of {options.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}:"
@@ -150,7 +151,7 @@ class _Recording:
         """Return the recorder, which is created with the first episode."""
         if self._recorder is None:
             options = self._options
-            images = {camera.name: camera.shape() for camera in cameras}
+            images = {camera.key.removeprefix(f"{keys.OBSERVATION_IMAGES}."): camera.shape() for camera in cameras}
             features = keys.dataset_features(
                 options.observation_names, options.action_names, images, {}, options.environment_names
             )  # the state of a real robot's physics is not known
@@ -181,7 +182,7 @@ class _Episode:
     """Frames, and the tracks of the segment of the bag in which they lie, sorted by time."""
 
     grid: Grid
-    tracks: Mapping[str, Track]
+    tracks: Sequence[Track]
     exported: ExportedEpisode | None
 
 
@@ -194,28 +195,22 @@ class _RobotBag:
         self.notes: list[str] = []
         self._bag, self._options, self._recording, self._exported = bag, options, recording, exported
         self._tracks = read_tracks(bag, options, self.notes)
-        self._cameras = [
-            CameraImages(bag, role, track, self.notes)
-            for role, track in self._tracks.items()
-            if role.startswith(CAMERA)
-        ]
-        self._begin = min(int(track.times.min()) for track in self._tracks.values())
+        self._cameras = [CameraImages(bag, track, self.notes) for track in self._tracks if not track.names]
+        self._begin = min(int(track.times.min()) for track in self._tracks)
         self._check_clocks()
 
     def _check_clocks(self) -> None:
         """Check that commands and sensors are of one time."""
-        if "cmd" not in self._tracks:
-            return
-        cmd = self._tracks["cmd"].times
-        sensors = [track.times for role, track in self._tracks.items() if role != "cmd"]
+        sensors = [track.times for track in self._tracks if not track.is_action]
         begin, end = min(int(sensor.min()) for sensor in sensors), max(int(sensor.max()) for sensor in sensors)
-        if int(cmd.max()) < begin - NANO or int(cmd.min()) > end + NANO:
-            raise DatasetError(
-                f"{self._bag.path}: {self._tracks['cmd'].topic} is from {cmd.min() / NANO:.1f} to "
-                f"{cmd.max() / NANO:.1f} s and the sensors are from {begin / NANO:.1f} to {end / NANO:.1f} s, so no "
-                "command belongs to them. Their stamps are of different clocks; --stamps=receive takes the recorder's "
-                "for all."
-            )
+        for track in self._tracks:
+            cmd = track.times
+            if track.is_action and (int(cmd.max()) < begin - NANO or int(cmd.min()) > end + NANO):
+                raise DatasetError(
+                    f"{self._bag.path}: {track.topic} is from {cmd.min() / NANO:.1f} to {cmd.max() / NANO:.1f} s and "
+                    f"the sensors are from {begin / NANO:.1f} to {end / NANO:.1f} s, so no command belongs to them. "
+                    "Their stamps are of different clocks; --stamps=receive takes the recorder's for all."
+                )
 
     def episodes(self) -> Iterator[_Episode]:
         """Yield the episodes in order."""
@@ -224,7 +219,7 @@ class _RobotBag:
             self._tracks,
             [episode.place for episode in self._exported],
             stamps=options.stamps,
-            max_speed=options.max_speed if "odom" in self._tracks and options.pose else None,
+            max_speed=options.max_speed if options.pose else None,
             max_gap_s=options.max_gap_s,
             notes=self.notes,
         )
@@ -234,19 +229,18 @@ class _RobotBag:
             begin = begin if part.why == "reset" else part.first
             begun = [episode for episode in self._exported if episode.place <= part.first] or self._exported[:1]
             of_commands = part._replace(first=begin)
-            tracks = {
-                role: track.part((of_commands if role == "cmd" else part).mask(track))
-                for role, track in self._tracks.items()
-            }
-            sensors = {role: track for role, track in tracks.items() if role != "cmd"}
+            tracks = [track.part((of_commands if track.is_action else part).mask(track)) for track in self._tracks]
+            sensors = [track for track in tracks if not track.is_action]
             self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
-            for grid in grids(
-                [track.times for track in sensors.values()],
+            for found in grids(
+                [track.times for track in sensors],
                 options.fps,
                 max_age_ns=round(options.max_age_s * NANO),
                 max_gap_ns=round(options.max_gap_s * NANO),
                 why=part.why,
             ):
+                if (grid := self._answered(found, tracks)) is None:
+                    continue
                 lasts = (len(grid.times) - 1) / options.fps
                 if lasts >= options.min_episode_s:
                     yield _Episode(grid, tracks, begun[-1] if begun else None)
@@ -256,11 +250,19 @@ class _RobotBag:
                         "was left out"
                     )
 
+    def _answered(self, grid: Grid, tracks: Sequence[Track]) -> Grid | None:
+        """Return frames from the first on that has a command, of actions that are positions; None if none has."""
+        blind, n = unanswered(self._options, tracks, grid.times), len(grid.times)
+        if blind:
+            self.notes.append(
+                f"{self._after_start(grid)}: the first {blind} of {n} frames come before the first command, and are "
+                "left out: without one the robot is somewhere, not at the position 0"
+            )
+        return grid.since(blind) if blind < n else None
+
     def check_commands(self, episodes: Sequence[_Episode]) -> None:
         """Check that commands explain how the robot moves, unless the user said how long they are in force."""
         options, n = self._options, sum(len(episode.grid.times) for episode in episodes)
-        if "cmd" not in self._tracks:
-            return
         counts = {
             timeout: np.sum(
                 [unexplained_frames(options, one.tracks, one.grid.times, timeout) for one in episodes], axis=0
@@ -270,6 +272,8 @@ class _RobotBag:
         }
         if not counts or (moving := counts[options.command_timeout_s][0]) <= MOST_UNEXPLAINED * n:
             return
+        actions = [source for source in options.sources if source.is_action]
+        topics = " and ".join(source.topic for source in actions)
         what = {
             timeout: "the last command" if math.isinf(timeout) else "none, after so many seconds" for timeout in counts
         }
@@ -280,8 +284,8 @@ class _RobotBag:
         )
         raise DatasetError(
             f"{self._bag.path}: the robot moves in {moving} of {n} frames ({100 * moving / n:.0f} %) without a command "
-            f"of {self._tracks['cmd'].topic} that is in force, so their action would be 0. Name the topic that drove "
-            f"it with --cmd, or choose what is in force while no command comes. {choices}."
+            f"of {topics} that is in force, so their action would be 0. Name the topic that drove "
+            f"it with {actions[0].option}, or choose what is in force while no command comes. {choices}."
         )
 
     def save(self, episode: _Episode) -> int:
@@ -292,7 +296,7 @@ class _RobotBag:
         writer = recorder.begin_episode()
         try:
             for camera in self._cameras:
-                shown = camera.write(episode.tracks[camera.role], times, writer)
+                shown = camera.write(camera.of(episode.tracks), times, writer)
                 ages = np.maximum(ages, times - shown)
             task, metadata = self._described(episode)
             columns = frame_columns(self._options, episode.tracks, times, ages, metadata.get("outcome"))
@@ -312,13 +316,13 @@ class _RobotBag:
     def _with_images(self, episode: _Episode) -> _Episode:
         """Return an episode from the frame on at which every camera has an image that can be decoded."""
         grid = episode.grid
-        blind = max((camera.blind(episode.tracks[camera.role], grid.times) for camera in self._cameras), default=0)
+        blind = max((camera.blind(camera.of(episode.tracks), grid.times) for camera in self._cameras), default=0)
         if blind:
             self.notes.append(
                 f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first image that can "
                 "be decoded"
             )
-        return replace(episode, grid=Grid(grid.times[blind:], grid.ages[:, blind:], grid.why))
+        return replace(episode, grid=grid.since(blind))
 
     def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
         """Return the task of an episode, and its metadata: those of the user have precedence over those of the bag."""

@@ -9,6 +9,7 @@ from typing import Any
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 from bhd_lerobot.ros2.bag.exporter.episode import EPISODE_TOPIC, image_topic
+from bhd_lerobot.ros2.bag.importer.sources import Source, exported_sources
 from bhd_lerobot.ros2.bag.storage.read import Bag
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.parts import NANO, Part
@@ -122,20 +123,6 @@ def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:
     return episode
 
 
-def exported_parts(episode: ExportedEpisode) -> dict[str, Part]:
-    """Return what the bag has of states, environment and actions: role, ``<feature>/<topic>``, -> the topic's part.
-
-    Raises:
-        DatasetError: the bag has no observations.
-    """
-    found: dict[str, Part] = {}
-    for key in _VECTORS:
-        found |= {f"{key}{part.topic}": part for part in episode.parts.get(key, ())}
-    if keys.OBSERVATION_STATE not in episode.parts:
-        raise DatasetError(f"{EPISODE_TOPIC} names no {keys.OBSERVATION_STATE}, so there is nothing to import.")
-    return found
-
-
 def names_of(episode: ExportedEpisode, key: str) -> tuple[str, ...]:
     """Return the names of a vector's numbers, in order; nothing if there is no such vector."""
     feature = episode.features.get(key)
@@ -146,7 +133,19 @@ def names_of(episode: ExportedEpisode, key: str) -> tuple[str, ...]:
     return tuple(str(name) for name in (names if known else range(count)))
 
 
-def exported_cameras(episode: ExportedEpisode, bag: Bag) -> dict[str, str]:
+def sources_of(episode: ExportedEpisode, bag: Bag) -> list[Source]:
+    """Return what is read of an exported bag.
+
+    Raises:
+        DatasetError: the bag has no observations.
+    """
+    if keys.OBSERVATION_STATE not in episode.parts:
+        raise DatasetError(f"{EPISODE_TOPIC} names no {keys.OBSERVATION_STATE}, so there is nothing to import.")
+    parts = {key: episode.parts[key] for key in _VECTORS if key in episode.parts}
+    return exported_sources(parts, _cameras(episode, bag))
+
+
+def _cameras(episode: ExportedEpisode, bag: Bag) -> dict[str, str]:
     """Return the topics of an episode's cameras by name; raw images if a bag has both."""
     return {
         key.removeprefix(f"{keys.OBSERVATION_IMAGES}."): next(

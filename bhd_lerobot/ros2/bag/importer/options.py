@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.ros2.messages.parts import Part
+from bhd_lerobot.ros2.bag.importer.sources import Source
 
 
 @dataclass(frozen=True)
@@ -19,15 +18,9 @@ class ImportOptions:
         task: the instruction; None if exported bags have one for each episode.
         fps: frames a second.
         observation_names, action_names, environment_names: of the dataset's numbers, in order.
-        lidar: the scanner that the dataset is of.
-        topics: role (``scan``, ``odom``, ``cmd``, ``imu``) -> topic; only roles that are wanted.
-        cameras: name of a camera -> topic.
-        parts: role -> what carries numbers, of exported bags; the role begins with the feature and a slash.
-        beams: that a scan has in the dataset.
+        sources: what is read of a bag.
         stamps: whose time counts: ``"auto"``, ``"header"`` or ``"receive"``.
-        scan_frame, odom_frame: frames of the scanner and the base, if the user names them.
-        scan_yaw: angle of the scanner in the robot [rad], if the user gives it.
-        pose: whether the odometry's pose is wanted, beside its speeds.
+        pose: whether ``x.pos``, ``y.pos`` and ``theta.pos`` are those since the episode's start.
         max_speed: largest of each action [m/s, rad/s], to which the applied action is limited; None if not known.
         max_age_s: age of the oldest reading beyond which a frame is late.
         max_gap_s: silence of a sensor that ends an episode.
@@ -35,6 +28,7 @@ class ImportOptions:
         timeouts: those that the user chooses from where the robot moves without a command; none if one was given.
         min_episode_s: shorter episodes are left out.
         outcome: what the episodes ended with; None if it is not known.
+        given: what else decides the episodes, JSON values.
     """
 
     robot_type: str
@@ -42,34 +36,23 @@ class ImportOptions:
     fps: int
     observation_names: tuple[str, ...]
     action_names: tuple[str, ...]
-    lidar: LidarSpec
+    sources: tuple[Source, ...]
     max_speed: tuple[float, ...] | None
     max_age_s: float
     max_gap_s: float
     command_timeout_s: float
     min_episode_s: float
-    topics: Mapping[str, str] = field(default_factory=dict)
-    cameras: Mapping[str, str] = field(default_factory=dict)
-    parts: Mapping[str, Part] = field(default_factory=dict)
     environment_names: tuple[str, ...] = ()
-    beams: int = 0
     stamps: str = "receive"
-    scan_frame: str | None = None
-    odom_frame: str | None = None
-    scan_yaw: float | None = None
     pose: bool = False
     outcome: str | None = None
     timeouts: tuple[float, ...] = ()
-
-    @property
-    def topic_of(self) -> dict[str, str]:
-        """All topics that are read, by role; a camera's is ``camera/<name>``."""
-        cameras = {f"camera/{name}": topic for name, topic in self.cameras.items()}
-        return {**self.topics, **{role: part.topic for role, part in self.parts.items()}, **cameras}
+    given: Mapping[str, Any] = field(default_factory=dict)
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the episodes, JSON values. A recording has its simulation here, too."""
-        plain = ("stamps", "scan_frame", "scan_yaw", "odom_frame", "max_age_s", "max_gap_s", "min_episode_s")
+        plain = ("stamps", "max_age_s", "max_gap_s", "min_episode_s")
+        values = {name: getattr(self, name) for name in plain} | dict(self.given)
         timeout = None if np.isinf(self.command_timeout_s) else self.command_timeout_s
-        values = {name: getattr(self, name) for name in plain}
-        return {"imported": {"format": "rosbag2", "topics": self.topic_of, "command_timeout_s": timeout, **values}}
+        topics = {source.key: source.topic for source in self.sources}
+        return {"imported": {"format": "rosbag2", "topics": topics, "command_timeout_s": timeout, **values}}

@@ -32,6 +32,10 @@ class Grid:
     ages: Times
     why: str
 
+    def since(self, first: int) -> "Grid":
+        """Return its frames from one on."""
+        return Grid(self.times[first:], self.ages[:, first:], self.why)
+
 
 def message_times(received: Times, stamps: Times | None, policy: str, tolerance_ns: int = NANO // 2) -> Times:
     """Return when messages happened [ns], shape (n,).

@@ -1,6 +1,6 @@
 """Where a bag's recording breaks off and begins anew: silences, clocks that go back, drivers that restart."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, clock_jumps
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track, seconds
+from bhd_lerobot.ros2.messages.base import ODOMETRY
 
 _LISTED = 5  # of the same kind, one by one
 _MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_LISTED`) no restart explains it
@@ -40,7 +41,7 @@ class Segment(NamedTuple):
 
 
 def segments(
-    tracks: Mapping[str, Track],
+    tracks: Sequence[Track],
     starts: Iterable[int],
     *,
     stamps: str,
@@ -53,15 +54,14 @@ def segments(
     Args:
         max_speed: of the robot forward [m/s] and turning [rad/s], if its pose matters; None if it does not.
     """
-    every = list(tracks.values())
     step = CLOCK_STEP_NS if stamps == "receive" else STEP_BACK_NS
-    jumps = clock_jumps([track.times for track in every], [track.order for track in every], step)
+    jumps = clock_jumps([track.times for track in tracks], [track.order for track in tracks], step)
     if len(jumps):
         notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
     found = _cut([Segment(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(starts, "start"))
     found = _cut(found, dict.fromkeys(jumps.tolist(), "clock"))
-    for role, track in tracks.items():
-        if role != "cmd" and track.stamps is not None and track.stamps is not track.times:
+    for track in tracks:
+        if not track.is_action and track.stamps is not None and track.stamps is not track.times:
             found = _cut(found, dict.fromkeys(_restarts(track, track.stamps, found, notes), "clock"))
     if max_speed is not None:
         found = _cut(found, dict.fromkeys(_resets(tracks, max_speed, max_gap_s, found, notes), "reset"))
@@ -101,15 +101,16 @@ def _restarts(track: Track, stamps: Times, parts: list[Segment], notes: list[str
 
 
 def _resets(
-    tracks: Mapping[str, Track], max_speed: tuple[float, ...], max_gap_s: float, parts: list[Segment], notes: list[str]
+    tracks: Sequence[Track], max_speed: tuple[float, ...], max_gap_s: float, parts: list[Segment], notes: list[str]
 ) -> list[int]:
     """Return where the odometry's pose jumps."""
-    track = tracks["odom"]
-    begin = min(int(sensor.times.min()) for sensor in tracks.values())
+    track = next(track for track in tracks if {*ODOMETRY} <= {*track.names})
+    pose = [track.names.index(name) for name in ODOMETRY]
+    begin = min(int(sensor.times.min()) for sensor in tracks)
     places, jumps = [], []
     for part in parts:
         rows = np.flatnonzero(part.mask(track))
-        way, turn, took = pose_steps(track.times[rows], track.values[rows, 2:])
+        way, turn, took = pose_steps(track.times[rows], track.values[rows][:, pose])
         limits = [POSE_FACTOR * speed * took + slack for speed, slack in zip(max_speed, POSE_SLACK, strict=True)]
         jumped = ((way > limits[0]) | (turn > limits[1])) & (took <= max_gap_s)
         for row in np.flatnonzero(jumped).tolist():
@@ -130,19 +131,19 @@ def _resets(
     return places
 
 
-def silence_notes(sensors: Mapping[str, Track], start: int, gap: int) -> list[str]:
+def silence_notes(sensors: Sequence[Track], start: int, gap: int) -> list[str]:
     """Return, in sentences, where a sensor was silent in a segment: at its beginning, within it, or at its end.
 
     Args:
         start: of the bag [ns].
         gap: silence that is reported [ns].
     """
-    received = [track.times for track in sensors.values() if len(track.times)]
+    received = [track.times for track in sensors if len(track.times)]
     if not received:
         return []
     begin, end = min(int(times[0]) for times in received), max(int(times[-1]) for times in received)
     notes = []
-    for track in sensors.values():
+    for track in sensors:
         if not len(track.times):
             if end - begin > gap:  # a restart is seen a moment later by the sensor that is slower
                 notes.append(

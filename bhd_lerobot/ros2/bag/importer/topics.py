@@ -1,13 +1,13 @@
 """Which topics of a bag are read for what, and who published them."""
 
 import contextlib
-from collections.abc import Mapping
+import difflib
+from collections.abc import Sequence
 
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.ros2.bag.importer.sources import Source
 from bhd_lerobot.ros2.bag.storage.read import Bag, Topic
-from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
-from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
-from bhd_lerobot.ros2.messages.parts import Part
+from bhd_lerobot.ros2.messages.base import OdometryPart, ScanPart
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
 
@@ -25,9 +25,9 @@ def _refuse_arm(bag: Bag) -> None:
             more = ", …" if len(joints) > _NAMED else ""
             raise DatasetError(
                 f"{bag.path} seems to be of an arm: {topic.name} has the joints {', '.join(joints[:_NAMED])}{more}, "
-                "and there are no scans and no odometry. bhd-data import is for bags of a TurtleBot3: it needs scans, "
-                "odometry and speed commands; for an arm's bags there is none, except for those that bhd-data export "
-                "wrote."
+                "and there are no scans and no odometry. Without --map, bhd-data import is for bags of a TurtleBot3: "
+                "it needs scans, odometry and speed commands. --map=FILE.yaml names the fields of any other robot, "
+                "--map=ur5 those of a UR5 as bhd-data export writes them."
             )
 
 
@@ -39,37 +39,20 @@ def _joints(bag: Bag, topic: str) -> list[str]:
     return []
 
 
-TYPES = {
-    "scan": (ScanPart.msgtype,),
-    "odom": (OdometryPart.msgtype,),
-    "cmd": (TwistPart.msgtype, BareTwistPart.msgtype),
-    "imu": (GyroPart.msgtype,),
-    "camera": (IMAGE, COMPRESSED),
-}
-"""What is read -> the types of message that it is read from."""
+def wanted_topics(bag: Bag, sources: Sequence[Source]) -> list[tuple[Source, Topic]]:
+    """Return the topics that are read; ``scan`` is ``/scan``, too.
 
-_MEANING = {
-    "scan": "the scan",
-    "odom": "the robot's speed",
-    "cmd": "the action",
-    "imu": "the yaw rate of the gyroscope",
-    "camera": "the image",
-}
-
-
-def wanted_topics(bag: Bag, names: Mapping[str, str]) -> dict[str, Topic]:
-    """Return the topics that roles are read from.
-
-    Args:
-        names: role, a key of `TYPES`, of a camera with its name behind a slash -> topic; ``scan`` is ``/scan``, too.
+    Raises:
+        DatasetError: some are missing, all of which are named, or of another type.
     """
-    found = {role: bag.topics.get(name) or bag.topics.get(other_form(name)) for role, name in names.items()}
-    lacking = [_lacking(bag, role, names[role], topic) for role, topic in found.items() if not topic or not topic.count]
+    found = [(one, bag.topics.get(one.topic) or bag.topics.get(other_form(one.topic))) for one in sources]
+    lacking = [_lacking(bag, source, topic) for source, topic in found if not topic or not topic.count]
     if lacking:
-        _refuse_arm(bag)
+        if any(source.option == "--scan" for source in sources):
+            _refuse_arm(bag)
         there = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in bag.topics.values()) or "none"
         raise DatasetError(f"{bag.path} has {' It has '.join(lacking)} The bag has: {there}.{_damage(bag)}")
-    return {role: _checked(bag, role, topic) for role, topic in found.items() if topic}
+    return [(source, _checked(bag, source, topic)) for source, topic in found if topic]
 
 
 def other_form(name: str) -> str:
@@ -77,51 +60,37 @@ def other_form(name: str) -> str:
     return name[1:] if name.startswith("/") else f"/{name}"
 
 
-def _lacking(bag: Bag, role: str, name: str, topic: Topic | None) -> str:
+def _lacking(bag: Bag, source: Source, topic: Topic | None) -> str:
     """Return the end of a sentence: which topic there is not, and what may be read in its place."""
-    kind = role.partition("/")[0]
-    types = TYPES[kind]
-    fitting = [one.name for one in bag.topics.values() if one.msgtype in types and one.count]
-    remedy = (
-        f"Name another one with --{kind}. Of the right type: {', '.join(fitting)}."
-        if fitting
-        else f"--{kind} can name no other one: none is of type {' or '.join(types)}."
-    )
-    if kind == "odom":
+    fitting = [one.name for one in bag.topics.values() if one.msgtype in source.readers and one.count]
+    if source.remedy:
+        remedy = source.remedy
+    elif fitting:
+        near = difflib.get_close_matches(source.topic, fitting, n=1)
+        hint = f"Did you mean {near[0]}? " if near else ""
+        remedy = f"{hint}Name another one with {source.option}. Of the right type: {', '.join(fitting)}."
+    else:
+        remedy = f"{source.option} can name no other one: none is of type {' or '.join(source.readers)}."
+    if source.option == "--odom":
         remedy += " --no_odom does without: the state is the scan alone."
-    return f"{'no topic' if topic is None else 'no message of'} {name}, which {_MEANING[kind]} is read from. {remedy}"
+    what = "no topic" if topic is None else "no message of"
+    return f"{what} {source.topic}, which {source.meaning} is read from. {remedy}"
 
 
-def _checked(bag: Bag, role: str, topic: Topic) -> Topic:
-    kind = role.partition("/")[0]
-    if topic.msgtype not in TYPES[kind]:
+def _checked(bag: Bag, source: Source, topic: Topic) -> Topic:
+    if topic.msgtype not in source.readers:
         raise DatasetError(
-            f"{topic.name} in {bag.path} is of type {topic.msgtype}; valid for --{kind}: {', '.join(TYPES[kind])}."
+            f"{topic.name} in {bag.path} is of type {topic.msgtype}; valid for {source.option}: "
+            f"{', '.join(source.readers)}. {source.remedy}".rstrip()
         )
     if topic.others:
         raise DatasetError(
             f"{topic.name} in {bag.path} has messages of several types, {', '.join((topic.msgtype, *topic.others))}, "
-            f"and it is not known which of them is {_MEANING[kind]}. Make a bag with one of them: ros2 bag convert."
+            f"and it is not known which of them is {source.meaning}. Make a bag with one of them: ros2 bag convert."
         )
     if topic.serialisation != "cdr":
         raise DatasetError(
             f"{topic.name} in {bag.path} is serialised as {topic.serialisation!r}; only cdr can be read."
-        )
-    return topic
-
-
-def exported_topic(bag: Bag, role: str, part: Part) -> Topic:
-    """Return the topic of an exported bag that carries numbers of a feature."""
-    topic = bag.topics.get(part.topic)
-    if topic is None or not topic.count:
-        raise DatasetError(
-            f"{bag.path} has no message of {part.topic}, which carries {role.removesuffix(part.topic)}, as "
-            f"/bhd/episode lists.{_damage(bag)} Export the dataset again."
-        )
-    if topic.msgtype != part.msgtype or topic.others:
-        raise DatasetError(
-            f"{part.topic} in {bag.path} is of type {', '.join((topic.msgtype, *topic.others))}, not {part.msgtype} "
-            "alone, as described in /bhd/episode. Export the dataset again."
         )
     return topic
 
@@ -136,11 +105,11 @@ def static_topics(scan: str) -> set[str]:
     return names | {other_form(name) for name in names}
 
 
-def publisher_notes(bag: Bag, wanted: Mapping[str, Topic]) -> list[str]:
-    """Return, in sentences, which wanted topics, by role, may have more than one publisher."""
+def publisher_notes(bag: Bag, wanted: Sequence[tuple[Source, Topic]]) -> list[str]:
+    """Return, in sentences, which topics that are read may have more than one publisher."""
     notes = []
-    for role, topic in wanted.items():
-        counts = "newest command counts, as it did for the robot" if role == "cmd" else "newest message counts"
+    for source, topic in {topic.name: (source, topic) for source, topic in wanted}.values():
+        counts = "newest command counts, as it did for the robot" if source.is_action else "newest message counts"
         if topic.connections:
             each = " and ".join(str(count) for count in topic.connections)
             notes.append(
@@ -152,14 +121,17 @@ def publisher_notes(bag: Bag, wanted: Mapping[str, Topic]) -> list[str]:
                 f"{topic.name} had {topic.publishers} publishers when the recording began. Which of them sent a "
                 f"message is not in the bag; the {counts}, whichever publisher sent it"
             )
-    if "cmd" not in wanted:
-        return notes  # an exported bag, whose other topics are known
-    read = wanted["cmd"].name
-    others = [one for one in bag.topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
-    if others:
-        there = ", ".join(f"{other.name} ({other.count})" for other in others)
-        notes.append(
-            f"there are commands on other topics, too: {there}. The action is of {read} alone ({wanted['cmd'].count}); "
-            "if that is not what drove the robot, name the topic with --cmd"
-        )
+        if source.option == "--cmd":
+            notes += _other_commands(bag, source, topic)
     return notes
+
+
+def _other_commands(bag: Bag, source: Source, read: Topic) -> list[str]:
+    others = [
+        one for one in bag.topics.values() if one.msgtype in source.readers and one.count and one.name != read.name
+    ]
+    there = ", ".join(f"{other.name} ({other.count})" for other in others)
+    return [
+        f"there are commands on other topics, too: {there}. The action is of {read.name} alone ({read.count}); "
+        f"if that is not what drove the robot, name the topic with {source.option}"
+    ] * bool(others)

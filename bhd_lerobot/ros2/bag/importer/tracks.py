@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer import frames
-from bhd_lerobot.ros2.bag.importer.diagnostics import pace, pace_warnings, speed_warnings
+from bhd_lerobot.ros2.bag.importer.diagnostics import pace, pace_warnings
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import Times, apart, message_times, sane
-from bhd_lerobot.ros2.bag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topics
+from bhd_lerobot.ros2.bag.importer.sources import Reading, Source
+from bhd_lerobot.ros2.bag.importer.topics import publisher_notes, static_topics, wanted_topics
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
-from bhd_lerobot.ros2.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
-from bhd_lerobot.ros2.messages.parts import NANO, WXYZ, head_stamps, header_stamps, numbers
-from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
+from bhd_lerobot.ros2.messages.mapping import has_header
+from bhd_lerobot.ros2.messages.parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.ros2.messages.serialize import decode
 
 Array = NDArray[np.float64]
@@ -31,15 +31,17 @@ _APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first r
 
 @dataclass(frozen=True)
 class Track:
-    """Messages of one topic, in the order in which they were written.
+    """Messages of one topic that carry the same numbers, in the order in which they were written.
 
     Attributes:
+        source: what is read from the topic.
         times: when they happened [ns], shape (n,).
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
         stamps: of their headers [ns], shape (n,); None if they have none.
     """
 
+    source: Source
     topic: str
     msgtype: str
     times: Times
@@ -47,6 +49,11 @@ class Track:
     values: Array
     stamps: Times | None
     names: tuple[str, ...] = ()
+
+    @property
+    def is_action(self) -> bool:
+        """Whether it carries commands."""
+        return self.source.is_action
 
     def part(self, mask: NDArray[np.bool_]) -> "Track":
         """Return some of its messages, sorted by time; those of the same time stay in their order."""
@@ -60,26 +67,28 @@ class Track:
         return replace(self, times=times, order=self.order[rows], values=self.values[rows], stamps=stamps)
 
 
-def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str, Track]:
-    """Return the tracks of a bag by role; cameras' as ``camera/<name>``."""
-    wanted = wanted_topics(bag, {role: topic for role, topic in options.topic_of.items() if role not in options.parts})
-    cameras = {role: wanted.pop(role) for role in list(wanted) if role.startswith("camera/")}
-    wanted |= {role: exported_topic(bag, role, part) for role, part in options.parts.items()}
-    notes += publisher_notes(bag, {**wanted, **cameras})
-    latched = sorted(static_topics(options.topics["scan"]) & bag.topics.keys()) if "scan" in options.topics else []
-    names = {topic.name for topic in wanted.values()} | {*latched}
-    messages = bag.read(names, {topic.name for topic in cameras.values()})
+def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> list[Track]:
+    """Return the tracks of a bag, in the order of what is read of it."""
+    wanted = wanted_topics(bag, options.sources)
+    notes += publisher_notes(bag, wanted)
+    turned = {name for source, _ in wanted if source.is_turned for name in static_topics(source.topic)}
+    latched = sorted(turned & bag.topics.keys())
+    images = {topic.name for source, topic in wanted if not source.names}
+    messages = bag.read({topic.name for _, topic in wanted} - images | {*latched}, images)
     static, lost = frames.static_frames([one for name in latched for one in messages[name].data])
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
-    tracks, paces, clocks = {}, {}, {}
-    for role, topic in {**wanted, **cameras}.items():
+    tracks: list[Track] = []
+    paces, clocks, decoded = {}, {}, {}
+    for source, topic in wanted:
         if not len(messages[topic.name].data):
             damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
             raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
-        found, decoded = _decoded(bag, topic, messages[topic.name])
-        stamps = _stamps(topic, found, decoded)
-        if stamps is not None and role != "cmd":
+        if topic.name not in decoded:
+            decoded[topic.name] = _decoded(bag, topic, messages[topic.name], is_image=topic.name in images)
+        found, content = decoded[topic.name]
+        stamps = _stamps(topic, found, content, is_image=topic.name in images)
+        if stamps is not None and not source.is_action:
             paces[topic.name] = pace(found.received, stamps)
         times = message_times(found.received, stamps, options.stamps)
         if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
@@ -88,36 +97,52 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str,
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
         clocks[topic.name] = (found.received, times)
-        values = _values(role, topic, found, decoded, _Reading(options, static, lost > 0, notes))
-        fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
-        finite = np.logical_and.reduce(fits, axis=1)
-        unset = _unset(role, decoded, options) & fits[:, :-1].all(axis=1) & ~finite
-        for lost, what in (
-            (~finite & ~unset, "are no scan of a whole turn" if role == "scan" else "with values that are not finite"),
-            (unset, f"have {_UNSET}"),
-        ):
-            if lost.any():
-                notes.append(f"{topic.name}: {int(lost.sum())} of {len(finite)} messages {what}, left out")
-        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps, _names(role, options))
-        track = track.rows(np.flatnonzero(finite))
-        if unset.all():
-            raise DatasetError(
-                f"{bag.path}: all messages of {topic.name} have {_UNSET}: its driver fills in no pose. Leave out "
-                "--odometry, or name another topic with --odom."
-            )
-        if not len(track.times):
-            raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
-        tracks[role] = track
+        try:
+            values = source.readers[topic.msgtype](Reading(topic.name, found, content, static, lost > 0, notes))
+        except DatasetError as error:
+            raise DatasetError(f"{bag.path}: {error}") from error
+        track = Track(source, topic.name, topic.msgtype, times, found.order, values, stamps, source.names)
+        tracks += [_finite(bag, one, notes) for one in _complete(track)]
     notes += pace_warnings(paces)
-    _check_one_time(bag, wanted["odom" if "odom" in wanted else next(iter(wanted))].name, clocks)
+    _check_one_time(bag, wanted[0][1].name, clocks)
     return tracks
 
 
-def _unset(role: str, decoded: Sequence[Any], options: ImportOptions) -> NDArray[np.bool_]:
-    """Return which messages have an orientation that was never set, shape (n,), or, of other topics, (1,)."""
-    if role != "odom" or not options.pose:
-        return np.zeros(1, np.bool_)
-    return ~np.any(numbers([message.pose.pose.orientation for message in decoded], WXYZ), axis=1)
+def _complete(track: Track) -> list[Track]:
+    """Return a track for each set of numbers that come together: a topic may have messages of some joints each."""
+    missing = np.ma.getmaskarray(track.values)
+    if not missing.any():
+        return [track]
+    tracks = []
+    patterns, which = np.unique(missing, axis=1, return_inverse=True)
+    for number, pattern in enumerate(patterns.T):
+        columns = np.flatnonzero(which.reshape(-1) == number)
+        part = track.rows(np.flatnonzero(~pattern))
+        names = tuple(track.names[column] for column in columns)
+        tracks.append(replace(part, values=np.asarray(part.values[:, columns]), names=names))
+    return tracks
+
+
+def _finite(bag: Bag, track: Track, notes: list[str]) -> Track:
+    """Return a track without the messages whose numbers are none; note how many there were."""
+    values = np.asarray(track.values)
+    fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
+    finite = np.logical_and.reduce(fits, axis=1)
+    angles = [column for column, name in enumerate(track.names) if name in track.source.angles]
+    others = [column for column in range(values.shape[1]) if column not in angles]
+    unset = ~finite & fits[:, others].all(axis=1) & np.isnan(values[:, angles]).any(axis=1)
+    what = "are no scan of a whole turn" if track.source.is_turned else "with values that are not finite"
+    for lost, text in ((~finite & ~unset, what), (unset, f"have {_UNSET}")):
+        if lost.any():
+            notes.append(f"{track.topic}: {int(lost.sum())} of {len(finite)} messages {text}, left out")
+    if unset.all():
+        raise DatasetError(
+            f"{bag.path}: all messages of {track.topic} have {_UNSET}: its driver fills in no pose. Leave out "
+            + ("--odometry, or name another topic with --odom." if track.source.option == "--odom" else "the feature.")
+        )
+    if not finite.any():
+        raise DatasetError(f"{bag.path}: no message of {track.topic} has finite values.")
+    return replace(track, values=values).rows(np.flatnonzero(finite))
 
 
 def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:
@@ -132,27 +157,19 @@ def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, 
             )
 
 
-def _names(role: str, options: ImportOptions) -> tuple[str, ...]:
-    if role in options.parts:
-        return options.parts[role].names
-    scan = tuple(f"scan_{beam:03d}.pos" for beam in range(options.beams))
-    return {"scan": scan, "odom": TWIST + ODOMETRY * options.pose, "imu": GYRO, "cmd": TWIST}.get(role, ())
-
-
-def _decoded(bag: Bag, topic: Topic, messages: Messages) -> tuple[Messages, list[Any]]:
-    """Return the messages of a topic that can be read, and what is in them; of cameras, nothing is.
+def _decoded(bag: Bag, topic: Topic, messages: Messages, *, is_image: bool) -> tuple[Messages, list[Any]]:
+    """Return the messages of a topic that can be read, and what is in them; of images, nothing is.
 
     The others are as if they had been lost, and are counted. An image that is cut off is found when it is decoded.
     """
-    is_camera = topic.msgtype in TYPES["camera"]
     decoded: list[Any] = []
     mask = np.ones(len(messages.data), np.bool_)
     reason = ""
     for place, data in enumerate(messages.data):
         try:
-            if is_camera and len(data) < _HEADER_BYTES:
+            if is_image and len(data) < _HEADER_BYTES:
                 raise DatasetError(f"An image's message ends after {len(data)} bytes.")
-            decoded += [] if is_camera else [decode(topic.msgtype, data)]
+            decoded += [] if is_image else [decode(topic.msgtype, data)]
         except DatasetError as error:
             mask[place] = False
             reason = reason or str(error)
@@ -169,74 +186,10 @@ def _decoded(bag: Bag, topic: Topic, messages: Messages) -> tuple[Messages, list
     return messages.part(mask), decoded
 
 
-def _stamps(topic: Topic, messages: Messages, decoded: Sequence[Any]) -> Times | None:
-    if topic.msgtype == BareTwistPart.msgtype:
+def _stamps(topic: Topic, messages: Messages, decoded: Sequence[Any], *, is_image: bool) -> Times | None:
+    if not has_header(topic.msgtype):
         return None
-    return head_stamps(messages.data) if topic.msgtype in TYPES["camera"] else header_stamps(decoded)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """What decoding needs to know, and where its notes go."""
-
-    options: ImportOptions
-    static: frames.Static
-    static_lost: bool
-    notes: list[str]
-
-
-def _values(role: str, topic: Topic, messages: Messages, decoded: list[Any], reading: _Reading) -> Array:
-    if role in reading.options.parts:
-        return reading.options.parts[role].decode(decoded)
-    if role == "scan":
-        return _scans(topic, decoded, reading)
-    if role == "odom":
-        children = [message.child_frame_id for message in decoded]
-        frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
-        speeds, pose = odometry(decoded)
-        stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
-        measured = stamps if (np.diff(stamps) > 0).all() else messages.received
-        reading.notes.extend(speed_warnings(topic.name, measured, speeds, pose))
-        return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
-    if role == "cmd":
-        kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart
-        return kind(topic.name, ()).decode(decoded)
-    if role == "imu":
-        return GyroPart(topic.name, ()).decode(decoded)
-    return messages.order.astype(np.float64)[:, None]
-
-
-def _scans(topic: Topic, scans: Sequence[Any], reading: _Reading) -> Array:
-    options, notes = reading.options, reading.notes
-    frame = frames.the_frame(topic.name, [scan.header.frame_id for scan in scans])
-    rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
-    if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
-        raise DatasetError(
-            f"Messages of /tf_static cannot be read, and with them may be lost how the scanner of {topic.name} is "
-            "turned. Say where its zero points with --scan_yaw (0 is straight ahead)."
-        )
-    if not np.allclose(rotation, np.eye(3), atol=1e-3):
-        ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
-        over = ", upside down" if rotation[2, 2] < 0 else ""
-        notes.append(f"{topic.name}: the scanner is turned by {ahead:.1f} degrees{over}, from {source}")
-    counts = {len(scan.ranges) for scan in scans}
-    if counts != {options.beams}:
-        few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
-        notes.append(f"{topic.name}: scans of {few} beams became {options.beams}, each the nearest by angle")
-    reach = min((scan.range_max for scan in scans if scan.range_max > 0), default=np.inf)
-    if reach < options.lidar.range_max * (1 - 1e-6):
-        notes.append(
-            f"{topic.name}: the scanner sees to {reach:.2f} m (range_max); where nothing came back, the dataset "
-            f"has {options.lidar.range_max:g} m all the same"
-        )
-    return resampled_scans(
-        [scan.ranges for scan in scans],
-        {name: np.array([getattr(scan, name) for scan in scans]) for name in GEOMETRY},
-        lidar=options.lidar,
-        beams=options.beams,
-        rotation=rotation,
-        topic=topic.name,
-    )
+    return head_stamps(messages.data) if is_image else header_stamps(decoded)
 
 
 def seconds(nanoseconds: int) -> str:

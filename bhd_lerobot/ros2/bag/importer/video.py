@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.episode import EpisodeWriter
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import Times, newest
@@ -13,27 +12,34 @@ from bhd_lerobot.ros2.bag.importer.tracks import MOST_LOST, Track
 from bhd_lerobot.ros2.bag.storage.read import Bag
 from bhd_lerobot.ros2.messages.images import decode_image
 
-CAMERA = "camera/"
-"""What the role of a camera's track begins with; its name follows."""
-
 _TRIED = 10  # images at the beginning, of which one must be readable
 
 
 class CameraImages:
     """One camera."""
 
-    def __init__(self, bag: Bag, role: str, track: Track, notes: list[str]) -> None:
-        self.role, self.name = role, role.removeprefix(CAMERA)
+    def __init__(self, bag: Bag, track: Track, notes: list[str]) -> None:
+        self.key = track.source.feature
         self._bag, self._track, self._notes = bag, track, notes
         self._messages = bag.messages((track.topic,))
         self._place, self._payload = -1, b""  # the newest message that was read
         self._image: NDArray[np.uint8] | None = None  # of that message, once it is decoded
+
+    def of(self, tracks: Sequence[Track]) -> Track:
+        """Return its track among others."""
+        return next(track for track in tracks if track.source.feature == self.key)
 
     def shape(self) -> tuple[int, int, int]:
         """Return the shape of its images."""
         height, width, channels = self._decode(
             self._track, self._first(self._track, range(len(self._track.times)))
         ).shape
+        wanted = self._track.source.size
+        if any(wanted) and wanted != (height, width):
+            raise DatasetError(
+                f"The images of {self._track.topic} have {width} x {height} pixels; the mapping says {wanted[1]} x "
+                f"{wanted[0]}. Give the size that they have, or leave width and height out."
+            )
         return height, width, channels
 
     def blind(self, track: Track, times: Times) -> int:
@@ -74,7 +80,7 @@ class CameraImages:
                 before = row
             assert image is not None
             shown[frame] = good
-            writer.add_image(f"{keys.OBSERVATION_IMAGES}.{self.name}", image)
+            writer.add_image(self.key, image)
         if broken:
             self._notes.append(
                 f"{track.topic}: {broken} of {total} images of an episode cannot be decoded; the previous image takes "

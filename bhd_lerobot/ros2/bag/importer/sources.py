@@ -1,0 +1,258 @@
+"""What is read of a bag: which topic carries which numbers of the dataset, and how they are in its messages."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.ros2.bag.importer import frames
+from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
+from bhd_lerobot.ros2.bag.storage.read import Messages
+from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
+from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
+from bhd_lerobot.ros2.messages.mapping import QUATERNION, SCAN, MappingConfig, TopicFields, topics_of
+from bhd_lerobot.ros2.messages.parts import Part, header_stamps
+from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The messages of a topic, what reading them needs to know beside them, and where its notes go.
+
+    Attributes:
+        decoded: what is in the messages; nothing of images.
+        static: the transforms of ``/tf_static``.
+        static_lost: whether some of them cannot be read.
+    """
+
+    topic: str
+    messages: Messages
+    decoded: Sequence[Any]
+    static: frames.Static
+    static_lost: bool
+    notes: list[str]
+
+
+type Reader = Callable[[Reading], Array]
+"""Returns the values in the messages of a topic, shape (n, names); masked where a message does not have one."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What one topic carries of the dataset.
+
+    Attributes:
+        key: what it is called where the dataset says how it was made.
+        topic: its name.
+        feature: of the dataset: the state, the environment's state, the action, or the images of a camera.
+        names: of its numbers in the feature; none of images.
+        readers: type that the topic's messages may have -> what reads them.
+        meaning: what is read from it, for messages.
+        option: what names the topic.
+        remedy: if it is missing, instead of the option.
+        is_turned: whether ``/tf_static`` states how the sensor is mounted.
+        angles: those of the names that are yaws, which count on beyond half a turn, and a whole turn of each.
+        size: height and width that images must have [px]; 0 for any.
+    """
+
+    key: str
+    topic: str
+    feature: str
+    names: tuple[str, ...]
+    readers: Mapping[str, Reader]
+    meaning: str
+    option: str = "--map"
+    remedy: str = ""
+    is_turned: bool = False
+    angles: Mapping[str, float] = field(default_factory=dict)
+    size: tuple[int, int] = (0, 0)
+
+    @property
+    def is_action(self) -> bool:
+        """Whether it carries commands, which stay in force, and no readings of a sensor."""
+        return self.feature == keys.ACTION
+
+
+def mapped_sources(
+    mapping: MappingConfig, scan_frame: str | None = None, scan_yaw: float | None = None
+) -> list[Source]:
+    """Return what is read for a mapping.
+
+    Args:
+        scan_frame, scan_yaw: the scanner's frame, and its angle in the robot [rad], if the user gives them.
+
+    Raises:
+        ConfigError: a type is not known, or has no such field, or it is no number.
+    """
+    found = []
+    for feature, section in ((keys.OBSERVATION_STATE, mapping.observation), (keys.ACTION, mapping.action)):
+        place = feature.removesuffix(".state")
+        numbers = {name: one for name, one in section.items() if not one.beams}
+        try:
+            topics = topics_of(numbers, mapping.types)
+        except ConfigError as error:
+            raise ConfigError(f"The mapping's {place}: {error}") from error
+        for topic in topics:
+            names = tuple(list(numbers)[column] for column in topic.columns)
+            yaws = zip(names, topic.fields, topic.scales.tolist(), strict=True)
+            angles = {name: 2 * np.pi * abs(scale) for name, one, scale in yaws if one.kind == QUATERNION}
+            angles = angles if feature == keys.OBSERVATION_STATE else {}
+            key, readers = f"{feature}{topic.topic}", {topic.msgtype: partial(_fields, topic, names, angles)}
+            meaning = f"{place}.{names[0]}" + f" and {len(names) - 1} more" * (len(names) > 1)
+            found.append(Source(key, topic.topic, feature, names, readers, meaning, angles=angles))
+        for name, one in section.items():
+            if one.beams:
+                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
+                reader = partial(_scans, lidar, scan_frame, scan_yaw)
+                topic_name, names = "/" + one.topic.lstrip("/"), one.names(name)
+                key, meaning = f"{feature}{topic_name}", f"{place}.{name}"
+                found.append(Source(key, topic_name, feature, names, {SCAN: reader}, meaning, is_turned=True))
+    for name, camera in mapping.images.items():
+        feature = f"{keys.OBSERVATION_IMAGES}.{name}"
+        topic_name, size = "/" + camera.topic.lstrip("/"), (camera.height, camera.width)
+        of_images: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
+        found.append(Source(feature, topic_name, feature, (), of_images, f"images.{name}", size=size))
+    return found
+
+
+def exported_sources(parts: Mapping[str, Sequence[Part]], cameras: Mapping[str, str]) -> list[Source]:
+    """Return what is read of an exported bag.
+
+    Args:
+        parts: of its vectors, by feature.
+        cameras: name -> topic.
+    """
+    remedy = "It is listed in /bhd/episode. Export the dataset again."
+    found = [
+        Source(
+            f"{feature}{part.topic}", part.topic, feature, part.names, {part.msgtype: partial(_part, part)}, feature,
+            "/bhd/episode", remedy,
+            angles=dict.fromkeys(part.names[4:], 2 * np.pi) if isinstance(part, OdometryPart) else {},
+        )
+        for feature, several in parts.items()
+        for part in several
+    ]  # fmt: skip
+    for name, topic in cameras.items():
+        feature = f"{keys.OBSERVATION_IMAGES}.{name}"
+        readers: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
+        found.append(Source(f"camera/{name}", topic, feature, (), readers, feature, "/bhd/episode", remedy))
+    return found
+
+
+def base_sources(
+    mapping: MappingConfig, bare: MappingConfig, odom_frame: str | None, scan_frame: str | None, scan_yaw: float | None
+) -> list[Source]:
+    """Return what is read of a TurtleBot3's bag, named by the options that choose its topics.
+
+    Args:
+        mapping: of its preset, for commands with stamps.
+        bare: the same for commands without.
+        odom_frame: of its base, if the user names it.
+        scan_frame, scan_yaw: see `mapped_sources`.
+    """
+    found = []
+    bare_readers = {one.feature: one.readers for one in mapped_sources(bare) if one.is_action}
+    for source in mapped_sources(mapping, scan_frame, scan_yaw):
+        (first, *_) = source.readers
+        role = "cmd" if source.is_action else _ROLES[first]
+        readers = {**source.readers, **bare_readers.get(source.feature, {})}
+        if role == "odom":
+            readers = {first: partial(_odometry, readers[first], odom_frame)}
+        key = f"camera/{source.feature.rpartition('.')[2]}" if role == "camera" else role
+        found.append(replace(source, key=key, readers=readers, meaning=_MEANING[role], option=f"--{role}"))
+    return found
+
+
+_IMAGES = (IMAGE, COMPRESSED)
+_ROLES = {SCAN: "scan", OdometryPart.msgtype: "odom", GyroPart.msgtype: "imu", IMAGE: "camera"}
+_MEANING = {
+    "scan": "the scan",
+    "odom": "the robot's speed",
+    "cmd": "the action",
+    "imu": "the yaw rate of the gyroscope",
+    "camera": "the image",
+}
+
+
+def _places(reading: Reading) -> Array:
+    """Return the places of images in the bag."""
+    return reading.messages.order.astype(np.float64)[:, None]
+
+
+def _part(part: Part, reading: Reading) -> Array:
+    return part.decode(reading.decoded)
+
+
+def _fields(fields: TopicFields, names: Sequence[str], angles: Mapping[str, float], reading: Reading) -> Array:
+    """Return the fields of messages; a joint state of some joints has some of them."""
+    values = np.zeros((len(reading.decoded), len(names)))
+    missing = np.zeros_like(values, np.bool_)
+    reasons: dict[str, None] = {}
+    for row, message in enumerate(reading.decoded):
+        try:
+            values[row] = fields.read(message)
+        except DatasetError as error:
+            reasons[str(error)] = None
+            values[row], missing[row] = fields.read_present(message)
+    lacking = [name for name, column in zip(names, missing.T, strict=True) if column.all()]
+    if lacking and len(values):
+        raise DatasetError(
+            f"No message of {reading.topic} has what {', '.join(lacking)} is read from: {' '.join(list(reasons)[:3])}"
+        )
+    for column, name in enumerate(names):
+        if name in angles:
+            rows = ~missing[:, column]
+            values[rows, column] = unwrapped(values[rows, column], angles[name])
+    return np.ma.masked_array(values, missing) if missing.any() else values
+
+
+def _odometry(read: Reader, frame: str | None, reading: Reading) -> Array:
+    """Return the fields of a base's odometry; note speeds that are not those of its pose."""
+    topic, decoded = reading.topic, reading.decoded
+    children = [message.child_frame_id for message in decoded]
+    frames.check_base_frame(topic, frames.the_frame(topic, children), frame)
+    stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
+    measured = stamps if (np.diff(stamps) > 0).all() else reading.messages.received
+    reading.notes.extend(speed_warnings(topic, measured, *odometry(decoded)))
+    return read(reading)
+
+
+def _scans(lidar: LidarSpec, scan_frame: str | None, scan_yaw: float | None, reading: Reading) -> Array:
+    topic, scans, notes = reading.topic, reading.decoded, reading.notes
+    frame = frames.the_frame(topic, [scan.header.frame_id for scan in scans])
+    rotation, source = frames.scanner_rotation(topic, frame, reading.static, scan_frame, scan_yaw)
+    if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
+        raise DatasetError(
+            f"Messages of /tf_static cannot be read, and with them may be lost how the scanner of {topic} is "
+            "turned. Say where its zero points with --scan_yaw (0 is straight ahead)."
+        )
+    if not np.allclose(rotation, np.eye(3), atol=1e-3):
+        ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        over = ", upside down" if rotation[2, 2] < 0 else ""
+        notes.append(f"{topic}: the scanner is turned by {ahead:.1f} degrees{over}, from {source}")
+    counts = {len(scan.ranges) for scan in scans}
+    if counts != {lidar.beams}:
+        few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
+        notes.append(f"{topic}: scans of {few} beams became {lidar.beams}, each the nearest by angle")
+    reach = min((scan.range_max for scan in scans if scan.range_max > 0), default=np.inf)
+    if reach < lidar.range_max * (1 - 1e-6):
+        notes.append(
+            f"{topic}: the scanner sees to {reach:.2f} m (range_max); where nothing came back, the dataset "
+            f"has {lidar.range_max:g} m all the same"
+        )
+    return resampled_scans(
+        [scan.ranges for scan in scans],
+        {name: np.array([getattr(scan, name) for scan in scans]) for name in GEOMETRY},
+        lidar=lidar,
+        beams=lidar.beams,
+        rotation=rotation,
+        topic=topic,
+    )

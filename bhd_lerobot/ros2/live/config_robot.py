@@ -1,0 +1,32 @@
+"""Configuration of any robot on a ROS 2 network."""
+
+from dataclasses import dataclass, field
+
+from lerobot.robots.config import RobotConfig
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.ros2.live.network import Ros2Config
+
+
+@RobotConfig.register_subclass("ros2")
+@dataclass(kw_only=True)
+class Ros2RobotConfig(RobotConfig):
+    """Configuration of the robot type ``ros2``: any robot on a ROS 2 network.
+
+    Attributes:
+        mapping: YAML file that says which field of which topic is which feature, see "Use ROS 2".
+        ros2: the network.
+        stop: values of actions that stop the robot, sent when no action comes for `ros2.timeout_s`; by default 0 for
+            the topics whose actions all are speeds (``.vel``), and nothing for the others, which hold their positions.
+        topic_timeout_s: a topic that sends nothing for so long is a fault [s].
+    """
+
+    mapping: str
+    ros2: Ros2Config = field(default_factory=Ros2Config)
+    stop: dict[str, float] = field(default_factory=dict)
+    topic_timeout_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.topic_timeout_s < float("inf"):
+            raise ConfigError(f"robot.topic_timeout_s is {self.topic_timeout_s}; it is positive and finite.")

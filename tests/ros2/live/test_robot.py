@@ -1,0 +1,113 @@
+"""Any ROS 2 robot as a LeRobot robot: a stand-in for a TurtleBot3, by rclpy, described by a mapping."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError
+from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.live.robot import Ros2Robot
+from tests.ros2.peer_env import Peer
+from tests.waiting import until
+
+TWIST = "type: geometry_msgs/msg/TwistStamped"
+MAPPING = f"""
+observation:
+  x.vel: {{topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}}
+  scan: {{topic: /scan, type: sensor_msgs/msg/LaserScan, beams: 8, range_min: 0.12, range_max: 3.5}}
+  left.pos: {{topic: /joint_states, type: sensor_msgs/msg/JointState, field: "position[name=wheel_left_joint]"}}
+action:
+  x.vel: {{topic: /cmd_vel, {TWIST}, field: twist.linear.x}}
+  theta.vel: {{topic: /cmd_vel, {TWIST}, field: twist.angular.z}}
+"""
+FORWARD = {"x.vel": 0.1, "theta.vel": 0.0}
+
+
+def config_of(tmp_path: Path, domain: int, text: str = MAPPING, **options: object) -> Ros2RobotConfig:
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    return Ros2RobotConfig(mapping=str(path), ros2=Ros2Config(domain=domain), **options)  # type: ignore[arg-type]
+
+
+def speed(robot: Ros2Robot, action: dict[str, float] | None) -> Callable[[], float]:
+    def step() -> float:
+        if action is not None:
+            robot.send_action(action)
+        observation: float = robot.get_observation()["x.vel"]
+        return observation
+
+    return step
+
+
+def test_observations_actions_and_the_stop_when_actions_cease(tmp_path: Path, domain: int) -> None:
+    robot = Ros2Robot(config_of(tmp_path, domain))
+    assert list(robot.observation_features) == ["x.vel", *(f"scan_{k:03d}.pos" for k in range(8)), "left.pos"]
+    assert list(robot.action_features) == ["x.vel", "theta.vel"]
+    with Peer("standin_turtlebot3.py", "--open", domain=domain) as peer:
+        peer.wait_event("ready")
+        robot.connect()
+        try:
+            before = robot.get_observation()
+            assert all(np.isfinite(value) for value in before.values())
+            forward, nothing = speed(robot, FORWARD), speed(robot, None)
+            until(lambda: forward() > 0.08, "it drives")
+            assert robot.get_observation()["left.pos"] > before["left.pos"]
+            until(lambda: abs(nothing()) < 0.01, "it stands without actions")
+            for wrong in ({"x.vel": 0.1}, {"x.vel": np.nan, "theta.vel": 0.0}):
+                with pytest.raises(ActionError):
+                    robot.send_action(wrong)
+            until(lambda: forward() > 0.08, "it drives again")
+            peer.signal(9)
+            with pytest.raises(RealtimeError, match=r"no message for|any more"):
+                until(lambda: [forward(), False][1], "its end is noticed")
+        finally:
+            robot.disconnect()
+
+
+@pytest.mark.thorough
+def test_stock_lerobot_record(tmp_path: Path, domain: int) -> None:
+    config_of(tmp_path, domain)
+    root = tmp_path / "data"
+    with Peer("standin_turtlebot3.py", "--open", domain=domain) as peer:
+        peer.wait_event("ready")
+        subprocess.run(
+            [
+                *(
+                    sys.executable,
+                    "-c",
+                    "import pty, sys; sys.exit(pty.spawn(sys.argv[1:]) >> 8)",
+                ),  # keys of a terminal
+                *(Path(sys.executable).parent / "lerobot-record", "--robot.type=ros2"),
+                f"--robot.mapping={tmp_path / 'robot.yaml'}",
+                f"--robot.ros2.domain={domain}",
+                *("--teleop.type=bhd_keyboard_base", "--dataset.repo_id=me/drives", f"--dataset.root={root}"),
+                *("--dataset.num_episodes=1", "--dataset.episode_time_s=2", "--dataset.reset_time_s=0"),
+                *("--dataset.single_task=Drive.", "--dataset.push_to_hub=false", "--play_sounds=false"),
+            ],
+            check=True,
+            stdin=subprocess.DEVNULL,
+        )
+    dataset = LeRobotDataset("me/drives", root)
+    assert dataset.num_frames > 10
+    assert dataset[0]["observation.state"].shape == (10,)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (MAPPING + "images: {front: {topic: /image}}", {}, "images.front has no width and height"),
+        (MAPPING, {"stop": {"y.vel": 0.0}}, "Did you mean 'x.vel'"),
+        (MAPPING.replace("linear.x}", "linear.w}"), {}, "Did you mean|Unknown field"),
+    ],
+)
+def test_a_mapping_that_cannot_be_used_is_refused(
+    tmp_path: Path, text: str, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Ros2Robot(config_of(tmp_path, 1, text, **options))
