@@ -68,7 +68,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.timing": (*_DATASETS, "control"),
     "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),
     "ros2.live": ("bodies", "control", "ros2.messages"),
-    "ros2.serve": ("bodies", "control", "robots", "robots.host", "ros2.live", "ros2.messages"),
+    "ros2.serve": (
+        *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
+        *("robots", "robots.host", "ros2.live", "ros2.messages"),
+    ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
     "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
     "ros2.bag.importer": (
