@@ -5,9 +5,6 @@ With BHD_TRIALS=full the first lasts ten minutes: `BHD_TRIALS=full pytest tests/
 
 import os
 import signal
-import re
-import signal
-import signal
 from pathlib import Path
 from typing import Any
 
