@@ -40,7 +40,7 @@ class PerceptionError(BhdError):
 
 
 class CommandRefusedError(BhdError):
-    """The cerebellum refused a well-formed command, for example because the emergency stop is latched."""
+    """The cerebellum, or a server of a ROS 2 action, refused a well-formed command."""
 
 
 class SimulationError(BhdError):

@@ -3,6 +3,7 @@
 python scripts/make_reference.py
 """
 
+import argparse
 import ast
 import dataclasses
 import inspect
@@ -18,6 +19,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 import bhd_lerobot.plugin  # noqa: F401  registers the teleoperators
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
+from bhd_lerobot.cli import ros2
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
@@ -53,6 +55,7 @@ written `null`.
 | [`bhd-replay`](options/replay.md) | of a replay |
 | [`bhd-eval`](options/eval.md) | of an evaluation, also with `env` |
 | [`bhd-train`](options/train.md) | of a training, also with `algorithm: ppo` and `algorithm: dagger` |
+| [`bhd-ros2 topics`](options/ros2.md) | of what is on a ROS 2 network |
 | [`teleop`](options/teleop.md) | of each teleoperator of ours, for LeRobot's own commands, too |
 | [`robot`](options/robot.md), [`brain`](options/brain.md), [`task`](options/task.md) | of each type |
 """
@@ -103,6 +106,7 @@ def pages() -> dict[Path, str]:
             f"## `teleop.type={chosen}`\n",
             *_options(one, "teleop.", "teleop.md", listed, own),
         ]
+    texts["ros2"] = ["# `bhd-ros2 topics`\n", *_commands(ros2.topics_parser(), "bhd-ros2 topics")]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():
         page = "\n".join(parts)
@@ -186,6 +190,20 @@ def _options(
         yield from _options(one, inner_prefix, page, listed)
 
 
+def _commands(parser: argparse.ArgumentParser, program: str) -> Iterator[str]:
+    """Yield the table of each command of a parser."""
+    (commands,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
+    for name, command in commands.choices.items():
+        yield f"### `{program} {name}`\n"
+        yield f"{str(command.description).capitalize()}.\n"
+        rows = [
+            (f"`{' '.join(filter(None, (*one.option_strings, one.metavar)))}`", one.help)
+            for one in command._actions
+            if one.dest != "help"
+        ]
+        yield _table(("option", "meaning"), rows)
+
+
 def _introduction(config_class: type) -> Iterator[str]:
     summary = summary_of(config_class)
     if not summary.startswith("Configuration of the"):  # the heading says that
@@ -204,10 +222,10 @@ def _plain(value: Any) -> str:
 
 
 def _type_name(kind: Any) -> str:
-    arguments = typing.get_args(kind)
+    arguments = tuple(one for one in typing.get_args(kind) if one is not ...)
     if arguments and typing.get_origin(kind) is dict:
         return f"{_type_name(arguments[1])} for each name"
-    if arguments and typing.get_origin(kind) is not list:
+    if arguments and typing.get_origin(kind) not in (list, tuple):
         return " or ".join("nothing" if one is type(None) else _type_name(one) for one in arguments)
     if arguments:
         return f"list of {_type_name(arguments[0])}"

@@ -67,7 +67,6 @@ class BhdRobotConfig(RobotConfig):
         if self.plant == "ros2":
             self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
             self.clock = "realtime"
-            # The topics of a TurtleBot3 come at 20 Hz; four of them may be lost.
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silence_s)
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
         if self.plant:

@@ -98,6 +98,8 @@ def test_every_command_names_the_nearest_option_with_status_2(capsys: pytest.Cap
         ("cli.data.main", ["chek"]),
         ("cli.monitor", ["--oncee"]),
         ("cli.doctor", ["--jsonn"]),
+        ("cli.ros2", ["topics", "list", "--domian=1"]),
+        ("cli.ros2", ["topics", "lst"]),
     ):
         try:
             status = importlib.import_module(f"bhd_lerobot.{module}").main(arguments)

@@ -4,6 +4,7 @@ __all__ = [
     "arm_plant",
     "base_plant",
     "channel",
+    "clients",
     "clock_offset",
     "config_robot",
     "graph",
@@ -15,4 +16,5 @@ __all__ = [
     "robot",
     "spec",
     "topic_types",
+    "topics",
 ]

@@ -12,7 +12,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.plant import Ros2Plant
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
-from bhd_lerobot.ros2.messages.base import SCAN_FRAME, BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
+from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -115,14 +115,21 @@ class BasePlant(Ros2Plant):
         node_silence = max(_NODE_SILENCE_S, config.ros2.silence_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
-            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), silence_s=node_silence),
+            InputSpec(
+                "/joint_states",
+                JOINT_STATE,
+                WheelReader(body.drive.wheel_radius),
+                silence_s=node_silence,
+                has_one_source=True,
+            ),
             InputSpec(
                 "/scan",
                 ScanPart.msgtype,
                 ScanReader("/scan", body.lidar, beams),
                 SENSOR_DATA,
                 max(_SCAN_SILENCE_S, config.ros2.silence_s),
-                SCAN_FRAME,
+                config.ros2.scan_frame,
+                has_one_source=True,
             ),
         ]
         if config.imu:

@@ -10,7 +10,7 @@ from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.live.topic_types import ros_type_name
 
 _GID_BYTES = {"humble": 24}  # 16 since Iron
-_PREFIX = "rt/"  # of topics; services have others
+_TOPICS, _REQUESTS = "rt", "rq"  # what names of topics and of requests to services begin with
 _MOST = 10_000
 
 
@@ -98,19 +98,19 @@ class Graph:
             self._update()
             return sorted(name for names in self._nodes.values() for name in names)
 
-    def endpoints(self) -> list[Endpoint]:
-        """Return all publishers and subscriptions of topics, sorted by topic."""
+    def endpoints(self, prefix: str = _TOPICS) -> list[Endpoint]:
+        """Return all publishers and subscriptions of topics, sorted by topic; with another prefix, of services."""
         with self._lock:
             self._update()
             owners = {gid: name for owned in self._owners.values() for gid, name in owned.items()}
             found = []
             for is_publisher, reader in self._endpoints.items():
                 for one in reader.read(_MOST):
-                    if not one.sample_info.valid_data or not one.topic_name.startswith(_PREFIX):
+                    if not one.sample_info.valid_data or not one.topic_name.startswith(f"{prefix}/"):
                         continue
                     found.append(
                         Endpoint(
-                            one.topic_name.removeprefix(_PREFIX[:-1]),
+                            one.topic_name.removeprefix(prefix),
                             ros_type_name(one.type_name),
                             _qos_of(one.qos),
                             is_publisher,
@@ -119,6 +119,14 @@ class Graph:
                         )
                     )
         return sorted(found, key=lambda one: (one.topic, not one.is_publisher, one.node))
+
+    def services(self) -> dict[str, str]:
+        """Return the types of all services that have a server, by name, sorted."""
+        return {
+            one.topic.removesuffix("Request"): one.msgtype.removesuffix("_Request")
+            for one in self.endpoints(_REQUESTS)
+            if not one.is_publisher
+        }
 
     def _update(self) -> None:
         for sample in self._reader.take(_MOST):
@@ -155,7 +163,7 @@ class Graph:
                 found.append(f"{who} is of type {one.msgtype}; the {ours} here is of {msgtype}.")
             else:
                 offered, wanted = (qos, one.qos) if is_publisher else (one.qos, qos)
-                if wanted.reliable > offered.reliable or wanted.transient_local > offered.transient_local:
+                if not offered.serves(wanted):
                     found.append(f"{who} is {one.qos}; the {ours} here is {qos}, and no message passes.")
         return found
 

@@ -24,12 +24,14 @@ class Received:
         data: it, serialised.
         sent_ns: when it was sent, on the sender's wall clock [ns].
         arrived_ns: when it was taken, on the monotonic clock of this machine [ns].
+        sender: its publisher, one of `Subscription.sender_ids`.
     """
 
     msgtype: str
     data: bytes
     sent_ns: int
     arrived_ns: int
+    sender: int = 0
 
     def message(self) -> Any:
         """Return it deserialised.
@@ -76,15 +78,20 @@ class Subscription:
         samples = self.reader.take(_MOST)
         now = time.monotonic_ns()
         return [
-            Received(self.msgtype, sample.data, sample.sample_info.source_timestamp, now)
+            Received(self.msgtype, sample.data, info.source_timestamp, now, info.publication_handle)
             for sample in samples
-            if sample.sample_info.valid_data
+            if (info := sample.sample_info).valid_data
         ]
 
     @property
     def senders(self) -> int:
         """How many publishers fit, of any node; one that was killed counts for up to 20 s more."""
-        return len(self.reader.get_matched_publications())
+        return len(self.sender_ids)
+
+    @property
+    def sender_ids(self) -> list[int]:
+        """The publishers that fit."""
+        return list(self.reader.get_matched_publications())
 
 
 class Node:
@@ -127,13 +134,22 @@ class Node:
         """Return a topic's name with the namespace in front, unless it begins with a slash."""
         return topic if topic.startswith("/") else f"{self.namespace.rstrip('/')}/{topic}"
 
-    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None) -> Publisher:
-        """Return a publisher."""
-        return Publisher(*self._writer(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
+    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt") -> Publisher:
+        """Return a publisher; with another prefix it is part of a service."""
+        return Publisher(*self._writer(f"{prefix}{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
 
-    def subscription(self, topic: str, msgtype: str, qos: Qos | None = None) -> Subscription:
-        """Return a subscription."""
-        return Subscription(self._reader(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
+    def subscription(
+        self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt", *, wakes: bool = True
+    ) -> Subscription:
+        """Return a subscription; with another prefix it is part of a service.
+
+        Args:
+            topic, msgtype, qos: see `Subscription`.
+            prefix: what its name on the network begins with.
+            wakes: whether its messages end `wait`.
+        """
+        reader = self._reader(f"{prefix}{self.full_name(topic)}", msgtype, qos or Qos(), wakes=wakes)
+        return Subscription(reader, topic, msgtype)
 
     def wait(self, timeout_s: float) -> None:
         """Return when a message has arrived on a subscription, or after a time [s]."""
@@ -154,14 +170,16 @@ class Node:
         self.graph.add(writer.guid, is_writer=True)
         return writer, topic_type(msgtype)
 
-    def _reader(self, name: str, msgtype: str, qos: Qos) -> Any:
+    def _reader(self, name: str, msgtype: str, qos: Qos, *, wakes: bool) -> Any:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
         reader = DataReader(self._participant, self._topic(name, msgtype), qos.of_dds(_type_hash(msgtype)))
-        anything = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
-        self._waiting.attach(anything)
-        self._entities += [reader, anything]
+        self._entities.append(reader)
+        if wakes:
+            anything = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
+            self._waiting.attach(anything)
+            self._entities.append(anything)
         self.graph.add(reader.guid, is_writer=False)
         return reader
 

@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,17 +27,18 @@ class Ros2Plant(Plant):
     command_hz: float
 
     def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
+        network = config.ros2
         spec = NodeSpec(
             f"bhd_{name}_{os.getpid()}",
-            config.ros2,
-            inputs,
-            outputs,
-            command_hz=config.ros2.command_hz or self.command_hz,
-            timeout_s=config.ros2.timeout_s,
+            network,
+            tuple(replace(one, topic=network.in_namespace(one.topic)) for one in inputs),
+            tuple(replace(one, topic=network.in_namespace(one.topic)) for one in outputs),
+            command_hz=network.command_hz or self.command_hz,
+            timeout_s=network.timeout_s,
         )
         self.link = NodeLink(spec)
         self._parts = spec.columns
-        self._silence_s = config.ros2.silence_s
+        self._silence_s = network.silence_s
         self._enabled = False
 
     def open(self) -> None:

@@ -26,7 +26,7 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 from bhd_lerobot.ros2.messages.images import decode_image
 
 _WAIT_S = 0.02
-_CHECK_NS = 1_000_000_000  # between two looks at who else is there
+_CHECK_NS = 500_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
 _TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
@@ -113,6 +113,7 @@ class Receiver:
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
+        self._heard: list[dict[int, int]] = [{} for _ in self._inputs]  # publisher -> when it was heard last [ns]
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()
         self._intruders: set[str] = set()
@@ -132,7 +133,7 @@ class Receiver:
         now = time.monotonic_ns()
         if now - self._checked_ns > _CHECK_NS:
             self._checked_ns = now
-            self._network_problem = self._intrusion()
+            self._network_problem = self._intrusion() or self._twins(now)
         problem = (self._network_problem or self._silence(now)).encode()[:PROBLEM_BYTES]
         if news or problem != self._record["problem"]:
             self._record["problem"] = problem
@@ -160,6 +161,7 @@ class Receiver:
                 self._old_stamps[index] = newest
             self._stamps[index] = stamp
         self._wrong.pop(one.topic, None)
+        self._heard[index][received.sender] = received.arrived_ns
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
         record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
@@ -224,12 +226,25 @@ class Receiver:
         }
         # One that has just appeared may not have told its name yet, and may be the guard.
         self._intruders, self._others = now & self._others, now
+        self._channel.words[Word.OTHERS] = len(self._intruders)
+        self._channel.words[Word.CHECKS] += 1
         if not self._intruders:
             return ""
         return (
             f"Another node commands the robot: {', '.join(sorted(self._intruders))}. Stop it; one that was killed "
             "counts for up to 20 s more."
         )
+
+    def _twins(self, now_ns: int) -> str:
+        """Return which topic two publishers send to at a time, as text; empty if none. A robot may have restarted."""
+        for one, heard in zip(self._spec.inputs, self._heard, strict=True):
+            if one.has_one_source and sum(now_ns - last < _CHECK_NS for last in heard.values()) > 1:
+                everyone = self._node.graph.endpoints()
+                nodes = sorted({other.node for other in everyone if other.is_publisher and other.topic == one.topic})
+                return (
+                    f"Several nodes send {one.topic} at a time: {', '.join(nodes)}. Are there two robots of one name?"
+                )
+        return ""
 
     def _is_ours(self, endpoint: Endpoint) -> bool:
         return endpoint.is_own or endpoint.node == f"/{self._spec.name}_guard"

@@ -3,6 +3,7 @@
 __all__ = [
     "arm",
     "base",
+    "definitions",
     "fields",
     "images",
     "mapping",

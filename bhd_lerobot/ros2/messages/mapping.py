@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text, unknown_name
 from bhd_lerobot.ros2.messages.base import yaw_of
+from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -263,22 +264,6 @@ def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> l
             kinds = ", ".join(one.msgtype for one in found if one.topic == topic)
             raise ConfigError(f"{topic} is mapped with several types: {kinds}. A topic has one.")
     return found
-
-
-def register_types(types: Mapping[str, str]) -> None:
-    """Make further message types known.
-
-    Raises:
-        ConfigError: a definition cannot be read.
-    """
-    from rosbags.typesys import get_types_from_msg
-
-    store = type_store()
-    for name, text in types.items():
-        try:
-            store.register(get_types_from_msg(text, name))
-        except Exception as error:  # whatever rosbags' parser raises
-            raise ConfigError(f"The definition of {name} cannot be read: {as_text(error)}.") from error
 
 
 def _number(place: Field, value: Any) -> float:

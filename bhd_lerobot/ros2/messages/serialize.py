@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.ros2.messages.types import type_store
 
 Tree = Mapping[str, Any]
@@ -26,6 +26,63 @@ def encode(msgtype: str, fields: Tree, n: int) -> list[bytes]:
     """
     store = type_store()
     return [bytes(store.serialize_cdr(_message(msgtype, fields, row), msgtype)) for row in range(n)]
+
+
+def encode_one(msgtype: str, fields: Tree) -> bytes:
+    """Return one serialised message.
+
+    Args:
+        msgtype: its type.
+        fields: values by name; what is left out is zero, empty or nothing.
+
+    Raises:
+        ConfigError: there is no such field, or a value is not of its type.
+    """
+    _check_message(msgtype, fields, msgtype)
+    return encode(msgtype, fields, 1)[0]
+
+
+def _check_message(msgtype: str, fields: Any, where: str) -> None:
+    known = _definition(msgtype)[1]
+    if not isinstance(fields, Mapping):
+        raise ConfigError(f"{where} is {fields!r}; it is a mapping of {', '.join(known)}.")
+    for name, value in fields.items():
+        if name not in known:
+            raise ConfigError(unknown_name(f"field of {msgtype}", name, known))
+        _check(known[name], value, f"{name} of {msgtype}")
+
+
+def _check(description: Any, value: Any, where: str) -> None:
+    kind, inner = int(description[0]), description[1]
+    if kind == _NAME:
+        _check_message(inner, value, where)
+    elif kind == _BASE:
+        _check_base(inner[0], value, where)
+    else:
+        element, count = inner
+        if not isinstance(value, list | tuple) and not (isinstance(value, np.ndarray) and value.ndim == 1):
+            raise ConfigError(f"{where} is {value!r}; it is a list.")
+        if count and (len(value) != count if kind == _ARRAY else len(value) > count):
+            raise ConfigError(f"{where} has {len(value)} elements, not {'' if kind == _ARRAY else 'at most '}{count}.")
+        for place, one in enumerate(value):
+            _check(element, one, f"{where}, element {place},")
+
+
+def _check_base(name: str, value: Any, where: str) -> None:
+    is_truth = isinstance(value, bool)
+    if name == "string":
+        fits, wanted = isinstance(value, str), "text"
+    elif name == "bool":
+        fits, wanted = is_truth, "true or false"
+    elif name.startswith("float"):
+        fits, wanted = isinstance(value, int | float | np.number) and not is_truth, "a number"
+    else:
+        limits = np.iinfo("uint8" if name in ("octet", "char", "byte") else name)
+        is_whole = isinstance(value, int | np.integer) and not is_truth
+        fits = bool(is_whole and limits.min <= value <= limits.max)
+        wanted = f"a whole number from {limits.min} to {limits.max}"
+    if not fits:
+        raise ConfigError(f"{where} is {value!r}; it is {wanted}.")
 
 
 def decode(msgtype: str, data: bytes) -> Any:

@@ -150,6 +150,31 @@ def test_another_node_that_commands_the_robot_is_named(robot: Peer, plant: BaseP
         until(lambda: [plant.read(reading()), False][1], "it is noticed")
 
 
+def test_a_namespace_and_another_scanner(domain: int) -> None:
+    plant = make(domain, namespace="tb3_1", scan_frame="laser")  # type: ignore[arg-type]
+    assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
+    assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
+    assert plant.link.spec.inputs[1].frame == "laser"
+
+
+def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant: BasePlant, domain: int) -> None:
+    second = make(domain)
+    with pytest.raises(
+        RealtimeError, match=f"Another program of this machine commands /cmd_vel in ROS domain {domain}"
+    ):
+        second.open()
+    drive(plant, lambda: moves(robot), "the robot moves")
+    plant.read(reading())
+
+
+def test_two_robots_of_one_name_are_named(robot: Peer, plant: BasePlant, domain: int) -> None:
+    with (
+        Peer("standin_turtlebot3.py", domain=domain),
+        pytest.raises(RealtimeError, match=r"Several nodes send /(joint_states|scan) at a time: .*two robots"),
+    ):
+        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
+
 def test_a_network_with_nobody_is_named(domain: int) -> None:
     plant = make(domain)
     with pytest.raises(RealtimeError, match=r"Nobody publishes /joint_states .*No node publishes anything"):

@@ -1,0 +1,141 @@
+import json
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
+from bhd_lerobot.ros2.live.clients import ActionClient, GoalStatus, ServiceClient
+from bhd_lerobot.ros2.live.network import NetworkConfig
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.definitions import DEFINITIONS, find_type, register_types
+from bhd_lerobot.ros2.messages.types import type_store
+from tests.ros2.peer_env import Peer, environment
+
+SET_BOOL, TRIGGER, FIBONACCI = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger", "test_msgs/action/Fibonacci"
+NUMBERS = [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89]
+
+
+@pytest.fixture(autouse=True)
+def types() -> None:
+    register_types({FIBONACCI: "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"})
+
+
+@pytest.fixture
+def node(domain: int) -> Iterator[Node]:
+    with Node("client", NetworkConfig(domain=domain)) as node:
+        yield node
+
+
+@pytest.fixture
+def servers(domain: int) -> Iterator[Peer]:
+    with Peer("servers.py", domain=domain) as peer:
+        peer.wait_event("ready")
+        yield peer
+
+
+def test_definitions_are_those_of_ros() -> None:
+    """By the hashes that ROS computes of its own."""
+    share = environment().python.parents[1] / "share"
+    compared = 0
+    for name in (*DEFINITIONS, FIBONACCI):
+        package, kind, short = name.split("/")
+        file = share / package / kind / f"{short}.json"
+        if not file.exists():
+            continue
+        find_type(name)
+        for one in json.loads(file.read_text())["type_hashes"]:
+            if one["type_name"] in type_store().fielddefs:
+                assert type_store().hash_rihs01(one["type_name"]) == one["hash_string"], one["type_name"]
+                compared += one["type_name"].startswith(name)
+    assert compared == 4 * 2 + 8  # four services, and an action
+
+
+def test_every_request_to_a_service_has_its_reply_and_is_carried_out_once(domain: int, servers: Peer) -> None:
+    for calls in range(1, 4):  # a client that comes later has its first reply as well
+        with Node("client", NetworkConfig(domain=domain)) as node:
+            motors, odometry = (
+                ServiceClient(node, "/motor_power", SET_BOOL),
+                ServiceClient(node, "reset_odometry", TRIGGER),
+            )
+            for on in (True, False):
+                reply = motors.call({"data": on}, 60)
+                assert (reply.success, reply.message) == (True, f"motor power is {'on' if on else 'off'}")
+            assert odometry.call(timeout_s=60).message == str(calls)
+    assert [line["data"] for line in servers.events("motor_power")] == 3 * [True, False]
+
+
+def test_what_cannot_be_called_is_named(node: Node, servers: Peer) -> None:
+    ServiceClient(node, "/motor_power", SET_BOOL).wait_for_server(60)
+    ActionClient(node, "/fibonacci", FIBONACCI).send_goal({"order": 1}, timeout_s=60)
+    goals = ActionClient(node, "/fibonaci", FIBONACCI)
+    for call, kind, said in (
+        (lambda: ServiceClient(node, "/motor_powr", SET_BOOL).call(timeout_s=0.1), RealtimeError, "'/motor_power'?"),
+        (lambda: ServiceClient(node, "/x", SET_BOOL).call(timeout_s=0.1), RealtimeError, "Valid: /motor_power, /reset"),
+        (lambda: goals.send_goal({"order": 1}, timeout_s=0.1), RealtimeError, "'/fibonacci'?"),
+        (lambda: ServiceClient(node, "/reset_odometry", SET_BOOL).call(), ConfigError, f"{TRIGGER}; the client is of"),
+        (lambda: ServiceClient(node, "/motor_power", "std_srvs/srv/SetBol"), ConfigError, "'std_srvs/srv/SetBool'?"),
+        (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"dat": True}), ConfigError, "'data'?"),
+        (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"data": 1}), ConfigError, "is 1; it is true or"),
+        (lambda: ActionClient(node, "/fibonacci", FIBONACCI).send_goal({"order": 2**31}), ConfigError, "2147483647"),
+    ):
+        with pytest.raises(kind) as found:
+            call()
+        assert said in str(found.value)
+    assert not servers.events("motor_power")
+
+
+def test_no_reply_in_time_is_an_error_and_an_idempotent_request_is_sent_again(domain: int, node: Node) -> None:
+    with Peer("servers.py", "--busy", 2, domain=domain) as peer:
+        client = ServiceClient(node, "/motor_power", SET_BOOL)
+        client.wait_for_server(60)
+        with pytest.raises(RealtimeError, match=r"has not replied within 0.3 s. The request may have been carried out"):
+            client.call({"data": True}, 0.3)
+        assert client.call({"data": True}, 60, idempotent=True).success
+        peer.wait(lambda _: len(peer.events("motor_power")) >= 3, "three requests")
+
+
+@pytest.mark.parametrize("options", [(), ("--others", 0.05)], ids=["alone", "beside other clients"])
+def test_a_goal_has_its_own_feedback_and_result(domain: int, node: Node, options: tuple) -> None:
+    with Peer("servers.py", *options, domain=domain):
+        client = ActionClient(node, "/fibonacci", FIBONACCI)
+        for order in range(6, 13):
+            feedback: list = []
+            goal = client.send_goal({"order": order}, feedback.append, 60)
+            ended = goal.result(60)
+            assert ended.status == GoalStatus.SUCCEEDED
+            np.testing.assert_array_equal(ended.result.sequence, NUMBERS[:order])
+            for one in feedback:
+                np.testing.assert_array_equal(one.sequence, NUMBERS[: len(one.sequence)])
+            assert len(feedback) > 1
+        both = [client.send_goal({"order": order}) for order in (8, 9)]
+        assert [len(goal.result(60).result.sequence) for goal in reversed(both)] == [9, 8]
+
+
+def test_a_goal_is_refused_cancelled_or_aborted(node: Node, servers: Peer) -> None:
+    client = ActionClient(node, "/fibonacci", FIBONACCI)
+    with pytest.raises(CommandRefusedError, match="refuses the goal"):
+        client.send_goal({"order": 0}, timeout_s=60)
+    goal = client.send_goal({"order": 50})
+    with pytest.raises(RealtimeError, match=r"has not ended the goal within 0\.05 s"):
+        goal.result(0.05)
+    assert goal.cancel(60)
+    assert goal.result(60).status == GoalStatus.CANCELED
+    assert client.send_goal({"order": 120}).result(60).status == GoalStatus.ABORTED
+    goal = client.send_goal({"order": 60})
+    with pytest.raises(CommandRefusedError, match="refuses to cancel"):
+        goal.cancel(60)
+    assert goal.result(60).status == GoalStatus.SUCCEEDED
+    assert not goal.cancel()
+    assert [line["succeeded"] for line in servers.events("ended")] == [False, False, True]
+
+
+@pytest.mark.thorough(but=1)
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_server_that_leaves_during_a_goal_is_an_error(domain: int, node: Node, how: signal.Signals) -> None:
+    with Peer("servers.py", "--step", 0.5, domain=domain) as peer:
+        client = ActionClient(node, "/fibonacci", FIBONACCI)
+        goal = client.send_goal({"order": 40}, lambda _: peer.signal(how), 60)
+        with pytest.raises(RealtimeError, match="/fibonacci has left the network before the goal ended"):
+            goal.result(120)
