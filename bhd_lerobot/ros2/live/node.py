@@ -91,7 +91,8 @@ class Subscription:
     @property
     def sender_ids(self) -> list[int]:
         """The publishers that fit."""
-        return list(self.reader.get_matched_publications())
+        # Cyclone DDS returns them signed here, and unsigned with a sample (11.0.1).
+        return [handle % 2**64 for handle in self.reader.get_matched_publications()]
 
 
 class Node:
