@@ -3,6 +3,7 @@
 import asyncio
 import io
 import socket
+import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -225,6 +226,12 @@ def test_a_port_in_use_is_named_with_the_remedy(foxglove: FoxgloveServer, port: 
         other.listen()
         with pytest.raises(ConfigError, match=rf"--foxglove_port={port}: .*in use.*Choose another port, .*8766"):
             foxglove.start()
+
+
+def test_a_missing_sdk_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(ConfigError, match="--foxglove_port=8765 needs the package foxglove-sdk"):
+        FoxgloveServer("robot", 8765)
 
 
 @pytest.mark.parametrize("number", [-1, 65536])
