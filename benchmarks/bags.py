@@ -21,11 +21,11 @@ from mcap.writer import CompressionType, Writer
 from benchmarks._report import Report, parse_options
 from benchmarks._turns import in_turns, rates
 from bhd_lerobot.cli.data import main as data
-from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.ros2.bag.exporter.episode import ExportOptions
 from bhd_lerobot.ros2.bag.exporter.export import export_bags
+from bhd_lerobot.ros2.messages.robot_views import robot_view
 
 FPS = 10
 

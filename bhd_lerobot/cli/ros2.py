@@ -84,7 +84,7 @@ def _node(options: argparse.Namespace) -> Node:
     for name in ("wait", "window", "seconds", "n"):
         if (value := getattr(options, name, None)) is not None and not value > 0:
             raise ConfigError(f"{'-' if len(name) == 1 else '--'}{name} is {value}; it must be positive.")
-    network = NetworkConfig(options.domain, options.interface, tuple(options.peers), options.distro)
+    network = NetworkConfig(options.domain, options.interface, list(options.peers), options.distro)
     node = Node("bhd_ros2", network)
     if getattr(options, "map", None) is not None:
         register_types(MappingConfig.load(options.map.expanduser()).types)

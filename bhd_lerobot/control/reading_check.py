@@ -118,6 +118,9 @@ class ReadingCheck:
             return None
         if np.count_nonzero(early) and not self.problem:
             self.problem = ahead_of_time(int(newest_ns.max()) - now_ns)
+        elif not self.problem:
+            age, most = (now_ns - int(stamp_ns.min())) / NANOSECONDS, self.oldest_ns / NANOSECONDS
+            self.problem = f"the newest reading was {age:.3f} s old, more than {most:g} s"
         return wrong
 
 

@@ -75,7 +75,7 @@ class BaseHost(Host):
             parts.append(reading.sensors[:, beams:])
         age = np.zeros(self.n, np.int64)
         if reading.stamp_ns is not None:
-            age = (reading.stamp_ns - reading.sensors_ns) * self.rates.control_hz // NANOSECONDS
+            age = np.abs(reading.stamp_ns - reading.sensors_ns) * self.rates.control_hz // NANOSECONDS
         return np.concatenate(parts, axis=1), self.tick - age
 
     def truth(self) -> BaseTruth:

@@ -14,7 +14,10 @@ from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
 
-_ROS2_PLANTS = {True: "bhd_lerobot.ros2.live.base_plant:BasePlant", False: "bhd_lerobot.ros2.live.arm_plant:ArmPlant"}
+_ROS2_PLANTS = {
+    True: "bhd_lerobot.ros2.robots.base_plant:BasePlant",
+    False: "bhd_lerobot.ros2.robots.arm_plant:ArmPlant",
+}
 
 
 @dataclass(kw_only=True)
@@ -67,7 +70,6 @@ class BhdRobotConfig(RobotConfig):
         if self.plant == "ros2":
             self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
             self.clock = "realtime"
-            # The topics of a TurtleBot3 come at 20 Hz; four of them may be lost.
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silence_s)
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
         if self.plant:

@@ -234,8 +234,12 @@ class LiveProcess:
         return not moves or self._standing_ticks > self._most_orphan_ticks
 
     def _stamp_ns(self) -> int:
-        stamp_ns = self._host.cerebellum.reading.stamp_ns
-        return 0 if stamp_ns is None else int(stamp_ns[0])
+        """Return when the newest of what a plant reads was measured, monotonic [ns]."""
+        reading = self._host.cerebellum.reading
+        if reading.stamp_ns is None:
+            return 0
+        newest = int(reading.stamp_ns[0])
+        return max(newest, int(reading.sensors_ns[0])) if reading.sensors.shape[1] else newest
 
     def _advance(self, ticks: int) -> None:
         for _ in range(ticks):

@@ -26,6 +26,10 @@ class Word(IntEnum):
     """Whether the processes are to end."""
     DRIVEN = 3
     """Whether a command has been sent."""
+    CHECKS = 4
+    """How often the node has looked who else is there."""
+    OTHERS = 5
+    """How many other publishers it found on the topics of commands."""
 
 
 class Channel:

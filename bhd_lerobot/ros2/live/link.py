@@ -1,12 +1,16 @@
 """Starts, feeds and ends a node's process and its guard."""
 
 import contextlib
+import fcntl
+import hashlib
 import os
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +23,8 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 
 _START_S = 30.0
 _END_S = 3.0
+_CHECKS = 3  # looks at who else is there, before a command is sent
+_GHOST_S = 25.0  # a node that was killed counts for up to 20 s
 SILENCE_S = 1.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
 
 
@@ -38,6 +44,7 @@ class NodeLink:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._wake = -1
         self._record: Any = None
+        self._lock = -1
 
     def open(self, patience_s: float | None = 10.0) -> None:
         """Start the processes, and wait until every topic that is received has sent something.
@@ -47,12 +54,14 @@ class NodeLink:
 
         Raises:
             ConfigError: Cyclone DDS is not installed.
-            RealtimeError: the processes do not start, or a topic sends nothing; names it, and why.
+            RealtimeError: the processes do not start, a topic sends nothing, or another program commands the robot;
+                names it, and why.
         """
         require_cyclonedds()
         self.close()
+        lock = _locked(self.spec)
         channel = self._channel = Channel(self.spec)
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK)
+        self._lock, self._wake = lock, os.eventfd(0, os.EFD_NONBLOCK)
         self._record = np.zeros((), channel.command_dtype)
         try:
             needs_guard = any(one.stop is not None for one in self.spec.outputs)
@@ -60,6 +69,8 @@ class NodeLink:
                 self._start(role)
             if patience_s is not None:
                 self._wait_for_topics(time.monotonic() + patience_s)
+            if self.spec.outputs and self.spec.is_alone:
+                self._wait_for_others(time.monotonic() + _GHOST_S)
         except BaseException:
             self.close()
             raise
@@ -99,6 +110,15 @@ class NodeLink:
             self.check()
             time.sleep(0.01)
 
+    def _wait_for_others(self, end: float) -> None:
+        """Wait until no other node commands the robot; one that was killed counts for a while."""
+        words = self.channel.words
+        while words[Word.CHECKS] < _CHECKS or words[Word.OTHERS]:
+            if time.monotonic() > end:
+                raise RealtimeError(self.problem or "The ROS 2 node has not looked who else commands the robot.")
+            self.check()
+            time.sleep(0.01)
+
     @property
     def channel(self) -> Channel:
         """The shared memory.
@@ -126,14 +146,17 @@ class NodeLink:
         state = self.state
         return "" if state is None else bytes(state["problem"]).decode(errors="ignore")
 
-    def check(self) -> None:
+    def check(self, silence_s: float = SILENCE_S) -> None:
         """Raise if the node or its guard has ended or is stopped.
+
+        Args:
+            silence_s: so long without a sign of life one counts as stopped [s].
 
         Raises:
             RealtimeError: one has.
         """
         for role, word in (("node", Word.ALIVE), ("guard", Word.GUARD_ALIVE)):
-            if role in self._processes and self.channel.silence_s(word) > SILENCE_S:
+            if role in self._processes and self.channel.silence_s(word) > silence_s:
                 process = self._processes[role]
                 how = "is stopped" if process.poll() is None else f"ended with status {process.returncode}"
                 raise RealtimeError(f"The process of the ROS 2 {role} {how}.")
@@ -163,3 +186,28 @@ class NodeLink:
         self._channel = None
         os.close(self._wake)
         self._wake = -1
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+
+def _locked(spec: NodeSpec) -> int:
+    """Return the descriptor of a lock on the robot that a node commands; -1 if it commands none.
+
+    The second of two programs on one machine would otherwise stop the robot of the first before it is refused.
+    """
+    if not spec.outputs or not spec.is_alone:
+        return -1
+    robot = repr((spec.network.domain_number, [one.topic for one in spec.outputs]))
+    name = f"bhd-ros2-{os.getuid()}-{hashlib.sha256(robot.encode()).hexdigest()[:16]}.lock"
+    descriptor = os.open(Path(tempfile.gettempdir()) / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        topics = ", ".join(one.topic for one in spec.outputs)
+        raise RealtimeError(
+            f"Another program of this machine commands {topics} in ROS domain {spec.network.domain_number}. End it "
+            "first."
+        ) from error
+    return descriptor

@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
@@ -26,7 +26,7 @@ class NetworkConfig:
 
     domain: int | None = None
     interface: str = "lo"
-    peers: tuple[str, ...] = ()
+    peers: list[str] = field(default_factory=list)
     distro: str = "jazzy"
 
     def __post_init__(self) -> None:
@@ -89,12 +89,20 @@ class Ros2Config(NetworkConfig):
         command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
             base, 125 Hz to an arm.
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
-        silence_s: readings that are older are a fault [s].
+        silence_s: readings that are older are a fault [s]; a TurtleBot3 sends every 0.05 s.
+        namespace: in front of the robot's topics, such as ``/tb3_1``.
+        scan_frame: the frame of a base's scans; their beam 0 is taken to point ahead.
     """
 
     command_hz: float = 0.0
     timeout_s: float = 0.2
-    silence_s: float = 0.2
+    silence_s: float = 0.5
+    namespace: str = ""
+    scan_frame: str = "base_scan"
+
+    def in_namespace(self, topic: str) -> str:
+        """Return a topic's full name."""
+        return f"/{self.namespace.strip('/')}{topic}" if self.namespace.strip("/") else topic
 
     def __post_init__(self) -> None:
         super().__post_init__()

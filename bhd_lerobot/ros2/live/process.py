@@ -26,10 +26,10 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 from bhd_lerobot.ros2.messages.images import decode_image
 
 _WAIT_S = 0.02
-_CHECK_NS = 1_000_000_000  # between two looks at who else is there
+_CHECK_NS = 500_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
-_TOMORROW_NS = 1_000_000_000  # a stamp further ahead of the one before is of a clock that was set
+_TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
 
 
 class Stopper:
@@ -108,10 +108,12 @@ class Receiver:
         self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
         self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
-        self._stamps = [0] * len(self._inputs)
+        self._stamps = [0] * len(self._inputs)  # newest of each [ns]
+        self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
+        self._heard: list[dict[int, int]] = [{} for _ in self._inputs]  # publisher -> when it was heard last [ns]
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()
         self._intruders: set[str] = set()
@@ -131,7 +133,7 @@ class Receiver:
         now = time.monotonic_ns()
         if now - self._checked_ns > _CHECK_NS:
             self._checked_ns = now
-            self._network_problem = self._intrusion()
+            self._network_problem = self._intrusion() or self._twins(now)
         problem = (self._network_problem or self._silence(now)).encode()[:PROBLEM_BYTES]
         if news or problem != self._record["problem"]:
             self._record["problem"] = problem
@@ -150,11 +152,16 @@ class Receiver:
         if one.frame and header is not None and header.frame_id != one.frame:
             self._wrong[one.topic] = f"it is in the frame {header.frame_id!r}, not {one.frame!r}"
             return False
-        if stamp and stamp <= self._stamps[index] < stamp + _TOMORROW_NS:
-            record["dropped"][index] += 1
-            return False  # out of order; a stamp that is far behind is of a clock that was set
-        self._stamps[index] = stamp
+        if stamp:
+            newest = self._stamps[index]
+            if any(stamp <= other < stamp + _TOMORROW_NS for other in (newest, self._old_stamps[index])):
+                record["dropped"][index] += 1
+                return False  # out of order; a stamp that is far behind is of a clock that was set
+            if abs(stamp - newest) > _TOMORROW_NS:
+                self._old_stamps[index] = newest
+            self._stamps[index] = stamp
         self._wrong.pop(one.topic, None)
+        self._heard[index][received.sender] = received.arrived_ns
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
         record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
@@ -219,12 +226,25 @@ class Receiver:
         }
         # One that has just appeared may not have told its name yet, and may be the guard.
         self._intruders, self._others = now & self._others, now
+        self._channel.words[Word.OTHERS] = len(self._intruders)
+        self._channel.words[Word.CHECKS] += 1
         if not self._intruders:
             return ""
         return (
             f"Another node commands the robot: {', '.join(sorted(self._intruders))}. Stop it; one that was killed "
             "counts for up to 20 s more."
         )
+
+    def _twins(self, now_ns: int) -> str:
+        """Return which topic two publishers send to at a time, as text; empty if none. A robot may have restarted."""
+        for one, heard in zip(self._spec.inputs, self._heard, strict=True):
+            if one.has_one_source and sum(now_ns - last < _CHECK_NS for last in heard.values()) > 1:
+                everyone = self._node.graph.endpoints()
+                nodes = sorted({other.node for other in everyone if other.is_publisher and other.topic == one.topic})
+                return (
+                    f"Several nodes send {one.topic} at a time: {', '.join(nodes)}. Are there two robots of one name?"
+                )
+        return ""
 
     def _is_ours(self, endpoint: Endpoint) -> bool:
         return endpoint.is_own or endpoint.node == f"/{self._spec.name}_guard"

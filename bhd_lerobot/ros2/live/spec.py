@@ -46,6 +46,7 @@ class InputSpec:
         silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
             when something changes, which is not waited for either: its numbers are not a number until then.
         frame: what the header's `frame_id` has to be; any if empty.
+        has_one_source: whether messages of two publishers at a time are a problem.
     """
 
     topic: str
@@ -54,6 +55,7 @@ class InputSpec:
     qos: Qos = field(default_factory=Qos)
     silence_s: float = 1.0
     frame: str = ""
+    has_one_source: bool = False
 
     @property
     def is_required(self) -> bool:

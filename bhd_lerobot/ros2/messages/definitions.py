@@ -44,6 +44,7 @@ builtin_interfaces/Duration timeout
 bool ok
 string message
 """,
+    "ur_dashboard_msgs/msg/SafetyMode": "uint8 mode",
     "control_msgs/msg/JointTolerance": """
 string name
 float64 position

@@ -25,7 +25,7 @@ _DEPTH = 10  # messages of clients that wait on a topic, as with the QoS of a su
 class _Refused(Received):
     """A client's message that is not of the topic's type."""
 
-    why: str
+    why: str = ""
 
     @override
     def message(self) -> Any:
@@ -133,7 +133,7 @@ class FoxgloveServer:
             f"takes {' or '.join(filter(None, (wanted, _ALSO.get(wanted))))} with {_ENCODING!r}."
         )
         self._warn(key, f"{channel.topic}: {why}")
-        waiting.append(_Refused(given, b"", *times, why))
+        waiting.append(_Refused(given, b"", *times, why=why))
 
     def _warn(self, key: tuple[int, int], message: str) -> None:
         """Show a message in the app, once for each of a client's channels."""
@@ -207,16 +207,18 @@ class MirroredNode(Node):
         self._server = server
 
     @override
-    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None) -> Publisher:
+    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt") -> Publisher:
         qos, name = qos or Qos(), self.full_name(topic)
         channel = self._server.channel(name, msgtype)
-        publisher = MirroredPublisher(*self._writer(f"rt{name}", msgtype, qos), topic, msgtype, channel)
+        publisher = MirroredPublisher(*self._writer(f"{prefix}{name}", msgtype, qos), topic, msgtype, channel)
         if qos.transient_local:
             self._server.keep_last(name, publisher)
         return publisher
 
     @override
-    def subscription(self, topic: str, msgtype: str, qos: Qos | None = None) -> Subscription:
+    def subscription(
+        self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt", *, wakes: bool = True
+    ) -> Subscription:
         name = self.full_name(topic)
-        reader = self._reader(f"rt{name}", msgtype, qos or Qos())
+        reader = self._reader(f"{prefix}{name}", msgtype, qos or Qos(), wakes=wakes)
         return MirroredSubscription(reader, topic, msgtype, self._server.inbox(name, msgtype))

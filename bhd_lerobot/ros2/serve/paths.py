@@ -14,7 +14,7 @@ from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME, pose_tree
+from bhd_lerobot.ros2.messages.arm import ARM_FRAME
 from bhd_lerobot.ros2.messages.base import ODOM_FRAME
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import decode, encode
@@ -119,7 +119,7 @@ class DrivenPath:
 
 def _poses(stamps: NDArray[np.int64], frame: str, poses: NDArray[np.float64]) -> list[bytes]:
     """Return messages of poses, shape (n, 7), that share a stamp."""
-    fields = {"header": header(stamps.repeat(len(poses)), frame), "pose": pose_tree(poses)}
+    fields = {"header": header(stamps.repeat(len(poses)), frame), "pose": _pose_tree(poses)}
     return encode(POSE, fields, len(poses))
 
 
@@ -128,3 +128,11 @@ def _path(stamps: NDArray[np.int64], frame: str, poses: list[Any]) -> bytes:
     empty = decode(PATH, encode(PATH, {"header": header(stamps, frame)}, 1)[0])
     empty.poses = poses
     return bytes(type_store().serialize_cdr(empty, PATH))
+
+
+def _pose_tree(values: NDArray[np.float64]) -> dict[str, Any]:
+    """Return `geometry_msgs/msg/Pose` of positions and quaternions wxyz, shape (n, 7)."""
+    return {
+        "position": dict(zip("xyz", values[:, :3].T, strict=True)),
+        "orientation": dict(zip("wxyz", values[:, 3:].T, strict=True)),
+    }

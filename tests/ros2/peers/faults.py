@@ -36,6 +36,7 @@ def add_faults(parser: argparse.ArgumentParser) -> Any:
     ):
         faults.add_argument(name, action="append", default=[], type=at(kind), metavar=kind, help=text)
     faults.add_argument("--zero-stamp", action="append", default=[], metavar="TOPIC", help="no time in the header")
+    faults.add_argument("--repeat", type=float, default=math.inf, help="times begin anew each so many seconds")
     return faults
 
 
@@ -58,7 +59,7 @@ class Outlet:
         def mine(faults: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
             return [rest for name, *rest in faults if name in names]
 
-        self.clock = clock
+        self.clock = lambda: clock() % args.repeat
         self.gaps = [*mine(args.gap), *((start, math.inf) for (start,) in mine(args.silence))]
         self.nans = mine(args.nan)
         self.frame = next((name for (name,) in mine(args.frame)), frame)

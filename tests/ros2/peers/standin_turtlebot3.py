@@ -48,7 +48,9 @@ OLDEST = 0.2  # [s], what is older by the time it could be published is left out
 parser = peer.options(__doc__)
 parser.add_argument("--lidar", choices=("lds01", "lds02"), default="lds01")
 parser.add_argument("--twist", action="store_true", help="take Twist, as up to Humble, instead of TwistStamped")
-parser.add_argument("--log", help="file for JSON lines: each command, scan and odometry, and the true pose at 20 Hz")
+parser.add_argument(
+    "--log", help="file for JSON lines: each command, scan, wheel speeds and odometry, and the true pose at 20 Hz"
+)
 parser.add_argument("--seed", type=int, default=0, help="of all noise")
 parser.add_argument("--noise", type=float, default=1.0, help="factor of all noise; 0: none")
 parser.add_argument("--pose", type=at("X:Y:YAW"), default=(-1.2, -0.6, 0.0), help="where it starts [m, rad]")
@@ -252,7 +254,9 @@ class Robot:
         self.scan.publish(scan, scan.header, stamp)
         finite = ranges[np.isfinite(ranges) & (ranges > 0)]
         nearest = float(finite.min()) if len(finite) else None
-        record("scan", time.monotonic(), stamp=stamp, first=self.turn_start, beams=len(ranges), nearest=nearest)
+        shown = [None if math.isnan(value) else value for value in scan.ranges]
+        times = {"stamp": stamp, "first": self.turn_start}
+        record("scan", self.now, **times, beams=len(ranges), nearest=nearest, ranges=shown)
 
     def cycle(self, is_late: bool) -> None:
         """Publish what turtlebot3_node and diff_drive_controller publish every 50 ms."""
@@ -306,6 +310,7 @@ class Robot:
         self.power.publish(power, power.header, stamp)
         self.imu.publish(imu, imu.header, stamp)
         self.joints.publish(joints, joints.header, stamp)
+        record("joints", self.now, stamp=stamp, speeds=speeds.tolist())
         self.odom.publish(odometry, odometry.header, stamp)
         if self.tf is not None:
             transform = TransformStamped(child_frame_id="base_footprint")

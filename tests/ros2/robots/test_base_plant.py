@@ -12,8 +12,8 @@ import pytest
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.ros2.live.base_plant import BasePlant
 from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.robots.base_plant import BasePlant
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
 
@@ -22,7 +22,7 @@ _SOON_S = 10.0  # far longer than a stop takes, for a busy machine
 
 
 def make(domain: int, **options: float) -> BasePlant:
-    network = Ros2Config(domain=domain, **options)  # type: ignore[arg-type]
+    network = Ros2Config(domain=domain, **{"silence_s": 1.0, **options})  # type: ignore[arg-type]
     return BasePlant(SimpleNamespace(beams=360, imu=True, ros2=network), turtlebot3_burger())
 
 
@@ -146,6 +146,31 @@ def test_another_node_that_commands_the_robot_is_named(robot: Peer, plant: BaseP
         pytest.raises(
             RealtimeError, match=r"Another node commands the robot: /cmd_vel by (/avoidance_node|an unnamed node)"
         ),
+    ):
+        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
+
+def test_a_namespace_and_another_scanner(domain: int) -> None:
+    plant = make(domain, namespace="tb3_1", scan_frame="laser")  # type: ignore[arg-type]
+    assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
+    assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
+    assert plant.link.spec.inputs[1].frame == "laser"
+
+
+def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant: BasePlant, domain: int) -> None:
+    second = make(domain)
+    with pytest.raises(
+        RealtimeError, match=f"Another program of this machine commands /cmd_vel in ROS domain {domain}"
+    ):
+        second.open()
+    drive(plant, lambda: moves(robot), "the robot moves")
+    plant.read(reading())
+
+
+def test_two_robots_of_one_name_are_named(robot: Peer, plant: BasePlant, domain: int) -> None:
+    with (
+        Peer("standin_turtlebot3.py", domain=domain),
+        pytest.raises(RealtimeError, match=r"Several nodes send /(joint_states|scan) at a time: .*two robots"),
     ):
         until(lambda: [plant.read(reading()), False][1], "it is noticed")
 

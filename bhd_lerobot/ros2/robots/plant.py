@@ -1,13 +1,15 @@
 """What plants of ROS 2 robots have in common: a node in a process of its own below the cerebellum."""
 
 import os
+import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.ros2.live.link import NodeLink
+from bhd_lerobot.ros2.live.link import SILENCE_S, NodeLink
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec
 
 
@@ -25,16 +27,18 @@ class Ros2Plant(Plant):
     command_hz: float
 
     def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
+        network = config.ros2
         spec = NodeSpec(
             f"bhd_{name}_{os.getpid()}",
-            config.ros2,
-            inputs,
-            outputs,
-            command_hz=config.ros2.command_hz or self.command_hz,
-            timeout_s=config.ros2.timeout_s,
+            network,
+            tuple(replace(one, topic=network.in_namespace(one.topic)) for one in inputs),
+            tuple(replace(one, topic=network.in_namespace(one.topic)) for one in outputs),
+            command_hz=network.command_hz or self.command_hz,
+            timeout_s=network.timeout_s,
         )
         self.link = NodeLink(spec)
         self._parts = spec.columns
+        self._silence_s = network.silence_s
         self._enabled = False
 
     def open(self) -> None:
@@ -55,10 +59,14 @@ class Ros2Plant(Plant):
         Raises:
             RealtimeError: something is wrong with the topics, or the node's process has ended.
         """
-        self.link.check()
         state = self.link.state
+        silent_s = (time.monotonic_ns() - int(state["measured_ns"][0])) / 1e9
+        is_old = silent_s > self._silence_s
+        self.link.check(self._silence_s / 2 if is_old else SILENCE_S)
         if problem := bytes(state["problem"]).decode(errors="ignore"):
             raise RealtimeError(problem)
+        if is_old:
+            raise RealtimeError(f"{self.link.spec.inputs[0].topic} has sent no message for {silent_s:.2f} s.")
         return state
 
     def read(self, out: PlantReading) -> None:

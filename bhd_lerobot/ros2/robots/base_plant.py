@@ -10,13 +10,13 @@ from bhd_lerobot.bodies.body import LidarSpec, MobileBase
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
-from bhd_lerobot.ros2.live.plant import Ros2Plant
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
-from bhd_lerobot.ros2.messages.base import SCAN_FRAME, BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
+from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
+from bhd_lerobot.ros2.robots.plant import Ros2Plant
 
 _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _STOP = (0.0, 0.0)
@@ -112,20 +112,28 @@ class BasePlant(Ros2Plant):
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
+        node_silence = max(_NODE_SILENCE_S, config.ros2.silence_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
-            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), silence_s=_NODE_SILENCE_S),
+            InputSpec(
+                "/joint_states",
+                JOINT_STATE,
+                WheelReader(body.drive.wheel_radius),
+                silence_s=node_silence,
+                has_one_source=True,
+            ),
             InputSpec(
                 "/scan",
                 ScanPart.msgtype,
                 ScanReader("/scan", body.lidar, beams),
                 SENSOR_DATA,
-                _SCAN_SILENCE_S,
-                SCAN_FRAME,
+                max(_SCAN_SILENCE_S, config.ros2.silence_s),
+                config.ros2.scan_frame,
+                has_one_source=True,
             ),
         ]
         if config.imu:
-            inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, _NODE_SILENCE_S))
+            inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, node_silence))
         super().__init__(
             body.name, config, tuple(inputs), (OutputSpec("/cmd_vel", writer.msgtype, writer, stop=_STOP),)
         )

@@ -1,0 +1,162 @@
+"""Our programs in processes of their own, for tests against real ROS 2 peers.
+
+A busy machine alone stops neither robot: what is silent for long is found, what is late is not.
+"""
+
+import json
+import re
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from bhd_lerobot.cli import record, serve
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.robots.host.realtime import LiveHost
+from tests.forks import Fork
+from tests.waiting import until
+
+RELAXED = (
+    "--robot.realtime.brain_timeout_s=20",
+    "--robot.realtime.recorder_timeout_s=20",
+    "--robot.realtime.most_misses=1000000",
+)
+
+
+class Program:
+    """A program of ours, running from `with` to its end.
+
+    Attributes:
+        log: what it prints.
+    """
+
+    def __init__(self, main: Callable[..., int], *arguments: Any, log: Path) -> None:
+        self._main, self._arguments, self.log = main, arguments, log
+
+    def __enter__(self) -> Self:
+        self.process = Fork(self._main, *self._arguments, output=self.log)
+        self.pid = self.process.pid
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if error is not None:
+            error.add_note(f"{self._arguments} printed {self.text[-3000:]}")
+        self.process.kill()
+
+    @property
+    def text(self) -> str:
+        """What it has printed, on one line."""
+        return " ".join(self.log.read_text().split())
+
+    def wait_for(self, text: str) -> None:
+        """Wait until it has printed something."""
+
+        def printed() -> bool:
+            ended = self.process.poll() is not None
+            found = text in self.text
+            assert found or not ended, f"it ended with {self.process.poll()}"
+            return found
+
+        until(printed, f"{text!r} is printed")
+
+    def stop(self) -> int:
+        """End it by SIGINT; return its exit status."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait()
+
+
+class Served(Program):
+    """`bhd-ros2 serve`."""
+
+    def __init__(self, robot: str, *options: str, domain: int, log: Path) -> None:
+        given = [f"--robot.type={robot}", f"--network.domain={domain}", *RELAXED, *options]
+        super().__init__(serve.main, given, log=log)
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        self.wait_for("is a ROS 2 robot")
+        return self
+
+    @property
+    def contacts(self) -> tuple[int, int]:
+        """In how many control ticks it was in contact, and how many there were; it has ended."""
+        found = re.search(r"Contact in (\d+) of (\d+) control ticks", self.text)
+        assert found, self.text
+        return int(found[1]), int(found[2])
+
+
+def _record(options: list[str], starts: Path) -> int:
+    """Record, and note when each episode begins on the monotonic clock, which a dataset does not hold [s]."""
+    begin = LiveHost.begin
+
+    def noting(host: LiveHost) -> None:
+        has_begun = host._reader is not None
+        begin(host)
+        if not has_begun:
+            with starts.open("a") as file:
+                print(host._origin / NANOSECONDS, file=file)
+
+    LiveHost.begin = noting  # type: ignore[method-assign]
+    return record.main(options)
+
+
+class Recording(Program):
+    """`bhd-record` of a robot on the network.
+
+    Attributes:
+        root: the dataset.
+    """
+
+    def __init__(self, robot: str, *options: str, domain: int, folder: Path, silence_s: float = 5) -> None:
+        self.root, self._starts = folder / "dataset", folder / "starts"
+        given = [
+            f"--robot.type={robot}",
+            "--robot.plant=ros2",
+            f"--robot.ros2.domain={domain}",
+            f"--robot.ros2.silence_s={silence_s}",
+            *RELAXED,
+            "--dataset.repo_id=test/ros2",
+            f"--dataset.root={self.root}",
+            f"--output_dir={folder / 'run'}",
+            "--preview_video=false",
+            *options,
+        ]
+        self._starts.touch()
+        super().__init__(_record, given, self._starts, log=folder / "log")
+
+    @property
+    def starts(self) -> list[float]:
+        """When each episode has begun, monotonic [s]."""
+        return [float(line) for line in self._starts.read_text().splitlines()]
+
+    def wait_for_episode(self, number: int) -> None:
+        """Wait until an episode, counted from 1, has begun and is under way."""
+        until(lambda: len(self.starts) >= number or self.process.poll() is not None, f"episode {number} begins")
+        assert self.process.poll() is None, self.text
+        time.sleep(1.0)
+
+    def pid_of(self, part: str) -> int:
+        """Return the number of one of its processes, by a part of its command line."""
+        [found] = [pid for pid in _descendants(self.pid) if part in _command_line(pid)]
+        return found
+
+
+def _descendants(pid: int) -> list[int]:
+    children = [
+        int(child)
+        for thread in Path(f"/proc/{pid}/task").iterdir()
+        for child in (thread / "children").read_text().split()
+    ]
+    return [one for child in children for one in (child, *_descendants(child))]
+
+
+def _command_line(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
+
+
+def log_of(path: Path, event: str) -> list[dict[str, Any]]:
+    """Return the lines of a stand-in's log with this event; its last line may be incomplete."""
+    lines = path.read_text().splitlines(keepends=True)
+    return [line for line in map(json.loads, (one for one in lines if one.endswith("\n"))) if line["event"] == event]

@@ -1,0 +1,241 @@
+"""Our robots and programs on the network with others by the real ROS 2 client library, in short.
+
+With BHD_TRIALS=full the first lasts ten minutes: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance`.
+"""
+
+import itertools
+import json
+import math
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli.data.main import main as data
+from tests.ros2.peer_env import Peer, environment
+from tests.ros2.programs import Recording, Served, log_of
+from tests.waiting import until
+
+IS_FULL = os.environ.get("BHD_TRIALS") == "full"
+WALL = ("--robot.arena=random", "--robot.seed=3")  # a wall 0.73 m ahead
+
+
+def test_the_avoidance_node_drives_the_served_robot_without_contact(domain: int, tmp_path: Path) -> None:
+    seconds = 600 if IS_FULL else 10
+    with (
+        Served("turtlebot3", *WALL, domain=domain, log=tmp_path / "log") as robot,
+        Peer("avoidance_node.py", domain=domain) as driver,
+    ):
+        driver.wait(lambda line: line.get("scans", 0) >= 5 * seconds, f"{5 * seconds} scans")
+        assert driver.stop() == 0
+        assert robot.stop() == 0
+    last = driver.lines[-1]
+    assert last["turning"] > 0  # it has driven up to the wall
+    assert last["without_reading"] == 0
+    in_contact, ticks = robot.contacts
+    assert in_contact == 0
+    assert ticks > 100 * seconds
+
+
+DRIVE = (
+    "--task.type=free",
+    "--task.instruction=drive",
+    "--task.duration_s=3",
+    "--brain.type=avoidance",
+)
+PILLAR = "--pose=0.0:-0.6:0"  # a pillar is 0.9 m ahead, to the left
+
+
+def columns_of(root: Path) -> dict[str, np.ndarray]:
+    table = pq.read_table(root / "data")
+    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+
+def outcomes_of(root: Path) -> list[str]:
+    return [row["bhd/outcome"] for row in pq.read_table(root / "meta" / "episodes").to_pylist()]
+
+
+def test_what_is_recorded_is_what_the_robot_measured_and_was_sent(domain: int, tmp_path: Path) -> None:
+    log = tmp_path / "robot.jsonl"
+    jumps = [f"--clock-jump={start}:{offset}" for start, offset in enumerate([3600, -7000] * 10, 3)]
+    faults = ("--gap=scan:0.5:0.4", "--gap=joint_states:1.2:0.12", "--swap=joint_states:7", "--repeat=2", *jumps)
+    options = ("--clock-offset=-86400", "--wait", "--log", log)
+    with Peer("standin_turtlebot3.py", PILLAR, *options, *faults, domain=domain) as robot:
+        robot.wait_event("ready")
+        with Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=2", domain=domain, folder=tmp_path) as recording:
+            assert recording.process.wait() == 0, recording.text
+        until(lambda: robot.events("report")[-1]["command"] == [0.0, 0.0], "the robot stands")
+    assert data(["check", str(recording.root)]) == 0
+    columns = columns_of(recording.root)
+    assert len(recording.starts) == 2
+    times = np.array(recording.starts)[columns["episode_index"]] + columns["control.time"]
+    state = columns["observation.state"]
+
+    joints = log_of(log, "joints")
+    speeds = np.array([line["speeds"] for line in joints])
+    twists = np.stack([speeds.mean(axis=1), (speeds[:, 1] - speeds[:, 0]) / 0.160], axis=1)
+    check_source(state[:, :2], times, twists, joints, atol=1e-6)
+    scans = log_of(log, "scan")
+    ranges = np.array([line["ranges"] for line in scans])
+    used = check_source(state[:, 2:], times, np.where(ranges == 0, 3.5, ranges), scans, atol=1e-6)
+    assert len(set(used)) > 10
+
+    # The wheels' commands are sent at 50 Hz: what applied at the end of a frame lies between two that were sent.
+    commands = log_of(log, "command")
+    sent = np.array([line["monotonic"] for line in commands])
+    given = np.array([line["given"] for line in commands])
+    compared = 0
+    for frame in range(len(times) - 1):
+        near = given[(sent > times[frame + 1] - 0.1) & (sent < times[frame + 1] + 0.2)]
+        if columns["episode_index"][frame] == columns["episode_index"][frame + 1] and len(near) >= 5:
+            applied = columns["control.applied_action"][frame]
+            assert (near.min(axis=0) - 1e-6 <= applied).all()
+            assert (applied <= near.max(axis=0) + 1e-6).all()
+            compared += 1
+    assert compared > 0.8 * len(times)
+    assert given[:, 0].max() == pytest.approx(0.2)
+
+
+def check_source(
+    values: np.ndarray, times: np.ndarray, messages: np.ndarray, lines: list[dict[str, Any]], *, atol: float
+) -> list[int]:
+    """Check that each frame has the values of a message that was measured before its time, and that none goes back.
+
+    Returns:
+        Which message each frame has.
+    """
+    measured = np.array([line["monotonic"] for line in lines])
+    used: list[int] = []
+    for value, moment in zip(values, times, strict=True):
+        equal = np.flatnonzero(np.isclose(messages, value, rtol=0, atol=atol).all(axis=1) & (measured <= moment))
+        assert len(equal), f"no message before {moment} has {value[:4]}"
+        used.append(int(equal[-1]))
+    assert used == sorted(used)
+    return used
+
+
+KILLED = {  # a part of its command line, None for bhd-record itself; what is said of it
+    "robot": ("", "/joint_states has sent no message for"),
+    "recording": (None, ""),
+    "cerebellum": ("robots.host.process", "The cerebellum's process was killed by signal 9"),
+    "node": ("ros2.live.process node", "The process of the ROS 2 node ended with status -9"),
+}
+
+
+@pytest.mark.parametrize("killed", KILLED)
+@pytest.mark.thorough(but=2)
+def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
+    killed: str, domain: int, tmp_path: Path
+) -> None:
+    part, cause = KILLED[killed]
+    log = tmp_path / "robot.jsonl"
+    with (
+        Peer("standin_turtlebot3.py", "--open", "--log", log, domain=domain) as robot,
+        Recording(
+            "turtlebot3", *DRIVE, "--dataset.num_episodes=9", domain=domain, folder=tmp_path, silence_s=0.4
+        ) as recording,
+    ):
+        recording.wait_for_episode(2)
+        until(lambda: log_of(log, "pose")[-1]["twist"][0] > 0.1, "the robot moves")
+        if killed == "robot":
+            robot.signal(signal.SIGKILL)
+        else:
+            os.kill(recording.pid if part is None else recording.pid_of(part), signal.SIGKILL)
+            until(lambda: log_of(log, "pose")[-1]["twist"] == [0.0, 0.0], "the robot stands")
+        assert recording.process.wait() != 0
+        if part is not None:
+            assert cause in recording.text
+    if killed == "recording":
+        assert data(["repair", str(recording.root)]) == 0
+    outcomes = outcomes_of(recording.root)
+    assert outcomes[0] == "timeout"
+    assert outcomes[1:] in ([], ["fault"])
+    assert data(["check", str(recording.root)]) == 0
+
+
+HOME = (0.4869, 0.10915, 0.281859)  # of the UR5's tool in its base frame [m]
+DOWN = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # x, y, z, w
+
+
+def goal(*position: float, orientation: tuple[float, ...] = DOWN) -> str:
+    return "--goal=" + ",".join(map(str, (*position, *orientation)))
+
+
+ASIDE = (HOME[0], HOME[1] + 0.1, HOME[2])
+FLOATS = "std_msgs/msg/Float64MultiArray"
+REACHED = "The target is reached."
+
+
+@pytest.fixture
+def talk(domain: int) -> Callable[..., list[tuple[bool, str]]]:
+    """Return a function that sends goals as the articles' brain does, and returns the one result of each."""
+    environment(messages=True)
+    names = itertools.count()
+
+    def send(*options: str, **brain: Any) -> list[tuple[bool, str]]:
+        name = brain.get("name", f"brain-{next(names)}")
+        with Peer("brain_node.py", f"--name={name}", "--linger=0.3", *options, domain=domain) as peer:
+            summary = peer.wait_event("summary")
+            results = sorted(peer.events("result"), key=lambda line: line["task_id"])
+        counts = {key: summary[key] for key in ("once", "twice", "never", "unknown")}
+        assert counts == {"once": summary["sent"], "twice": 0, "never": 0, "unknown": 0}
+        return [(line["success"], line["message"]) for line in results]
+
+    return send
+
+
+def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate(
+    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+) -> None:
+    bad = {
+        goal(3.0, 0.0, 0.3): "too far away",
+        goal(math.nan, 0.0, 0.3): "must be finite",
+        goal(*HOME, orientation=(0.0, 0.0, 0.0, 0.0)): "norm of the quaternion",
+    }
+    with Served("ur5", "--state_hz=40", domain=domain, log=tmp_path / "log"):
+        first, *refused, last = talk(goal(*ASIDE), *bad, goal(*HOME), name="first")
+        assert first == last == (True, REACHED)
+        for (success, message), why in zip(refused, bad.values(), strict=True):
+            assert not success
+            assert why in message
+        [(success, message)] = talk(goal(*ASIDE), name="first")
+        assert not success
+        assert "already had the task_id 'first-0'" in message
+        [(success, message)] = talk(goal(*ASIDE), "--frame=map")
+        assert not success
+        assert "'map'" in message
+        assert talk(goal(*ASIDE), goal(*HOME), "--preempt=0.1") == [(True, REACHED)] * 2  # the second waits
+        slowly = ("--name=slow", "--max-velocity=0.01", "--linger=0.3")
+        home = json.dumps({"data": ur5().home[:6]})
+        with Peer("brain_node.py", goal(*ASIDE), *slowly, domain=domain) as brain:
+            brain.wait_event("command")
+            with Peer("topic.py", "pub", "/forward_position_controller/commands", FLOATS, home, domain=domain):
+                summary = brain.wait_event("summary")
+        assert (summary["once"], summary["twice"]) == (1, 0)
+        assert summary["state_hz"] == pytest.approx(40, rel=0.1)
+        assert "A setpoint came" in brain.events("result")[0]["message"]
+
+
+def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
+    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+) -> None:
+    def publish_until(is_stopped: bool, topic: str, kind: str, values: str) -> None:
+        with (
+            Peer("topic.py", "echo", "/cerebellum/state", "bhd_interfaces/msg/CerebellumState", domain=domain) as echo,
+            Peer("topic.py", "pub", topic, kind, values, domain=domain),
+        ):
+            echo.wait(lambda line: line.get("message", {}).get("emergency_stop") is is_stopped, f"stop: {is_stopped}")
+
+    with Served("ur5", domain=domain, log=tmp_path / "log"):
+        publish_until(True, "/emergency_stop", "std_msgs/msg/Bool", '{"data": true}')
+        [(success, message)] = talk(goal(*ASIDE))
+        assert not success
+        assert "emergency stop" in message
+        publish_until(False, "/emergency_stop/reset", "std_msgs/msg/Empty", "{}")
+        assert talk(goal(*ASIDE)) == [(True, REACHED)]
