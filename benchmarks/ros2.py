@@ -26,10 +26,10 @@ import numpy as np
 from benchmarks._report import Report, parse_options
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.ros2.live.arm_plant import ArmPlant
-from bhd_lerobot.ros2.live.base_plant import BasePlant
 from bhd_lerobot.ros2.live.network import Ros2Config
-from bhd_lerobot.ros2.live.plant import Ros2Plant
+from bhd_lerobot.ros2.robots.arm_plant import ArmPlant
+from bhd_lerobot.ros2.robots.base_plant import BasePlant
+from bhd_lerobot.ros2.robots.plant import Ros2Plant
 from tests.ros2 import peer_env
 from tests.ros2.peer_env import Peer
 

@@ -14,13 +14,12 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
 from bhd_lerobot.ros2.serve.base import BaseTopics
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
+from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
@@ -121,13 +120,13 @@ def _summary(host: LiveHost, counts: Counts) -> str:
 def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
     view = robot_view(config.robot.type)
     is_arm = isinstance(host.body, Arm)
-    frame = ARM_FRAME if is_arm else FOOTPRINT_FRAME
-    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, frame)]
+    goals: Goals = ArmGoals(host) if is_arm else BaseGoals(host)
+    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, goals)]
     if is_arm:
         arm = ArmTopics(host, node, counts, view, config.joint_states_hz)
         parts += [arm, PlannedPath(host, node, arm.trajectory)]
     else:
-        parts += [BaseTopics(host, node, counts, view), DrivenPath(node)]
+        parts += [BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
     if host.camera_shapes:
         parts.append(CameraTopics(host, node, view))
     if config.clock:

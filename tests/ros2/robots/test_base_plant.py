@@ -12,8 +12,8 @@ import pytest
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.ros2.live.base_plant import BasePlant
 from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.robots.base_plant import BasePlant
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
 

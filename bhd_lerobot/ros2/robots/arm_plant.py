@@ -11,11 +11,11 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
-from bhd_lerobot.ros2.live.plant import Ros2Plant
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
+from bhd_lerobot.ros2.robots.plant import Ros2Plant
 
 _SILENCE_S = 0.2  # of joints at 125 Hz
 _FOREVER = float("inf")
