@@ -1,16 +1,14 @@
-"""Programs that `benchmarks.ros2` measures, each in a process of its own: `python -m benchmarks._ros2_programs NAME`."""
+"""Programs that `benchmarks.ros2` runs, each in a process of its own: `python -m benchmarks._ros2_programs NAME`."""
 
 import argparse
 import json
 import math
 import os
-import sys
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
-from lerobot.robots.utils import make_robot_from_config
 from rich.console import Console
 
 from bhd_lerobot.control.fifo import RingReader
@@ -21,6 +19,7 @@ from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.messages.parts import header_stamps
 from bhd_lerobot.ros2.serve import serve as served
 from bhd_lerobot.ros2.serve.base import BaseTopics
+from bhd_lerobot.stock import make_robot_from_config
 
 
 class TimedTopics(BaseTopics):
@@ -47,7 +46,7 @@ class TimedTopics(BaseTopics):
         wall = time.time_ns() - time.monotonic_ns()
         while (state := self._ring.read()) is not None:
             if state["setpoints"] != self._setpoints:
-                self._setpoints = state["setpoints"]
+                self._setpoints = int(state["setpoints"])
                 self.used.append(int(state["start_ns"]) + wall)
         return super().poll(now_ns)
 
@@ -70,7 +69,7 @@ def serve(options: argparse.Namespace) -> None:
         kind(id=f"bench-{os.getpid()}"), NetworkConfig(domain=options.domain), joint_states_hz=options.hz
     )
     if options.times:
-        served.BaseTopics = TimedTopics  # type: ignore[misc]
+        served.BaseTopics = TimedTopics  # type: ignore[misc, assignment]
     robot: Any = make_robot_from_config(config.robot)
     assert isinstance(robot, BhdRobot)
     served.serve(config, robot, Console(stderr=True))
@@ -116,4 +115,4 @@ def _end_with(parent: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

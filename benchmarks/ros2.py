@@ -2,8 +2,8 @@
 
 Latencies of commands, processor time, how regular topics are, with and without a process beside it that computes all
 the time; and how long a robot goes on when one of the processes that drive it is killed or stopped. Every ratio is to
-the plain pair in the same run, as the median of some rounds. It needs the tests' ROS 2 environment, which it installs on
-first use. Exits with 3 if a goal is missed, with 2 if nothing can be measured here.
+the plain pair in the same run, the median of some rounds. It needs the ROS 2 environment of the tests, which it installs
+on first use. Exits with 3 if a goal is missed, with 2 if nothing can be measured here.
 """
 
 import contextlib
@@ -225,30 +225,31 @@ def report(rounds: list[dict[str, float]], stops: dict[str, float]) -> Report:
             series[name].append(value)
     found.numbers["rounds"], found.numbers["standstill_s"] = rounds, stops
 
-    def compare(what: str, ours: str, plain: str, form: str, scale: float, most: float | None = None) -> None:
+    def compare(what: str, ours: str, plain: str, most: float | None = None) -> None:
+        scale, form = (100, ".1f") if "[%]" in what else (1e3, ".2f")
         ratio = statistics.median(a / b for a, b in zip(series[ours], series[plain], strict=True))
         mine, other = (scale * statistics.median(series[name]) for name in (ours, plain))
         goal = "" if most is None else f"at most {most:g} x"
-        value = f"{mine:{form}} to {other:{form}}, {ratio:.2f} x"
+        value = f"{mine:{form}}, plain {other:{form}}: {ratio:.2f} x"
         found.add(what, value, goal, met=None if most is None else ratio <= most)
 
     for end in ("", f", {BUSY}"):
         for percent in (50, 99):
             name = f"latency of a command [ms], p{percent}"
             ends = f"p{percent}{end}", f"plain p{percent}{end}"
-            compare(f"{name}, to its acceptance{end}", f"accepted {ends[0]}", ends[1], ".2f", 1e3, 1.2)
-            compare(f"{name}, to the control tick{end}", f"tick {ends[0]}", ends[1], ".2f", 1e3)
+            compare(f"{name}, to its acceptance{end}", f"accepted {ends[0]}", ends[1], 1.2)
+            compare(f"{name}, to the control tick{end}", f"tick {ends[0]}", ends[1])
         for topic in ("scan", "odom", "joint_states"):
             what = f"error of the interval of /{topic} [ms], p99{end}"
             names = f"ours turtlebot3 /{topic}{end}", f"plain turtlebot3 /{topic}{end}"
-            compare(what, *names, ".2f", 1e3, 1.0)
+            compare(what, *names, 1.0)
     what = "error of the interval of a UR5's /joint_states at 500 Hz [ms], p99"
-    compare(what, "ours ur5 /joint_states", "plain ur5 /joint_states", ".2f", 1e3, 1.0)
+    compare(what, "ours ur5 /joint_states", "plain ur5 /joint_states", 1.0)
     for robot, name in (("turtlebot3", "TurtleBot3's topics"), ("ur5", "UR5's joint states at 500 Hz")):
         what = f"processor [%], {name}"
-        compare(f"{what}, received", f"{robot} received: ours", f"{robot} received: plain", ".1f", 100, 0.5)
+        compare(f"{what}, received", f"{robot} received: ours", f"{robot} received: plain", 0.5)
         names = f"{robot} published: ours", f"{robot} published: plain publisher"
-        compare(f"{what}, published, with all that serve does", *names, ".1f", 100)
+        compare(f"{what}, published, with all that serve does", *names)
     for name, seconds in stops.items():
         found.add(f"time to standstill from 0.2 m/s, {name}", f"{seconds:.2f} s", f"at most {LIMIT_S:g} s",
                   met=seconds <= LIMIT_S)  # fmt: skip
