@@ -22,7 +22,7 @@ _SOON_S = 10.0  # far longer than a stop takes, for a busy machine
 
 
 def make(domain: int, **options: float) -> BasePlant:
-    network = Ros2Config(domain=domain, **{"silence_s": 1.0, **options})  # type: ignore[arg-type]
+    network = Ros2Config(domain=domain, **{"silence_s": 5.0, **options})  # type: ignore[arg-type]
     return BasePlant(SimpleNamespace(beams=360, imu=True, ros2=network), turtlebot3_burger())
 
 
