@@ -13,7 +13,7 @@ from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
-from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import BhdKeyboardArmConfig
 from bhd_lerobot.teleoperators.config_bhd_keyboard_base import BhdKeyboardBaseConfig

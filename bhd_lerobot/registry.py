@@ -11,7 +11,7 @@ from lerobot.robots.config import RobotConfig
 
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
-import bhd_lerobot.ros2.live.config_robot
+import bhd_lerobot.ros2.robots.config_robot
 import bhd_lerobot.tasks.avoid
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick

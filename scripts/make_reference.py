@@ -106,7 +106,7 @@ def pages() -> dict[Path, str]:
             f"## `teleop.type={chosen}`\n",
             *_options(one, "teleop.", "teleop.md", listed, own),
         ]
-    texts["ros2"] = ["# `bhd-ros2 topics`\n", *_commands(ros2.topics_parser(), "bhd-ros2 topics")]
+    texts["ros2"] = ["# `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():
         page = "\n".join(parts)
@@ -190,18 +190,18 @@ def _options(
         yield from _options(one, inner_prefix, page, listed)
 
 
-def _commands(parser: argparse.ArgumentParser, program: str) -> Iterator[str]:
-    """Yield the table of each command of a parser."""
+def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield a table of the options of a parser's commands."""
     (commands,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
+    of_options: dict[tuple[str, str], list[str]] = {}
     for name, command in commands.choices.items():
-        yield f"### `{program} {name}`\n"
-        yield f"{str(command.description).capitalize()}.\n"
-        rows = [
-            (f"`{' '.join(filter(None, (*one.option_strings, one.metavar)))}`", one.help)
-            for one in command._actions
-            if one.dest != "help"
-        ]
-        yield _table(("option", "meaning"), rows)
+        for one in command._actions:
+            if one.dest != "help":
+                option = " ".join(filter(None, (*one.option_strings, typing.cast(str, one.metavar))))
+                of_options.setdefault((f"`{option}`", str(one.help)), []).append(f"`{name}`")
+    yield _table(("command", "meaning"), ((f"`{name}`", one.description) for name, one in commands.choices.items()))
+    rows = ((*option, ", ".join(names)) for option, names in of_options.items())
+    yield _table(("option", "meaning", "commands"), rows)
 
 
 def _introduction(config_class: type) -> Iterator[str]:

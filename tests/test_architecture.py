@@ -42,7 +42,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "robots.host": ("bodies.body", "sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
     "robots.external": ("options", "bodies.body", "control", "datasets.format", "robots.host"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host", "ros2.live.network"),
-    "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.live.config_robot"),
+    "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry", "policies"),
@@ -68,7 +68,11 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.timing": (*_DATASETS, "control"),
     "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),
     "ros2.live": ("bodies", "control", "ros2.messages"),
-    "ros2.serve": ("bodies", "control", "robots", "robots.host", "ros2.live", "ros2.messages"),
+    "ros2.robots": ("bodies", "control", "ros2.live", "ros2.messages"),
+    "ros2.serve": (
+        *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
+        *("robots", "robots.host", "ros2.live", "ros2.messages"),
+    ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
     "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
     "ros2.bag.importer": (
@@ -98,7 +102,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("bodies", "control", "control.geometry", "control.arm"),
         *("policies.*", "robots", "registry"),
     ),
-    "plugin": ("versions", "envs", "policies.*", "registry", "ros2.live.config_robot", "teleoperators"),
+    "plugin": ("versions", "envs", "policies.*", "registry", "ros2.robots.config_robot", "teleoperators"),
     "training": (
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
         *("options", "registry", "rollout", "hub"),

@@ -14,7 +14,10 @@ from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
 
-_ROS2_PLANTS = {True: "bhd_lerobot.ros2.live.base_plant:BasePlant", False: "bhd_lerobot.ros2.live.arm_plant:ArmPlant"}
+_ROS2_PLANTS = {
+    True: "bhd_lerobot.ros2.robots.base_plant:BasePlant",
+    False: "bhd_lerobot.ros2.robots.arm_plant:ArmPlant",
+}
 
 
 @dataclass(kw_only=True)

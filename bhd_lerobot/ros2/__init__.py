@@ -1,3 +1,3 @@
 """ROS 2 without a ROS installation."""
 
-__all__ = ["bag", "live", "messages", "serve"]
+__all__ = ["bag", "live", "messages", "robots", "serve"]

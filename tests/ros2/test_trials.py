@@ -3,8 +3,12 @@
 With BHD_TRIALS=full the first lasts ten minutes: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance`.
 """
 
+import itertools
+import json
+import math
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +16,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli.data.main import main as data
-from tests.ros2.peer_env import Peer
+from tests.ros2.peer_env import Peer, environment
 from tests.ros2.programs import Recording, Served, log_of
 from tests.waiting import until
 
@@ -124,7 +129,7 @@ KILLED = {  # a part of its command line, None for bhd-record itself; what is sa
 
 
 @pytest.mark.parametrize("killed", KILLED)
-@pytest.mark.thorough(but=2)
+@pytest.mark.thorough(but=1)
 def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
     killed: str, domain: int, tmp_path: Path
 ) -> None:
@@ -152,3 +157,85 @@ def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
     assert outcomes[0] == "timeout"
     assert outcomes[1:] in ([], ["fault"])
     assert data(["check", str(recording.root)]) == 0
+
+
+HOME = (0.4869, 0.10915, 0.281859)  # of the UR5's tool in its base frame [m]
+DOWN = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # x, y, z, w
+
+
+def goal(*position: float, orientation: tuple[float, ...] = DOWN) -> str:
+    return "--goal=" + ",".join(map(str, (*position, *orientation)))
+
+
+ASIDE = (HOME[0], HOME[1] + 0.1, HOME[2])
+FLOATS = "std_msgs/msg/Float64MultiArray"
+REACHED = "The target is reached."
+
+
+@pytest.fixture
+def talk(domain: int) -> Callable[..., list[tuple[bool, str]]]:
+    """Return a function that sends goals as the articles' brain does, and returns the one result of each."""
+    environment(messages=True)
+    names = itertools.count()
+
+    def send(*options: str, **brain: Any) -> list[tuple[bool, str]]:
+        name = brain.get("name", f"brain-{next(names)}")
+        with Peer("brain_node.py", f"--name={name}", "--linger=0.3", *options, domain=domain) as peer:
+            summary = peer.wait_event("summary")
+            results = sorted(peer.events("result"), key=lambda line: line["task_id"])
+        counts = {key: summary[key] for key in ("once", "twice", "never", "unknown")}
+        assert counts == {"once": summary["sent"], "twice": 0, "never": 0, "unknown": 0}
+        return [(line["success"], line["message"]) for line in results]
+
+    return send
+
+
+def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate(
+    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+) -> None:
+    bad = {
+        goal(3.0, 0.0, 0.3): "too far away",
+        goal(math.nan, 0.0, 0.3): "must be finite",
+        goal(*HOME, orientation=(0.0, 0.0, 0.0, 0.0)): "norm of the quaternion",
+    }
+    with Served("ur5", "--state_hz=40", domain=domain, log=tmp_path / "log"):
+        first, *refused, last = talk(goal(*ASIDE), *bad, goal(*HOME), name="first")
+        assert first == last == (True, REACHED)
+        for (success, message), why in zip(refused, bad.values(), strict=True):
+            assert not success
+            assert why in message
+        [(success, message)] = talk(goal(*ASIDE), name="first")
+        assert not success
+        assert "already had the task_id 'first-0'" in message
+        [(success, message)] = talk(goal(*ASIDE), "--frame=map")
+        assert not success
+        assert "'map'" in message
+        assert talk(goal(*ASIDE), goal(*HOME), "--preempt=0.1") == [(True, REACHED)] * 2  # the second waits
+        slowly = ("--name=slow", "--max-velocity=0.01", "--linger=0.3")
+        home = json.dumps({"data": ur5().home[:6]})
+        with Peer("brain_node.py", goal(*ASIDE), *slowly, domain=domain) as brain:
+            brain.wait_event("command")
+            with Peer("topic.py", "pub", "/forward_position_controller/commands", FLOATS, home, domain=domain):
+                summary = brain.wait_event("summary")
+        assert (summary["once"], summary["twice"]) == (1, 0)
+        assert summary["state_hz"] == pytest.approx(40, rel=0.1)
+        assert "A setpoint came" in brain.events("result")[0]["message"]
+
+
+def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
+    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+) -> None:
+    def publish_until(is_stopped: bool, topic: str, kind: str, values: str) -> None:
+        with (
+            Peer("topic.py", "echo", "/cerebellum/state", "bhd_interfaces/msg/CerebellumState", domain=domain) as echo,
+            Peer("topic.py", "pub", topic, kind, values, domain=domain),
+        ):
+            echo.wait(lambda line: line.get("message", {}).get("emergency_stop") is is_stopped, f"stop: {is_stopped}")
+
+    with Served("ur5", domain=domain, log=tmp_path / "log"):
+        publish_until(True, "/emergency_stop", "std_msgs/msg/Bool", '{"data": true}')
+        [(success, message)] = talk(goal(*ASIDE))
+        assert not success
+        assert "emergency stop" in message
+        publish_until(False, "/emergency_stop/reset", "std_msgs/msg/Empty", "{}")
+        assert talk(goal(*ASIDE)) == [(True, REACHED)]

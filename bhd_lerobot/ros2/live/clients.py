@@ -27,8 +27,8 @@ _FINAL_S = 0.5  # between a reply to one of several clients and the status of it
 _RESULT_S = 5.0  # for the result of a goal that has ended
 _ACTION = "/_action/send_goal"
 _OF_EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of services that all nodes have
-# Reliable would lose the first reply of a server of Fast DDS that has replied to others before, for up to some seconds:
-# Cyclone DDS discards what such a writer sends before its first heartbeat.
+# A reliable reader has the first reply of Fast DDS late or never: Cyclone DDS waits for a heartbeat of the server's
+# writer, which comes up to some seconds after the match. See findings/cyclonedds_first_reply_of_fastdds_late.sh.
 _RECEIVED = Qos(100, reliable=False)
 
 
@@ -51,8 +51,8 @@ class ServiceClient:
     def __init__(self, node: Node, name: str, srvtype: str) -> None:
         find_type(f"{srvtype}_Request", node.network.distro)
         self.name, self.srvtype, self._node = node.full_name(name), srvtype, node
-        self._requests = node.publisher(f"{self.name}Request", f"{srvtype}_Request", prefix="rq")
-        self._replies = node.subscription(f"{self.name}Reply", f"{srvtype}_Response", _RECEIVED, "rr", wakes=False)
+        self._requests = node.raw_publisher(f"rq{self.name}Request", f"{srvtype}_Request")
+        self._replies = node.raw_subscription(f"rr{self.name}Reply", f"{srvtype}_Response", _RECEIVED)
         self._found_at = math.inf
 
     def call(
@@ -273,9 +273,9 @@ class ActionClient:
         self._send_goal = ServiceClient(node, f"{base}/send_goal", f"{action_type}_SendGoal")
         self._get_result = ServiceClient(node, f"{base}/get_result", f"{action_type}_GetResult")
         self._cancel_goal = ServiceClient(node, f"{base}/cancel_goal", "action_msgs/srv/CancelGoal")
-        self._status = node.subscription(f"{base}/status", "action_msgs/msg/GoalStatusArray", LATCHED, wakes=False)
+        self._status = node.raw_subscription(f"rt{base}/status", "action_msgs/msg/GoalStatusArray", LATCHED)
         kind = f"{action_type}_FeedbackMessage"
-        self._feedback = node.subscription(f"{base}/feedback", kind, _RECEIVED, wakes=False)
+        self._feedback = node.raw_subscription(f"rt{base}/feedback", kind, _RECEIVED)
         self._goals: dict[bytes, Goal] = {}
 
     def send_goal(

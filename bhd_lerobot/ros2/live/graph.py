@@ -66,13 +66,13 @@ class Graph:
         self._writer = DataWriter(participant, topic, LATCHED.of_dds())
         self._reader = DataReader(participant, topic, Qos(100, transient_local=True).of_dds())
         self._endpoints = {
-            is_publisher: BuiltinDataReader(participant, kind)
+            is_publisher: _Present(BuiltinDataReader(participant, kind))
             for is_publisher, kind in (
                 (True, BuiltinTopicDcpsPublication),
                 (False, BuiltinTopicDcpsSubscription),
             )
         }
-        self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
+        self._participants = _Present(BuiltinDataReader(participant, BuiltinTopicDcpsParticipant))
         self._own: dict[bool, list[UUID]] = {True: [], False: []}
         self._owners: dict[bytes, dict[bytes, str]] = {}  # participant -> endpoint -> node
         self._nodes: dict[bytes, list[str]] = {}
@@ -104,9 +104,9 @@ class Graph:
             self._update()
             owners = {gid: name for owned in self._owners.values() for gid, name in owned.items()}
             found = []
-            for is_publisher, reader in self._endpoints.items():
-                for one in reader.read(_MOST):
-                    if not one.sample_info.valid_data or not one.topic_name.startswith(f"{prefix}/"):
+            for is_publisher, present in self._endpoints.items():
+                for one in present.samples():
+                    if not one.topic_name.startswith(f"{prefix}/"):
                         continue
                     found.append(
                         Endpoint(
@@ -140,7 +140,7 @@ class Graph:
                 for name, node in named.items()
                 for gid in (*node.reader_gid_seq, *node.writer_gid_seq)
             }
-        alive = {one.key.bytes for one in self._participants.read(_MOST) if one.sample_info.valid_data}
+        alive = {one.key.bytes for one in self._participants.samples()}
         for key in [key for key in self._nodes if key not in alive]:
             del self._nodes[key], self._owners[key]
 
@@ -166,6 +166,26 @@ class Graph:
                 if not offered.serves(wanted):
                     found.append(f"{who} is {one.qos}; the {ours} here is {qos}, and no message passes.")
         return found
+
+
+class _Present:
+    """What there is by a built-in topic, of which changes alone are read: a sample costs 0.3 ms."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+        self._samples: dict[int, Any] = {}
+
+    def samples(self) -> list[Any]:
+        """Return the samples of all that are there now."""
+        from cyclonedds.core import InstanceState
+
+        for one in self._reader.take(_MOST):
+            info = one.sample_info
+            if info.valid_data and info.instance_state == InstanceState.Alive:
+                self._samples[info.instance_handle] = one
+            else:
+                self._samples.pop(info.instance_handle, None)
+        return list(self._samples.values())
 
 
 def _full_name(node: Any) -> str:

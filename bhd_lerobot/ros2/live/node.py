@@ -1,7 +1,7 @@
 """A ROS 2 node: publishers and subscriptions on serialised messages."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
@@ -31,7 +31,7 @@ class Received:
     data: bytes
     sent_ns: int
     arrived_ns: int
-    sender: int = 0
+    sender: int = field(default=0, kw_only=True)
 
     def message(self) -> Any:
         """Return it deserialised.
@@ -78,7 +78,7 @@ class Subscription:
         samples = self.reader.take(_MOST)
         now = time.monotonic_ns()
         return [
-            Received(self.msgtype, sample.data, info.source_timestamp, now, info.publication_handle)
+            Received(self.msgtype, sample.data, info.source_timestamp, now, sender=info.publication_handle)
             for sample in samples
             if (info := sample.sample_info).valid_data
         ]
@@ -91,7 +91,8 @@ class Subscription:
     @property
     def sender_ids(self) -> list[int]:
         """The publishers that fit."""
-        return list(self.reader.get_matched_publications())
+        # Cyclone DDS returns them signed here, and unsigned with a sample (11.0.1).
+        return [handle % 2**64 for handle in self.reader.get_matched_publications()]
 
 
 class Node:
@@ -134,22 +135,21 @@ class Node:
         """Return a topic's name with the namespace in front, unless it begins with a slash."""
         return topic if topic.startswith("/") else f"{self.namespace.rstrip('/')}/{topic}"
 
-    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt") -> Publisher:
-        """Return a publisher; with another prefix it is part of a service."""
-        return Publisher(*self._writer(f"{prefix}{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
+    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None) -> Publisher:
+        """Return a publisher."""
+        return Publisher(*self._writer(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
 
-    def subscription(
-        self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt", *, wakes: bool = True
-    ) -> Subscription:
-        """Return a subscription; with another prefix it is part of a service.
+    def subscription(self, topic: str, msgtype: str, qos: Qos | None = None) -> Subscription:
+        """Return a subscription."""
+        return Subscription(self._reader(f"rt{self.full_name(topic)}", msgtype, qos or Qos()), topic, msgtype)
 
-        Args:
-            topic, msgtype, qos: see `Subscription`.
-            prefix: what its name on the network begins with.
-            wakes: whether its messages end `wait`.
-        """
-        reader = self._reader(f"{prefix}{self.full_name(topic)}", msgtype, qos or Qos(), wakes=wakes)
-        return Subscription(reader, topic, msgtype)
+    def raw_publisher(self, name: str, msgtype: str) -> Publisher:
+        """Return a publisher by its name on the network, as of a service's requests."""
+        return Publisher(*self._writer(name, msgtype, Qos()), name, msgtype)
+
+    def raw_subscription(self, name: str, msgtype: str, qos: Qos) -> Subscription:
+        """Return a subscription by its name on the network, whose messages do not end `wait`."""
+        return Subscription(self._reader(name, msgtype, qos, wakes=False), name, msgtype)
 
     def wait(self, timeout_s: float) -> None:
         """Return when a message has arrived on a subscription, or after a time [s]."""
@@ -170,7 +170,7 @@ class Node:
         self.graph.add(writer.guid, is_writer=True)
         return writer, topic_type(msgtype)
 
-    def _reader(self, name: str, msgtype: str, qos: Qos, *, wakes: bool) -> Any:
+    def _reader(self, name: str, msgtype: str, qos: Qos, *, wakes: bool = True) -> Any:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 

@@ -25,7 +25,8 @@ from bhd_lerobot.ros2.live.node import Node, Publisher, Received
 from bhd_lerobot.ros2.live.spec import NodeSpec
 from bhd_lerobot.ros2.messages.images import decode_image
 
-_WAIT_S = 0.02
+_WAIT_S = 0.05  # the longest without a sign of life
+_AGAIN_S = 0.02  # between two stops at the end
 _CHECK_NS = 500_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
@@ -72,7 +73,8 @@ class Sender(threading.Thread):
         period = 1 / self._spec.command_hz
         sent = 0.0
         while not self._channel.words[Word.END] and os.getppid() == self._parent:
-            select.select([self._wake], [], [], max(0.0, sent + period - time.monotonic()))
+            longest = period if self._channel.words[Word.DRIVEN] else max(period, _WAIT_S)
+            select.select([self._wake], [], [], max(0.0, sent + longest - time.monotonic()))
             if (left := sent + period - time.monotonic()) > 0:
                 time.sleep(left)
             with contextlib.suppress(BlockingIOError):
@@ -83,7 +85,7 @@ class Sender(threading.Thread):
         if self._channel.words[Word.DRIVEN]:
             for _ in range(5):
                 self._stopper.send()
-                time.sleep(_WAIT_S)
+                time.sleep(_AGAIN_S)
             self._channel.words[Word.DRIVEN] = 0
 
     def step(self) -> None:
@@ -105,6 +107,7 @@ class Receiver:
 
     def __init__(self, spec: NodeSpec, channel: Channel, node: Node) -> None:
         self._spec, self._channel, self._node = spec, channel, node
+        self._columns = spec.columns
         self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
         self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
@@ -165,7 +168,7 @@ class Receiver:
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
         record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
-        record["values"][self._spec.columns[index]] = values
+        record["values"][self._columns[index]] = values
         return True
 
     def _take_image(self, index: int, received: Received) -> None:

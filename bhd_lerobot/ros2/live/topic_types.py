@@ -7,7 +7,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.ros2.messages.definitions import find_type
 from bhd_lerobot.ros2.messages.types import type_store
 
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4  # rosbags' Nodetype
@@ -57,12 +57,8 @@ def _class_name(msgtype: str) -> str:
 
 
 def _fields(msgtype: str) -> dict[str, Any]:
-    store = type_store()
-    if msgtype not in store.fielddefs:
-        raise ConfigError(
-            f"The ROS 2 message type {msgtype} is not known. A mapping names its definition, see `types`."
-        )
-    return {name: _kind(description) for name, description in store.fielddefs[msgtype][1]}
+    find_type(msgtype)
+    return {name: _kind(description) for name, description in type_store().fielddefs[msgtype][1]}
 
 
 def _kind(description: Any) -> Any:

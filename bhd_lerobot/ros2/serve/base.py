@@ -5,7 +5,7 @@ stops by itself when no command comes for `command_timeout_s`, where a real one 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -45,12 +45,16 @@ class BaseTopics:
         node: the node.
         counts: what is refused.
         view: what is known of the robot.
+        interrupt: called when a command has come.
     """
 
-    def __init__(self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView) -> None:
+    def __init__(
+        self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView, interrupt: Callable[[], None]
+    ) -> None:
         body = host.body
         if not isinstance(body, MobileBase) or body.lidar is None:
             raise AssertionError(f"{host.config.type} is no base with a lidar.")
+        self._interrupt = interrupt
         self._host, self._counts, self._view, self._drive = host, counts, view, body.drive
         beams = host.config.beams
         names = list(host.observation_names)
@@ -83,6 +87,7 @@ class BaseTopics:
         return [Input(self._command, self._drive_by)]
 
     def _drive_by(self, message: Any) -> None:
+        self._interrupt()
         twist = getattr(message, "twist", message)
         values = np.array([[twist.linear.x, twist.angular.z]])
         self._counts.add_result(self._command.topic, self._host.bridge.send(values))

@@ -9,7 +9,8 @@ from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.types import INTERFACES
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State
+from bhd_lerobot.ros2.serve.goals import Goals
+from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
 
 COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
@@ -25,12 +26,12 @@ class InterfaceTopics:
         node: the node.
         counts: what is refused.
         state_hz: how often the state is published [Hz].
-        frame: the robot's base frame.
+        goals: follows the commands.
     """
 
-    def __init__(self, host: LiveHost, node: Node, counts: Counts, state_hz: float, frame: str) -> None:
-        self._host, self._counts, self._state_hz, self._frame = host, counts, state_hz, frame
-        self._refused: list[CommandResult] = []
+    def __init__(self, host: LiveHost, node: Node, counts: Counts, state_hz: float, goals: Goals) -> None:
+        self._host, self._counts, self._state_hz, self._goals = host, counts, state_hz, goals
+        self._frame = goals.frames[0]
         self._result = node.publisher(RESULT_TOPIC, RESULT)
         self._state = node.publisher(STATE_TOPIC, STATE)
         self._inputs = [
@@ -48,8 +49,8 @@ class InterfaceTopics:
         return self._inputs
 
     def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
+        """Follow the goal; return when there is more to do [ns]."""
+        return self._goals.poll(now_ns)
 
     def _stop(self, message: Any) -> None:
         if message.data:
@@ -60,8 +61,9 @@ class InterfaceTopics:
             self._counts.add_result(RESET_TOPIC, request())
 
     def _submit(self, message: Any) -> None:
-        if message.header.frame_id not in ("", self._frame):
-            text = f"The frame is {message.header.frame_id!r}; a target pose is in {self._frame!r}."
+        frame = message.header.frame_id or self._frame
+        if frame not in self._goals.frames:
+            text = f"The frame is {frame!r}; a target pose is in {' or '.join(map(repr, self._goals.frames))}."
             self._send(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
             return
         position, turn = message.target_pose.position, message.target_pose.orientation
@@ -71,18 +73,15 @@ class InterfaceTopics:
             target_pose=pose,
             max_velocity=message.max_velocity or None,
             max_acceleration=message.max_acceleration or None,
+            timeout_s=self._goals.timeout_s,
         )
-        refusal = self._host.bridge.submit(command)
+        refusal = self._goals.submit(command, frame)
         if refusal is not None:
-            self._refused.append(refusal)
             self._send(refusal)
 
     def _publish_results(self, state: State) -> None:
-        for result in self._host.bridge.take_results():
-            if result in self._refused:
-                self._refused.remove(result)
-            else:
-                self._send(result)
+        for result in self._goals.take_results():
+            self._send(result)
 
     def _send(self, result: CommandResult) -> None:
         fields = {

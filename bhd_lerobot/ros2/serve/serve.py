@@ -14,13 +14,12 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
 from bhd_lerobot.ros2.serve.base import BaseTopics
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
+from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
@@ -66,12 +65,13 @@ class ServeConfig:
             raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
 
 
-def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
+def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threading.Event | None = None) -> None:
     """Serve a robot until SIGINT or SIGTERM.
 
     Args:
         robot: the robot of `config.robot`, not connected.
         console: takes lines about the state.
+        ended: ends it as well, once it is set.
 
     Raises:
         ConfigError: Cyclone DDS is not installed, or Foxglove cannot be served.
@@ -79,8 +79,8 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
     """
     require_cyclonedds()
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
-    ended = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    end = ended or threading.Event()
+    before = {number: signal.signal(number, lambda *_: end.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         robot.connect()
         host = robot.host
@@ -92,6 +92,8 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
         with MirroredNode(*named, foxglove) if foxglove else Node(*named) as node:
             counts = Counts()
             server = Server(host, node, _parts(config, host, node, counts), counts)
+            if foxglove:
+                foxglove.start()
             where = "this machine" if config.network.is_local else config.network.interface
             console.print(
                 f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
@@ -99,10 +101,10 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
             if foxglove:
                 console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
             if config.duration_s:
-                timer = threading.Timer(config.duration_s, ended.set)
+                timer = threading.Timer(config.duration_s, end.set)
                 timer.daemon = True
                 timer.start()
-            server.run(ended.is_set, lambda line: console.print(line, markup=False))
+            server.run(end.is_set, lambda line: console.print(line, markup=False))
             console.print(_summary(host, counts))
     finally:
         if foxglove:
@@ -121,13 +123,13 @@ def _summary(host: LiveHost, counts: Counts) -> str:
 def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
     view = robot_view(config.robot.type)
     is_arm = isinstance(host.body, Arm)
-    frame = ARM_FRAME if is_arm else FOOTPRINT_FRAME
-    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, frame)]
+    goals: Goals = ArmGoals(host) if is_arm else BaseGoals(host)
+    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, goals)]
     if is_arm:
         arm = ArmTopics(host, node, counts, view, config.joint_states_hz)
         parts += [arm, PlannedPath(host, node, arm.trajectory)]
     else:
-        parts += [BaseTopics(host, node, counts, view), DrivenPath(node)]
+        parts += [BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
     if host.camera_shapes:
         parts.append(CameraTopics(host, node, view))
     if config.clock:

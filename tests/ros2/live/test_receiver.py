@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.ros2.live.arm_plant import NumberReader
 from bhd_lerobot.ros2.live.channel import Channel
 from bhd_lerobot.ros2.live.network import NetworkConfig
 from bhd_lerobot.ros2.live.node import Received
@@ -15,6 +14,7 @@ from bhd_lerobot.ros2.live.process import Receiver
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.robots.arm_plant import NumberReader
 
 BATTERY = "sensor_msgs/msg/BatteryState"
 

@@ -25,6 +25,7 @@ parser.add_argument(
     help="a target pose [m, rad]; several are sent one after the other; --goal=-1,0,0 where it begins with a minus",
 )
 parser.add_argument("--task-type", default="navigate")
+parser.add_argument("--name", default="task", help="the goals are called so, and numbered from 0 on")
 parser.add_argument("--frame", default="", help="frame_id of the goals' header")
 parser.add_argument("--max-velocity", type=float, default=0.0)
 parser.add_argument("--max-acceleration", type=float, default=0.0)
@@ -59,8 +60,9 @@ class Brain:
 
     def act(self) -> None:
         now = time.monotonic()
+        # What is sent the moment a subscription is found can be lost: wait for a state as well.
         is_heard = self.commands.get_subscription_count() and self.node.count_publishers(args.result_topic)
-        if not self.sent and not is_heard:
+        if not self.sent and not (is_heard and self.states):
             return
         waiting = [
             task for task, since in self.sent.items() if task not in self.results and now - since < args.patience
@@ -79,7 +81,7 @@ class Brain:
             peer.log("stop")
 
     def send(self, goal: list[float]) -> None:
-        command = BrainCommand(task_id=f"task-{len(self.sent)}", task_type=args.task_type)
+        command = BrainCommand(task_id=f"{args.name}-{len(self.sent)}", task_type=args.task_type)
         command.header.stamp = self.node.get_clock().now().to_msg()
         command.header.frame_id = args.frame
         position, orientation = command.target_pose.position, command.target_pose.orientation

@@ -10,13 +10,13 @@ from bhd_lerobot.bodies.body import LidarSpec, MobileBase
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
-from bhd_lerobot.ros2.live.plant import Ros2Plant
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
+from bhd_lerobot.ros2.robots.plant import Ros2Plant
 
 _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _STOP = (0.0, 0.0)
@@ -119,7 +119,8 @@ class BasePlant(Ros2Plant):
                 "/joint_states",
                 JOINT_STATE,
                 WheelReader(body.drive.wheel_radius),
-                silence_s=node_silence,
+                SENSOR_DATA,
+                node_silence,
                 has_one_source=True,
             ),
             InputSpec(

@@ -10,9 +10,9 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError
-from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
-from bhd_lerobot.ros2.live.robot import Ros2Robot
+from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.robots.robot import Ros2Robot
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError, unknown_name
-from bhd_lerobot.ros2.live.base_plant import ScanReader
-from bhd_lerobot.ros2.live.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import CameraSpec, InputSpec, NodeSpec, OutputSpec
 from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, features_of, topics_of
+from bhd_lerobot.ros2.robots.base_plant import ScanReader
+from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 
 _COMMAND_HZ = 50.0
 

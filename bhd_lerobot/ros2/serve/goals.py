@@ -1,0 +1,221 @@
+"""Pose goals of a brain in another process: an arm's cerebellum follows them; a base is driven to them."""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.messages.arm import ARM_FRAME
+from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, ODOM_FRAME
+from bhd_lerobot.ros2.serve.server import NEVER_NS
+
+_TOLERANCE_M, _TOLERANCE_RAD = 0.1, math.radians(10.0)  # as the task navigate has them
+_REST, _REST_TURN = 0.03, 0.15  # [m/s], [rad/s], likewise
+_ONE = np.zeros(1, np.intp)
+
+
+class Goals(Protocol):
+    """Follows one goal at a time.
+
+    Attributes:
+        frames: in which a target pose may be given; the first where none is named.
+        timeout_s: a goal fails if it takes longer [s].
+    """
+
+    frames: tuple[str, ...]
+    timeout_s: float
+
+    def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
+        """Take a goal; return the refusal, or None."""
+
+    def take_results(self) -> list[CommandResult]:
+        """Return how goals ended, each once."""
+
+    def interrupt(self) -> None:
+        """End the goal: a setpoint has come, and the newer command counts."""
+
+    def poll(self, now_ns: int) -> int:
+        """Do what is due at a monotonic time [ns]; return when there is more to do."""
+
+
+class ArmGoals:
+    """Goals of an arm, which its cerebellum follows.
+
+    Args:
+        host: the arm.
+    """
+
+    frames: tuple[str, ...] = (ARM_FRAME,)
+    timeout_s = 20.0
+
+    def __init__(self, host: LiveHost) -> None:
+        self._bridge = host.bridge
+        self._refused: list[CommandResult] = []
+
+    def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
+        """Take a goal; return the refusal, or None."""
+        refusal = self._bridge.submit(command)
+        if refusal is not None:
+            self._refused.append(refusal)
+        return refusal
+
+    def take_results(self) -> list[CommandResult]:
+        """Return how goals ended; a refusal was returned already."""
+        ended = []
+        for result in self._bridge.take_results():
+            if result in self._refused:
+                self._refused.remove(result)
+            else:
+                ended.append(result)
+        return ended
+
+    def interrupt(self) -> None:
+        """Do nothing: the cerebellum sees the setpoint."""
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing is due."""
+        return NEVER_NS
+
+
+class BaseGoals:
+    """Goals of a base, which the brain `navigator` drives to, by the scan and the odometry.
+
+    A goal ends the one before. It is reached within 0.1 m and 10 degrees, at rest.
+
+    Args:
+        host: the base, with odometry in its observation.
+    """
+
+    frames: tuple[str, ...] = (FOOTPRINT_FRAME, ODOM_FRAME)
+    timeout_s = 120.0
+
+    def __init__(self, host: LiveHost) -> None:
+        self._host = host
+        self._features = RobotFeatures(
+            host.observation_names, host.action_names, host.rates.fps, GOAL, host.body, robot_type=host.config.type
+        )
+        self._period_ns = NANOSECONDS // host.rates.fps
+        self._brain = NavigatorBrain()
+        self._command: BrainCommand | None = None
+        self._goal: NDArray[np.float64] = np.zeros(3)  # x, y [m], yaw [rad] in the odometry's frame
+        self._due_ns = self._end_ns = 0
+        self._known: set[str] = set()
+        self._results: list[CommandResult] = []
+
+    def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
+        """Take a goal; return the refusal, or None."""
+        if refusal := self._refusal(command):
+            return refusal
+        pose = command.target_pose
+        assert pose is not None
+        matrix = pose.matrix()
+        goal = np.array([matrix[0, 3], matrix[1, 3], math.atan2(matrix[1, 0], matrix[0, 0])])
+        if frame == FOOTPRINT_FRAME:
+            x, y, yaw = self._odometry()
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            goal = np.array([x + cos * goal[0] - sin * goal[1], y + sin * goal[0] + cos * goal[1], yaw + goal[2]])
+        config = NavigatorConfig()
+        if command.max_velocity is not None:
+            config.forward_speed = min(config.forward_speed, command.max_velocity)
+        self._end(ResultCode.PREEMPTED, f"The goal {command.task_id!r} took its place.")
+        self._brain = NavigatorBrain(config)
+        self._brain.bind(self._features)
+        self._brain.reset(_ONE, [0], 1)
+        self._known.add(command.task_id)
+        self._command, self._goal, self._due_ns = command, goal, 0
+        self._end_ns = 0
+        return None
+
+    def _refusal(self, command: BrainCommand) -> CommandResult | None:
+        """Return why a goal is not followed, or None."""
+        pose = command.target_pose
+        assert pose is not None
+        speed, change = command.max_velocity, command.max_acceleration
+        mode = Mode(int(self._host.modes[0]))
+        reasons = {
+            (ResultCode.BAD_TARGET, "The goal has no name (task_id)."): not command.task_id,
+            (ResultCode.DUPLICATE_ID, f"There was a goal {command.task_id!r} already."): command.task_id in self._known,
+            (ResultCode.NON_FINITE, f"The target pose is {pose.position}, {pose.quaternion}."): not np.isfinite(
+                [*pose.position, *pose.quaternion]
+            ).all(),
+            (ResultCode.NOT_NORMALISED, f"The quaternion {pose.quaternion} is not of unit length."): abs(
+                np.linalg.norm(pose.quaternion) - 1
+            )
+            > 1e-3,
+            (ResultCode.BAD_VELOCITY, f"max_velocity is {speed}; it is positive [m/s]."): speed is not None
+            and not 0 < speed < math.inf,
+            (ResultCode.BAD_ACCELERATION, f"max_acceleration is {change}; it is positive [m/s^2]."): change is not None
+            and not 0 < change < math.inf,
+            (ResultCode.ESTOP, Reason.ESTOP.explanation): self._host.estop_pressed,
+            (ResultCode.NOT_ACTIVE, f"The robot is not active (mode {mode.name})."): mode
+            not in (Mode.HOLD, Mode.TRACKING, Mode.STOPPING),
+        }
+        why = next((why for why, holds in reasons.items() if holds), None)
+        return None if why is None else CommandResult(command.task_id, False, *why)
+
+    def _odometry(self) -> NDArray[np.float64]:
+        pose: NDArray[np.float64] = self._host.bridge.latest["odometry"][0]
+        return pose
+
+    def take_results(self) -> list[CommandResult]:
+        """Return how goals ended, each once."""
+        results, self._results = self._results, []
+        return results
+
+    def interrupt(self) -> None:
+        """End the goal: a setpoint has come, and the newer command counts."""
+        self._end(ResultCode.REPLACED_BY_SETPOINT, "A twist came, and the newer command counts.")
+
+    def _end(self, code: ResultCode, text: str) -> None:
+        if self._command is not None:
+            succeeded = code == ResultCode.SUCCEEDED
+            self._results.append(CommandResult(self._command.task_id, succeeded, code, text))
+            self._command = None
+
+    def poll(self, now_ns: int) -> int:
+        """Drive for a frame; return when the next one begins [ns]."""
+        if self._command is None:
+            return NEVER_NS
+        if now_ns < self._due_ns:
+            return self._due_ns
+        self._end_ns = self._end_ns or now_ns + round(self._command.timeout_s * NANOSECONDS)
+        record = self._host.bridge.latest
+        x, y, yaw = record["odometry"][0]
+        way, turn = self._goal[:2] - (x, y), self._goal[2] - yaw
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        ahead, left = cos * way[0] + sin * way[1], -sin * way[0] + cos * way[1]
+        speed, rate = record["observation"][0, :2]
+        off = abs(math.remainder(turn, math.tau))
+        is_there = math.hypot(ahead, left) <= _TOLERANCE_M and off <= _TOLERANCE_RAD
+        action = self._brain.act(
+            Observation(
+                self._features.observation_names,  # type: ignore[arg-type]
+                record["observation"],
+                environment_state=np.array([[ahead, left, math.cos(turn), math.sin(turn)]]),
+            )
+        )
+        wants_rest = not np.any(np.abs(action) > (_REST, _REST_TURN))
+        if is_there and wants_rest and abs(speed) < _REST and abs(rate) < _REST_TURN:
+            self._host.bridge.send(np.zeros((1, 2)))
+            self._end(ResultCode.SUCCEEDED, f"{math.hypot(ahead, left):.3f} m and {math.degrees(off):.1f} degrees off")
+            return NEVER_NS
+        if now_ns > self._end_ns:
+            self._host.bridge.send(np.zeros((1, 2)))
+            self._end(
+                ResultCode.TIMEOUT,
+                f"Not there after {self._command.timeout_s:g} s: {math.hypot(ahead, left):.2f} m off.",
+            )
+            return NEVER_NS
+        reason = Reason(int(self._host.bridge.send(action).reasons[0]))
+        if reason != Reason.ACCEPTED:
+            code = {Reason.ESTOP: ResultCode.ESTOP, Reason.FAULT: ResultCode.FAULT}.get(reason, ResultCode.NOT_ACTIVE)
+            self._end(code, reason.explanation)
+            return NEVER_NS
+        self._due_ns = now_ns + self._period_ns
+        return self._due_ns
