@@ -55,7 +55,8 @@ class FollowingLimit:
 
     def of(self, velocity: Array) -> Array:
         """Return the largest distances [rad], shape (n, dof), from references of these speeds, shape (n, dof)."""
-        return self.at_rest + np.abs(velocity) * self.latency_s[:, None]
+        late = self.latency_s.any()  # 0 times infinity is no number
+        return self.at_rest + np.abs(velocity) * self.latency_s[:, None] if late else self.at_rest
 
 
 @kernel("b1(f8[:,::1], f8[:,::1], b1[:,::1], i8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1])")
@@ -76,7 +77,9 @@ def follow_references(  # noqa: PLR0917
     for sim in range(len(off)):
         for k in range(off.shape[1]):
             away[sim, k] = abs(position[sim, k] - reference[sim, k])
-            most[sim, k] = at_rest[sim, k] + abs(speed[sim, k]) * latency_s[sim]
+            most[sim, k] = at_rest[sim, k]
+            if latency_s[sim] != 0.0:  # 0 times infinity is no number
+                most[sim, k] += abs(speed[sim, k]) * latency_s[sim]
             off[sim, k] = away[sim, k] > most[sim, k]
             any_off |= off[sim, k]
         stands = abs(velocity[sim, -1]) < GRIPPER_STILL and speed[sim, -1] == 0.0
