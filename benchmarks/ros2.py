@@ -2,8 +2,8 @@
 
 Latencies of commands, processor time, how regular topics are, with and without a process beside it that computes all
 the time; and how long a robot goes on when one of the processes that drive it is killed or stopped. Every ratio is to
-the plain pair in the same run, the median of some rounds. It needs the ROS 2 environment of the tests, which it installs
-on first use. Exits with 3 if a goal is missed, with 2 if nothing can be measured here.
+the plain pair in the same run, the median of some rounds. It needs the ROS 2 environment of the tests, which it
+installs on first use. Exits with 3 if a goal is missed, with 2 if nothing can be measured here.
 """
 
 import contextlib

@@ -55,7 +55,11 @@ class Client:
     async def __aenter__(self) -> Self:
         """Connect."""
         self._session = aiohttp.ClientSession()
-        self._socket = await self._session.ws_connect(self._url, protocols=["foxglove.sdk.v1"], max_msg_size=0)
+        try:
+            self._socket = await self._session.ws_connect(self._url, protocols=["foxglove.sdk.v1"], max_msg_size=0)
+        except aiohttp.ClientConnectionError as error:
+            await self._session.close()
+            raise SystemExit(f"{self._url}: {error}. Serve a robot there first: --foxglove_port.") from error
         return self
 
     async def __aexit__(
@@ -65,9 +69,12 @@ class Client:
         await self._socket.close()
         await self._session.close()
 
-    async def receive(self) -> None:
-        """Take what comes next."""
-        received = await self._socket.receive()
+    async def receive(self, timeout_s: float = 0.01) -> None:
+        """Take what comes next, if it comes in time."""
+        try:
+            received = await self._socket.receive(timeout_s)
+        except TimeoutError:
+            return
         if received.type == aiohttp.WSMsgType.BINARY:
             topic, decode = self._topics[struct.unpack_from("<I", received.data, 1)[0]]
             self.messages[topic].append(decode(received.data[13:]))

@@ -65,7 +65,7 @@ def _add(commands: Commands, name: str, help_text: str, run: Run, positional: st
         command.add_argument("topic", metavar=positional, help="name of the topic")
         command.add_argument(
             "--map", type=Path, metavar="FILE",
-            help="a YAML file whose `types` define further message types, as of `bhd-data import --map`",
+            help="a YAML file whose `types` define further message types, as those of a bag",
         )  # fmt: skip
     command.add_argument("--domain", type=int, metavar="N", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
     command.add_argument(

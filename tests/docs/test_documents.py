@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies
-from bhd_lerobot.cli import evaluate, monitor
+from bhd_lerobot.cli import evaluate, monitor, ros2
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -22,6 +22,7 @@ from bhd_lerobot.options.parse import parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.ros2.serve.serve import ServeConfig
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from bhd_lerobot.training.rl.config import parse_rl
@@ -154,12 +155,14 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         parse(RecordConfig, arguments)
     elif program == "bhd-replay":
         parse(ReplayConfig, arguments)
-    elif program == "bhd-data":
+    elif program == "bhd-ros2" and arguments[:1] == ["serve"]:
+        parse(ServeConfig, arguments[1:] or ["--robot.type=turtlebot3"])
+    elif program in ("bhd-data", "bhd-ros2"):
         # In running text a command is named without its arguments.
         named = ["--help"] if len(arguments) == 1 else []
         with contextlib.redirect_stdout(io.StringIO()):
             try:
-                main._parser().parse_args([*arguments, *named])
+                (main if program == "bhd-data" else ros2)._parser().parse_args([*arguments, *named])
             except SystemExit as end:
                 if end.code:
                     raise
@@ -195,7 +198,7 @@ def test_every_quoted_command_parses(monkeypatch: pytest.MonkeyPatch) -> None:
         except (Exception, SystemExit) as error:
             wrong.append(f"{by_name(path)}: {line}: {error}")
     assert wrong == []
-    assert programs == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval"}
+    assert programs == {f"bhd-{name}" for name in ("record", "replay", "data", "monitor", "train", "eval", "ros2")}
 
 
 def test_a_wrong_command_does_not_parse(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,6 +68,9 @@ def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(comman
         assert np.array_equal(getattr(plan.trajectory, name), getattr(expected.trajectory, name))
         assert np.shares_memory(getattr(plan.trajectory, name), plan.rows)
     assert np.array_equal(plan.target, expected.target)
+    assert server.newest is not None
+    assert np.array_equal(server.newest.position, expected.trajectory.position)
+    assert not np.shares_memory(server.newest.position, plan.rows)  # it stays as it is when the rows do not
     assert not server.serve_once()
     assert link.poll(0) is None  # once
 

@@ -27,8 +27,8 @@ _FINAL_S = 0.5  # between a reply to one of several clients and the status of it
 _RESULT_S = 5.0  # for the result of a goal that has ended
 _ACTION = "/_action/send_goal"
 _OF_EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of services that all nodes have
-# Reliable would lose the first reply of a server of Fast DDS that has replied to others before, for up to some seconds:
-# Cyclone DDS discards what such a writer sends before its first heartbeat.
+# A reliable reader has the first reply of Fast DDS late or never: Cyclone DDS waits for a heartbeat of the server's
+# writer, which comes up to some seconds after the match. See findings/cyclonedds_first_reply_of_fastdds_late.sh.
 _RECEIVED = Qos(100, reliable=False)
 
 

@@ -98,7 +98,7 @@ def subscribed(node: Node, topic: str, wait_s: float) -> Subscription:
         who = ", ".join(f"{one.node or 'an unnamed node'} publishes {one.msgtype}" for one in publishers)
         raise ConfigError(f"{topic} has several types: {who}.")
     find_type(types[0], node.network.distro)
-    # A reliable subscription would miss what Fast DDS sends first to one that comes later.
+    # A reliable subscription would have what Fast DDS sends first late or never, see `clients`.
     keeps = all(one.qos.transient_local for one in publishers)
     return node.subscription(topic, types[0], Qos(1000, reliable=keeps, transient_local=keeps))
 

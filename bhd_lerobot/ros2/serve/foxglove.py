@@ -40,7 +40,7 @@ class FoxgloveServer:
         port: the TCP port.
 
     Raises:
-        ConfigError: Foxglove's SDK is not installed, or the port cannot be used.
+        ConfigError: Foxglove's SDK is not installed.
     """
 
     def __init__(self, name: str, port: int) -> None:
@@ -56,21 +56,30 @@ class FoxgloveServer:
         self._inboxes: dict[str, tuple[str, deque[Received]]] = {}  # the type and what waits, by topic
         self._advertised: dict[tuple[int, int], Any] = {}  # clients' channels
         self._warned: set[tuple[int, int]] = set()
+        self._name, self._port = name, port
+        self._server: Any = None
+
+    def start(self) -> None:
+        """Let clients connect, when all topics are there: the SDK announces one before it takes subscriptions to it.
+
+        Raises:
+            ConfigError: the port cannot be used.
+        """
         logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL)  # a client that goes away is no error
         try:
-            self._server = foxglove.start_server(
-                name=name,
+            self._server = self._sdk.start_server(
+                name=self._name,
                 host=HOST,
-                port=port,
-                capabilities=[foxglove.Capability.ClientPublish],
+                port=self._port,
+                capabilities=[self._sdk.Capability.ClientPublish],
                 supported_encodings=[_ENCODING],
                 server_listener=self,  # type: ignore[arg-type]  # it calls what its capabilities need
                 context=self._context,
             )
-        except (RuntimeError, OverflowError) as error:
+        except RuntimeError as error:
             raise ConfigError(
-                f"--foxglove_port={port}: Foxglove cannot be served on {HOST}: {as_text(error)}. Choose another port, "
-                "for example 8766, or end the program that uses it; 0 turns Foxglove off."
+                f"--foxglove_port={self._port}: Foxglove cannot be served on {HOST}: {as_text(error)}. Choose another "
+                "port, for example 8766, or end the program that uses it; 0 turns Foxglove off."
             ) from error
 
     def channel(self, topic: str, msgtype: str) -> Any:
@@ -89,7 +98,8 @@ class FoxgloveServer:
 
     def close(self) -> None:
         """Disconnect the clients. May be called twice."""
-        self._server.stop()
+        if self._server is not None:
+            self._server.stop()
 
     # --- called by the SDK, on threads of its own --------------------------------------------------------------------
 
@@ -118,7 +128,7 @@ class FoxgloveServer:
         if channel is None:  # not advertised any more
             return
         if channel.topic not in self._inboxes:
-            takes = ", ".join(sorted(self._inboxes)) or "nothing yet"
+            takes = ", ".join(sorted(self._inboxes))
             self._warn(key, f"The robot does not subscribe to {channel.topic}; it subscribes to: {takes}.")
             return
         wanted, waiting = self._inboxes[channel.topic]

@@ -65,12 +65,13 @@ class ServeConfig:
             raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
 
 
-def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
+def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threading.Event | None = None) -> None:
     """Serve a robot until SIGINT or SIGTERM.
 
     Args:
         robot: the robot of `config.robot`, not connected.
         console: takes lines about the state.
+        ended: ends it as well, once it is set.
 
     Raises:
         ConfigError: Cyclone DDS is not installed, or Foxglove cannot be served.
@@ -78,8 +79,8 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
     """
     require_cyclonedds()
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
-    ended = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    end = ended or threading.Event()
+    before = {number: signal.signal(number, lambda *_: end.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         robot.connect()
         host = robot.host
@@ -91,6 +92,8 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
         with MirroredNode(*named, foxglove) if foxglove else Node(*named) as node:
             counts = Counts()
             server = Server(host, node, _parts(config, host, node, counts), counts)
+            if foxglove:
+                foxglove.start()
             where = "this machine" if config.network.is_local else config.network.interface
             console.print(
                 f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
@@ -98,10 +101,10 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console) -> None:
             if foxglove:
                 console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
             if config.duration_s:
-                timer = threading.Timer(config.duration_s, ended.set)
+                timer = threading.Timer(config.duration_s, end.set)
                 timer.daemon = True
                 timer.start()
-            server.run(ended.is_set, lambda line: console.print(line, markup=False))
+            server.run(end.is_set, lambda line: console.print(line, markup=False))
             console.print(_summary(host, counts))
     finally:
         if foxglove:
