@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import binomtest
 
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli import record
 from bhd_lerobot.cli.data.main import main as data
 from tests.ros2.peer_env import Peer, environment
 from tests.ros2.programs import Recording, Served, log_of
@@ -239,3 +241,64 @@ def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
         assert "emergency stop" in message
         publish_until(False, "/emergency_stop/reset", "std_msgs/msg/Empty", "{}")
         assert talk(goal(*ASIDE)) == [(True, REACHED)]
+
+
+def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, tmp_path: Path) -> None:
+    log = tmp_path / "robot.jsonl"
+    move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=3", "--brain.type=random")
+    options = ("--brain.scale=0.02", "--dataset.num_episodes=1")
+    driver = ("--active=forward_position_controller", "--log", log)
+    with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
+        robot.wait_event("ready")
+        with Recording("ur5", *move, *options, domain=domain, folder=tmp_path) as recording:
+            assert recording.process.wait() == 0, recording.text
+    assert data(["check", str(recording.root)]) == 0
+    columns = columns_of(recording.root)
+    times = recording.starts[0] + columns["control.time"]
+    states = log_of(log, "state")
+    measured, positions = (np.array([line[key] for line in states]) for key in ("monotonic", "position"))
+    joints = columns["observation.state"][:, :6]
+    assert np.ptp(joints, axis=0).min() > 0.005  # [rad]: they moved
+    # It moves at up to 3 rad/s; between two of its messages, and until one has come, by far less than this.
+    for joint in range(6):
+        then = np.interp(times, measured, positions[:, joint])
+        np.testing.assert_allclose(joints[:, joint], then, atol=0.03)
+    sent = np.array([line["given"] for line in log_of(log, "positions")])
+    applied = columns["control.applied_action"][:, :6]
+    assert np.abs(sent[:, None] - applied[None]).max(axis=2).min(axis=0).max() < 0.02
+
+
+FULL_S, SHORT_S = 10, 4  # of an episode
+
+
+@pytest.mark.timeout(3600)
+def test_the_rule_does_over_ros_what_it_does_in_this_process(domain: int, tmp_path: Path) -> None:
+    episodes, seconds = (100, FULL_S) if IS_FULL else (2, SHORT_S)
+    task = (
+        *("--task.type=avoid", "--task.arena=turtlebot3_world", "--task.random_start=true", "--task.min_path_m=0.3"),
+        *(f"--task.duration_s={seconds}", "--brain.type=avoidance", f"--dataset.num_episodes={episodes}"),
+    )
+    alone = tmp_path / "alone"
+    here = ("--robot.type=turtlebot3", "--dataset.repo_id=test/alone", "--preview_video=false")
+    assert record.main([*here, f"--dataset.root={alone}", f"--output_dir={tmp_path / 'here'}", *task]) == 0
+    with Served("turtlebot3", "--robot.arena=turtlebot3_world", domain=domain, log=tmp_path / "robot") as robot:
+        with Recording("turtlebot3", *task, domain=domain, folder=tmp_path) as recording:
+            assert recording.process.wait() == 0, recording.text
+        assert robot.stop() == 0
+    (low, high), (ros_low, ros_high) = (_success(outcomes_of(root)) for root in (alone, recording.root))
+    in_contact, _ = robot.contacts
+    ages = columns_of(recording.root)["control.age"]
+    print(f"Success in this process {low:.3f} to {high:.3f}, over ROS {ros_low:.3f} to {ros_high:.3f}.")
+    print(f"Age of an observation [s]: p50 {np.median(ages):.3f}, p99 {np.percentile(ages, 99):.3f}.")
+    assert in_contact == 0
+    assert low <= ros_high
+    assert ros_low <= high
+    timing = json.loads(pq.read_table(recording.root / "meta" / "episodes").to_pylist()[0]["bhd/timing"])
+    assert timing["age_max"] > 0
+    assert timing["inference_p99"] > 0
+
+
+def _success(outcomes: list[str]) -> tuple[float, float]:
+    """Return the 95 % interval of the rate of success."""
+    found = binomtest(outcomes.count("success"), len(outcomes)).proportion_ci(method="wilson")
+    return found.low, found.high
