@@ -56,7 +56,7 @@ def test_commands_with_wrong_stamps_are_taken_as_a_real_robot_does(header: dict[
 
 def test_a_twist_that_is_not_finite_is_refused(base: Served) -> None:
     assert not drives(base, {"twist": {"linear": {"x": math.nan}}})
-    base.wait_for("/cmd_vel: a value is not finite")
+    base.wait_for("/cmd_vel: the command holds NaN or an infinity")
 
 
 def test_a_flood_of_commands_is_followed_and_the_robot_still_answers(base: Served) -> None:
@@ -80,7 +80,6 @@ def test_a_command_of_an_absurd_size_gets_its_result_and_others_theirs(base: Ser
         ):
             message = echo.wait_event("message")["message"]
         assert message["task_id"] == name
-        assert not message["success"]
 
 
 @pytest.mark.parametrize(
