@@ -62,7 +62,7 @@ class Ros2Plant(Plant):
         state = self.link.state
         silent_s = (time.monotonic_ns() - int(state["measured_ns"][0])) / 1e9
         is_old = silent_s > self._silence_s
-        self.link.check(self._silence_s / 2 if is_old else 2 * self._silence_s)
+        self.link.check(self._silence_s / 2 if is_old else self._silence_s)
         if problem := bytes(state["problem"]).decode(errors="ignore"):
             raise RealtimeError(problem)
         if is_old:
