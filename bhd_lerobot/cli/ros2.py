@@ -65,7 +65,7 @@ def _add(commands: Commands, name: str, help_text: str, run: Run, positional: st
         command.add_argument("topic", metavar=positional, help="name of the topic")
         command.add_argument(
             "--map", type=Path, metavar="FILE",
-            help="a YAML file whose `types` define further message types, as those of a bag",
+            help="a YAML file, a mapping as of `bhd-data`, whose `types` define further message types",
         )  # fmt: skip
     command.add_argument("--domain", type=int, metavar="N", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
     command.add_argument(

@@ -29,6 +29,7 @@ class ReadingCheck:
         oldest_ns: largest age of a reading [ns].
         ahead_ns: by how much a stamp may be ahead of the tick's time [ns].
         problem: why the last reading that was refused was no measurement, as text.
+        silence: how old the last reading was that was refused for its age, as text.
 
     Args:
         control_hz: ticks a second [Hz].
@@ -37,7 +38,7 @@ class ReadingCheck:
     def __init__(self, body: Body, n: int, control_hz: int) -> None:
         period = NANOSECONDS // control_hz
         self.oldest_ns, self.ahead_ns = _SLACK_PERIODS * period, period
-        self.problem = ""
+        self.problem = self.silence = ""
         if isinstance(body, Arm):
             self._names: tuple[str, ...] = (*body.chain.joints, "gripper")
             speed = np.array([*body.limits.velocity[:-1], np.inf])
@@ -53,7 +54,7 @@ class ReadingCheck:
     def forget(self, ids: NDArray[np.intp]) -> None:
         """Accept the next positions of some robots, whatever they are."""
         self._near[ids] = np.nan
-        self.problem = ""
+        self.problem = self.silence = ""
 
     def wrong_positions(self, reading: PlantReading, now_ns: int) -> Mask | None:
         """Return the robots whose positions are not finite or changed too fast, shape (n,); None if there are none.
@@ -118,9 +119,9 @@ class ReadingCheck:
             return None
         if np.count_nonzero(early) and not self.problem:
             self.problem = ahead_of_time(int(newest_ns.max()) - now_ns)
-        elif not self.problem:
+        elif not self.silence:
             age, most = (now_ns - int(stamp_ns.min())) / NANOSECONDS, self.oldest_ns / NANOSECONDS
-            self.problem = f"the newest reading was {age:.3f} s old, more than {most:g} s"
+            self.silence = f"the newest reading was {age:.3f} s old, more than {most:g} s"
         return wrong
 
 

@@ -59,7 +59,7 @@ def log_of(path: Path, event: str) -> list[dict[str, Any]]:
     ("robot", "brain", "options"),
     [("kilted", "kilted", ()), ("jazzy", "kilted", ("--lidar=lds02",)), ("kilted", "jazzy", ("--twist",))],
 )
-@pytest.mark.thorough(but=1)
+@pytest.mark.thorough
 def test_the_avoidance_node_drives_the_standin_without_contact(
     robot: str, brain: str, options: tuple[str, ...], domain: int, tmp_path: Path
 ) -> None:

@@ -131,7 +131,7 @@ KILLED = {  # a part of its command line, None for bhd-record itself; what is sa
 
 
 @pytest.mark.parametrize("killed", KILLED)
-@pytest.mark.thorough(but=2)
+@pytest.mark.thorough(but=1)
 def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
     killed: str, domain: int, tmp_path: Path
 ) -> None:

@@ -13,6 +13,7 @@ from bhd_lerobot.errors import BrainStoppedError, ConfigError, RealtimeError, un
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.ros2.live.link import NodeLink
+from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec
 from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
 from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, topics_of
@@ -53,7 +54,7 @@ class TopicBrain(ConfiguredBrain):
         names = list(mapping.action)
         self._columns = [[robot.action_names.index(names[column]) for column in topic.columns] for topic in topics]
         inputs = tuple(
-            InputSpec(topic.topic, topic.msgtype, topic, silence_s=self.config.timeout_s / 2) for topic in topics
+            InputSpec(topic.topic, topic.msgtype, topic, SENSOR_DATA, self.config.timeout_s / 2) for topic in topics
         )
         self._link = NodeLink(NodeSpec(f"bhd_brain_{os.getpid()}", self.config.network, inputs))
         self._link.open(patience_s=None)

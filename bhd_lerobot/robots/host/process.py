@@ -211,7 +211,8 @@ class LiveProcess:
         plant, cerebellum = self._plant, self._host.cerebellum
         if cerebellum.mode[0] != Mode.FAULT:
             return ""
-        return cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
+        named = cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
+        return named or cerebellum.readings.silence
 
     def _serve(self, now_ns: int) -> None:
         self._serve_bridge(now_ns)

@@ -25,7 +25,7 @@ _START_S = 30.0
 _END_S = 3.0
 _CHECKS = 3  # looks at who else is there, before a command is sent
 _GHOST_S = 25.0  # a node that was killed counts for up to 20 s
-SILENCE_S = 1.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
+SILENCE_S = 3.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
 
 
 class NodeLink:
@@ -46,7 +46,7 @@ class NodeLink:
         self._record: Any = None
         self._lock = -1
 
-    def open(self, patience_s: float | None = 10.0) -> None:
+    def open(self, patience_s: float | None = 15.0) -> None:
         """Start the processes, and wait until every topic that is received has sent something.
 
         Args:
@@ -156,10 +156,13 @@ class NodeLink:
             RealtimeError: one has.
         """
         for role, word in (("node", Word.ALIVE), ("guard", Word.GUARD_ALIVE)):
-            if role in self._processes and self.channel.silence_s(word) > silence_s:
-                process = self._processes[role]
-                how = "is stopped" if process.poll() is None else f"ended with status {process.returncode}"
-                raise RealtimeError(f"The process of the ROS 2 {role} {how}.")
+            process = self._processes.get(role)
+            if process is None:
+                continue
+            if process.poll() is not None:
+                raise RealtimeError(f"The process of the ROS 2 {role} ended with status {process.returncode}.")
+            if self.channel.silence_s(word) > silence_s:
+                raise RealtimeError(f"The process of the ROS 2 {role} is stopped.")
 
     def write(self, values: NDArray[np.float64]) -> None:
         """Send a command, shape (numbers of all outputs,); never waits."""

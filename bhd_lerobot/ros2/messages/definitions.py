@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError, as_text, unknown_name
-from bhd_lerobot.ros2.messages.types import type_store
+from bhd_lerobot.errors import ConfigError, as_text
+from bhd_lerobot.ros2.messages.types import type_store, unknown_type
 
 DEFINITIONS = {
     "std_srvs/srv/Empty": "---",
@@ -188,11 +188,7 @@ def find_type(name: str, distro: str = "jazzy") -> None:
     register_types({one: text for one, text in definitions.items() if not _is_known(one)})
     if not _is_known(name):
         kind = name.split("/")[1] if name.count("/") == 2 else ""
-        known = DEFINITIONS if kind in _PARTS else type_store().fielddefs
-        raise ConfigError(
-            f"{unknown_name('ROS 2 type', name, (one for one in known if f'/{kind}/' in one))} "
-            "bhd_lerobot.ros2.messages.definitions.register_types makes further ones known."
-        )
+        raise ConfigError(unknown_type(name, DEFINITIONS if kind in _PARTS else type_store().fielddefs))
 
 
 def _is_known(name: str) -> bool:

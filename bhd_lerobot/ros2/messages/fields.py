@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.ros2.messages.types import type_store
+from bhd_lerobot.ros2.messages.types import type_store, unknown_type
 
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
 _STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?:(?P<index>\d+)|(?P<key>[A-Za-z]\w*)=(?P<value>[^\]]+))\])?")
@@ -110,7 +110,7 @@ class Field:
         """Return the steps, and the kind of what they lead to."""
         store, inside, steps = type_store(), self.msgtype, []
         if inside not in store.fielddefs:
-            raise ConfigError(unknown_name("ROS 2 message type", inside, store.fielddefs))
+            raise ConfigError(unknown_type(inside, store.fielddefs))
         parts = self.path.split(".") if self.path else []
         for place, text in enumerate(parts):
             match = _STEP.fullmatch(text)

@@ -3,6 +3,8 @@
 Bags embed the definitions, so that a reader without this package decodes our messages as well.
 """
 
+import difflib
+from collections.abc import Iterable
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -164,3 +166,10 @@ def type_store() -> Any:
     for name, text in {**DEFINITIONS, **shipped}.items():
         store.register(get_types_from_msg(text, name))
     return store
+
+
+def unknown_type(name: str, known: Iterable[str]) -> str:
+    """Return the message for a type that is not among those that are known, which are too many to list."""
+    near = difflib.get_close_matches(name, list(known), n=4, cutoff=0.5)
+    hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+    return f"Unknown ROS 2 type {name!r}.{hint} The section `types` of a mapping defines further ones, by their text."

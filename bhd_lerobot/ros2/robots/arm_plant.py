@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.live.network import LATCHED, Qos
+from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -86,9 +86,9 @@ class ArmPlant(Ros2Plant):
         self._opening = body.home[-1]
         inputs = (
             InputSpec(
-                "/joint_states", JOINT_STATE, JointReader(joints), silence_s=max(_SILENCE_S, config.ros2.silence_s)
+                "/joint_states", JOINT_STATE, JointReader(joints), SENSOR_DATA, max(_SILENCE_S, config.ros2.silence_s)
             ),
-            InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), silence_s=_FOREVER),
+            InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), SENSOR_DATA, _FOREVER),
             InputSpec(ur.SAFETY_TOPIC, ur.SAFETY_MODE, NumberReader("mode"), LATCHED, silence_s=_FOREVER),
         )
         outputs = (

@@ -122,7 +122,8 @@ class BasePlant(Ros2Plant):
                 "/joint_states",
                 JOINT_STATE,
                 WheelReader(body.drive.wheel_radius),
-                silence_s=node_silence,
+                SENSOR_DATA,
+                node_silence,
                 has_one_source=True,
             ),
             InputSpec(

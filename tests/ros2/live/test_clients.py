@@ -75,7 +75,7 @@ def test_what_cannot_be_called_is_named(node: Node, servers: Peer) -> None:
         (lambda: ServiceClient(node, "/x", SET_BOOL).call(timeout_s=0.1), RealtimeError, "Valid: /motor_power, /reset"),
         (lambda: goals.send_goal({"order": 1}, timeout_s=0.1), RealtimeError, "'/fibonacci'?"),
         (lambda: ServiceClient(node, "/reset_odometry", SET_BOOL).call(), ConfigError, f"{TRIGGER}; the client is of"),
-        (lambda: ServiceClient(node, "/motor_power", "std_srvs/srv/SetBol"), ConfigError, "'std_srvs/srv/SetBool'?"),
+        (lambda: ServiceClient(node, "/motor_power", "std_srvs/srv/SetBol"), ConfigError, "'std_srvs/srv/SetBool'"),
         (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"dat": True}), ConfigError, "'data'?"),
         (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"data": 1}), ConfigError, "is 1; it is true or"),
         (lambda: ActionClient(node, "/fibonacci", FIBONACCI).send_goal({"order": 2**31}), ConfigError, "2147483647"),

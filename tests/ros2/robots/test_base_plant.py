@@ -22,7 +22,7 @@ _SOON_S = 10.0  # far longer than a stop takes, for a busy machine
 
 
 def make(domain: int, **options: float) -> BasePlant:
-    network = Ros2Config(domain=domain, **{"silence_s": 1.0, **options})  # type: ignore[arg-type]
+    network = Ros2Config(domain=domain, **{"silence_s": 5.0, **options})  # type: ignore[arg-type]
     return BasePlant(SimpleNamespace(beams=360, imu=True, ros2=network), turtlebot3_burger())
 
 
@@ -95,6 +95,7 @@ def test_it_stops_when_commands_cease_and_when_it_is_closed(robot: Peer, plant: 
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.thorough(but=1)
 def test_it_stops_when_the_node_is_killed_or_stopped(robot: Peer, plant: BasePlant, number: int) -> None:
     drive(plant, lambda: moves(robot), "the robot moves")
     os.kill(plant.link.pids["node"], number)
@@ -124,6 +125,7 @@ def test_a_robot_that_is_gone_is_named(robot: Peer, plant: BasePlant) -> None:
         (["--frame", "scan:laser"], "The newest message of /scan cannot be used: it is in the frame 'laser', not"),
     ],
 )
+@pytest.mark.thorough(but=1)
 def test_what_is_wrong_with_a_topic_is_named(domain: int, options: list[str], text: str) -> None:
     with Peer("standin_turtlebot3.py", *options, domain=domain) as peer:
         peer.wait_event("ready")

@@ -1,0 +1,73 @@
+"""Nodes beside real ones of ROS 2, and what does not fit together."""
+
+import time
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.ros2.live.network import SENSOR_DATA, NetworkConfig, Qos
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.serialize import encode
+from tests.ros2.peer_env import Peer
+from tests.waiting import until
+
+ODOMETRY, SCAN, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/Imu"
+
+
+def test_a_real_node_is_heard_and_named_and_mismatches_are_said(domain: int) -> None:
+    with (
+        Node("robot", NetworkConfig(domain)) as node,
+        Peer("standin_turtlebot3.py", "--open", domain=domain) as peer,
+    ):
+        peer.wait_event("ready")
+        scans = node.subscription("/scan", SCAN, SENSOR_DATA)
+        received = until(scans.take, "a scan comes")
+        assert abs(received[-1].sent_ns - time.time_ns()) < 60e9
+        assert len(received[-1].message().ranges) == 360
+        until(lambda: "/turtlebot3_node" in node.graph.nodes(), "the robot's node is named")
+        assert "/robot" in node.graph.nodes()
+
+        def mismatch(topic: str, msgtype: str, qos: Qos) -> str:
+            return until(lambda: node.graph.mismatches(topic, msgtype, qos, is_publisher=False), "it is found")[0]
+
+        assert "is best effort; the subscription here is reliable, and no message" in mismatch("/scan", SCAN, Qos())
+        assert f"is of type {SCAN}; the subscription here is of {IMU}" in mismatch("/scan", IMU, SENSOR_DATA)
+        assert not node.graph.mismatches("/odom", ODOMETRY, Qos(), is_publisher=False)
+        stale = node.graph.mismatches("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), is_publisher=True)
+        assert "is of type geometry_msgs/msg/TwistStamped" in stale[0]
+
+
+def test_a_real_node_lists_ours_and_receives_what_it_sends(domain: int) -> None:
+    text = "a text"
+    with Node("robot", NetworkConfig(domain)) as node:
+        publisher = node.publisher("/words", "std_msgs/msg/String")
+        [data] = encode("std_msgs/msg/String", {"data": text}, 1)
+        with Peer("topic.py", "echo", "/words", "std_msgs/msg/String", domain=domain) as peer:
+            until(lambda: [publisher.send(data), [line for line in peer.lines if text in str(line)]][1], "it arrives")
+        with Peer("topic.py", "list", domain=domain) as peer:
+            peer.wait(lambda line: "robot" in str(line) and "/words" in str(line), "the node")
+
+
+def test_nodes_of_one_process_come_and_go(domain: int) -> None:
+    for _ in range(3):
+        with Node("robot", NetworkConfig(domain)) as node:
+            node.publisher("/words", "std_msgs/msg/String")
+            assert node.graph.nodes() == ["/robot"]
+    node.close()
+
+
+def test_numbers_arrive_bit_for_bit(domain: int) -> None:
+    values = np.array([np.nan, np.inf, -np.inf, -0.0, 5e-324, 1 / 3], np.float32)
+    with Node("robot", NetworkConfig(domain)) as node:
+        publisher, subscription = node.publisher("/scan", SCAN), node.subscription("/scan", SCAN)
+        [data] = encode(SCAN, {"ranges": values[None]}, 1)
+        received = until(lambda: [publisher.send(data), subscription.take()][1], "it arrives")
+    assert received[0].message().ranges.tobytes() == values.tobytes()
+
+
+def test_an_unknown_type_is_named(domain: int) -> None:
+    with (
+        Node("robot", NetworkConfig(domain)) as node,
+        pytest.raises(ValueError, match="Unknown ROS 2 type 'my_msgs/msg/Foo'"),
+    ):
+        node.publisher("/foo", "my_msgs/msg/Foo")

@@ -1,0 +1,61 @@
+"""Joint trajectories of ROS 2, sampled in time."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import ActionError
+from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
+
+JOINTS = ("a", "b")
+START = np.array([0.1, -0.1])
+
+
+def point(time_s: float, positions: list[float], velocities: list[float] | None = None) -> Any:
+    sec = int(time_s)
+    stamp = SimpleNamespace(sec=sec, nanosec=round((time_s - sec) * 1e9))
+    return SimpleNamespace(positions=positions, velocities=velocities or [], time_from_start=stamp)
+
+
+def made(*points: Any, joints: tuple[str, ...] = JOINTS) -> JointTrajectory:
+    return JointTrajectory(SimpleNamespace(joint_names=list(joints), points=list(points)), JOINTS, START)
+
+
+@pytest.mark.parametrize("with_speeds", [False, True])
+def test_it_passes_its_points_in_time_and_holds_the_last(with_speeds: bool) -> None:
+    speeds = [0.5, 0.5] if with_speeds else None
+    rest = [0.0, 0.0] if with_speeds else None
+    one = made(point(1.0, [1.0, 2.0], speeds), point(2.5, [0.5, 3.0], rest))
+    np.testing.assert_allclose(one.at(0.0), START)
+    np.testing.assert_allclose(one.at(1.0), [1.0, 2.0])
+    np.testing.assert_allclose(one.at(2.5), [0.5, 3.0])
+    np.testing.assert_allclose(one.at(99.0), [0.5, 3.0])
+    assert one.duration_s == 2.5
+    if with_speeds:
+        slope = (one.at(1.0 + 1e-6) - one.at(1.0 - 1e-6)) / 2e-6
+        np.testing.assert_allclose(slope, speeds, atol=1e-4)
+    else:
+        np.testing.assert_allclose(one.at(0.5), (START + np.array([1.0, 2.0])) / 2)
+
+
+def test_joints_are_found_by_name() -> None:
+    one = made(point(1.0, [2.0, 1.0]), joints=("b", "a"))
+    np.testing.assert_allclose(one.at(1.0), [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("points", "joints", "text"),
+    [
+        ([], JOINTS, "no point"),
+        ([point(1.0, [1.0, 2.0])], ("a", "c"), "has the joints a, c; needed: a, b"),
+        ([point(1.0, [1.0])], JOINTS, "does not have 2 positions"),
+        ([point(1.0, [1.0, np.nan])], JOINTS, "not finite"),
+        ([point(1.0, [1.0, 2.0]), point(1.0, [1.0, 2.0])], JOINTS, "do not rise"),
+        ([point(-1.0, [1.0, 2.0])], JOINTS, "do not rise"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(points: list[Any], joints: tuple[str, ...], text: str) -> None:
+    with pytest.raises(ActionError, match=text):
+        made(*points, joints=joints)
