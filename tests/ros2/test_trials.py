@@ -1,6 +1,6 @@
 """Our robots and programs on the network with others by the real ROS 2 client library, in short.
 
-In full: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance` lasts 10 minutes, `-k rule` 20 for 100 episodes.
+In full: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance`: 10 min; `-k rule`: 20 min, 100 episodes.
 """
 
 import itertools
