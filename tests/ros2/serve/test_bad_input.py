@@ -1,4 +1,4 @@
-"""What other nodes, by the real client library, may send a served robot: it is refused or named, and serving goes on."""
+"""What other nodes, by the real client library, may send a served robot: it is refused or named, and it serves on."""
 
 import json
 import math
