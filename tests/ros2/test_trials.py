@@ -70,8 +70,15 @@ def test_what_is_recorded_is_what_the_robot_measured_and_was_sent(domain: int, t
     options = ("--clock-offset=-86400", "--wait", "--log", log)
     with Peer("standin_turtlebot3.py", PILLAR, *options, *faults, domain=domain) as robot:
         robot.wait_event("ready")
-        with Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=2", domain=domain, folder=tmp_path) as recording:
-            assert recording.process.wait() == 0, recording.text
+        for attempt in range(3):
+            folder = tmp_path / str(attempt)
+            folder.mkdir()
+            with Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=2", domain=domain, folder=folder) as recording:
+                if recording.process.wait() == 0:
+                    break
+                # On a busy machine the stand-in stands still for a third of a second: to us its wheels are blocked.
+                assert "watchdog: blocked" in recording.text, recording.text
+        assert recording.process.wait() == 0, recording.text
         until(lambda: robot.events("report")[-1]["command"] == [0.0, 0.0], "the robot stands")
     assert data(["check", str(recording.root)]) == 0
     columns = columns_of(recording.root)

@@ -77,10 +77,6 @@ def test_a_scan_that_is_none_is_named(
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (
-            ("/joint_states", JOINTS, "{}", "--best-effort"),
-            "/topic_pub is best effort; the subscription here is reliable",
-        ),
         (("/joint_states", "std_msgs/msg/String"), f"/topic_pub is of type std_msgs/msg/String; .* of {JOINTS}"),
         (
             ("/joint_states", JOINTS),
