@@ -1,5 +1,6 @@
 """Another package's robot on an absolute grid: what it is sent, what is reported, and what can go wrong with it."""
 
+import itertools
 import math
 import re
 import time
@@ -362,9 +363,9 @@ def test_after_a_hold_a_base_speeds_up_from_rest(tmp_path: Path) -> None:
         host.step(np.array([[0.5, 0.0]]))
         host.stop(ONLY)
     speeds = [row[0] for row in robot.rows]
-    held = speeds.index(0.0)
-    assert speeds[held - 1] == pytest.approx(0.5)
-    assert next(speed for speed in speeds[held:] if speed) == pytest.approx(0.1)
+    # On a busy machine it may have been held more than once.
+    assert 0.0 in speeds[1:]
+    assert max(after - before for before, after in itertools.pairwise(speeds)) == pytest.approx(0.1)
 
 
 def test_after_the_last_action_of_a_chunk_the_brain_may_fall_silent_no_longer(tmp_path: Path) -> None:
