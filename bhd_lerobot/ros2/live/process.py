@@ -186,7 +186,7 @@ class Receiver:
             self._wrong[camera.topic] = f"it is {width} x {height} px, not {camera.width} x {camera.height}"
             return
         self._wrong.pop(camera.topic, None)
-        record = np.zeros((), ring._state.dtype)
+        record = np.zeros((), self._channel.image_dtypes[index])
         clock = self._clocks[len(self._inputs) + index]
         record["measured_ns"] = clock.measured_ns(_header_stamp(received.data), received.arrived_ns)
         record["pixels"] = image
