@@ -125,6 +125,7 @@ class Receiver:
         self._checked_ns = 0
         self._start_ns = time.monotonic_ns()
         self._network_problem = ""
+        channel.states.publish(self._record)
 
     def step(self) -> None:
         """Take what has arrived, and publish it."""
