@@ -195,8 +195,9 @@ class Peer:
         return self
 
     def _read(self, stream: IO[str]) -> None:
-        for line in stream:
-            self.lines.append(json.loads(line))
+        with stream:
+            for line in stream:
+                self.lines.append(json.loads(line))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.stop()
