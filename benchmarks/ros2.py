@@ -37,11 +37,13 @@ WARM_UP_S = 3.0
 BUSY = "beside a busy process"
 READ = ("--topic=scan:5", "--topic=imu:20", "--topic=joint_states:20")  # what our plant of a base receives
 LIMIT_S = 0.7  # to standstill: 0.5 s and the plant's time-out, 0.2 s
-KILLED = (
-    *(("brain", "bhd-record's or lerobot-record's process"), ("cerebellum", "robots.host.process")),
-    *(("recorder", "realtime.recorder_process"), ("node", "ros2.live.process node")),
-    ("guard", "ros2.live.process guard"),
-)
+KILLED = {  # a part of its command line; the brain's is the process that the others belong to
+    "brain": "",
+    "cerebellum": "robots.host.process",
+    "recorder": "realtime.recorder_process",
+    "node": "ros2.live.process node",
+    "guard": "ros2.live.process guard",
+}
 
 
 class Session:
@@ -162,7 +164,7 @@ class Session:
                     process.stdout.readline()
                     pids += _descendants(process.pid)
                     time.sleep(1.5)
-                    [pid] = [one for one in pids if part in _command_line(one)] or [process.pid]
+                    pid = next(one for one in pids if part in _command_line(one))
                     then = time.monotonic()
                     os.kill(pid, number)
                     time.sleep(LIMIT_S + 1.5)
@@ -268,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stops = {}
     with peer_env.free_domain() as domain:
         rounds = [measure(domain, options.seconds) for _ in range(options.rounds)]
-        for part, process in KILLED:
+        for part, process in KILLED.items():
             for verb, number in (("killed", signal.SIGKILL), ("stopped", signal.SIGSTOP)):
                 stops[f"{part} {verb}"] = Session(domain, options.seconds).standstill(process, number)
     return report(rounds, stops).end(options.json)

@@ -39,6 +39,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell without job control starts a background command with Ctrl-C ignored; the children of a test inherit that,
     # and the tests of Ctrl-C would wait for ever.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # by nohup; inherited likewise
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 settings.register_profile("bhd", derandomize=True, deadline=None, database=None)
 settings.load_profile("bhd")

@@ -45,7 +45,7 @@ class BhdRobotConfig(RobotConfig):
             them, and are continued with others. A robot type may have some.
     """
 
-    not_recorded: ClassVar[tuple[str, ...]] = ("ros2",)
+    not_recorded: ClassVar[tuple[str, ...]] = ()
 
     fps: int
     clock: str = "lockstep"

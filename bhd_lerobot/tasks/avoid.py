@@ -135,6 +135,7 @@ class AvoidTask(BaseTask):
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""
+        super().begin(ids, scenes)
         for sim, arena in zip(ids, scenes, strict=True):
             cells = arena.free_cells(self.config.cell_m)
             columns, rows = arena.cells(self.config.cell_m)
@@ -151,23 +152,18 @@ class AvoidTask(BaseTask):
         started[ids] = True
         self._count_cells(started)
         self._path.begin(ids)
-        self.frame[ids] = 0
 
     def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
-        event = np.full(len(running), int(Event.NOTHING))
         position = truth.base_pose_in_world[:, :2]
         recent = self._path.add(np.where(running, np.hypot(*(position - self._pose).T), 0.0), self.frame)
         self._pose[running] = position[running]
-        self.frame[running] += 1
+        event = self.count_frame(running)
         clean = running & ~truth.touched
         reward = self._count_cells(clean)
-        over = clean & (self.frame >= self.max_frames)
-        far = self._path.total >= self.config.min_path_m
-        event[over & far] = Event.SUCCESS
-        event[over & ~far] = Event.TIMEOUT
-        stuck = clean & ~over & (self.frame >= self._window) & (recent < self.config.stuck_path_m)
-        event[stuck] = Event.STUCK
+        is_over = event == Event.TIMEOUT
+        event[is_over & (self._path.total >= self.config.min_path_m)] = Event.SUCCESS
+        event[clean & ~is_over & (self.frame >= self._window) & (recent < self.config.stuck_path_m)] = Event.STUCK
         event[running & truth.touched] = Event.COLLISION
         return reward, event
 

@@ -1,6 +1,5 @@
 """The task `free`: an instruction and a time, for every robot; a person says how an episode ends."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,15 +53,9 @@ class FreeTask(BaseTask):
         """Return the instruction."""
         return self.config.instruction
 
-    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
-        """Start episodes."""
-        self.frame[ids] = 0
-
     def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return no reward, and a time-out when the time is over, each of shape (n,)."""
-        self.frame += running
-        event = np.where(running & (self.frame >= self.max_frames), Event.TIMEOUT, Event.NOTHING)
-        return np.zeros(len(self.frame)), event.astype(np.int64)
+        return np.zeros(len(self.frame)), self.count_frame(running)
 
     def outcome(self, sim: int, event: Event) -> Outcome:
         """Return how an episode ended: as the person said."""

@@ -157,6 +157,7 @@ class NavigateTask(BaseTask):
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""
+        super().begin(ids, scenes)
         for sim, arena in zip(ids, scenes, strict=True):
             goal = arena.goal
             if goal is None or not np.isfinite(goal).all():
@@ -175,7 +176,7 @@ class NavigateTask(BaseTask):
             self._goal[sim], self._pose[sim] = goal, arena.start
         self._path.begin(ids)
         self._sum[ids] = 0.0
-        self._within[ids] = self.frame[ids] = 0
+        self._within[ids] = 0
         self._shortest[ids] = interpolate(self._ways, self._origin, self._pose[:, :2])[ids]
         self._first[ids] = self._left[ids] = np.maximum(self._way_left(), self.config.tolerance_m)[ids]
 
@@ -195,17 +196,15 @@ class NavigateTask(BaseTask):
         step, turn = np.hypot(*(pose - self._pose)[:, :2].T), np.abs(_wrap(pose[:, 2] - self._pose[:, 2]))
         self._pose = pose
         recent = self._path.add(step, self.frame)
-        self.frame[running] += 1
+        event = self.count_frame(running)
         distance, angle = self._errors()
         there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
         there &= (step * self.fps <= config.rest_speed) & (turn * self.fps <= config.rest_turn_speed)
         self._within[running] = np.where(there, self._within + 1, 0)[running]
         hit = running & truth.touched
         clean = running & ~truth.touched
-        over = clean & (self.frame >= self.max_frames)
-        event = np.full(len(running), int(Event.NOTHING))
-        event[clean & (self.frame >= self._window) & (recent < config.stuck_path_m)] = Event.STUCK
-        event[over] = Event.TIMEOUT
+        is_over = event == Event.TIMEOUT
+        event[clean & ~is_over & (self.frame >= self._window) & (recent < config.stuck_path_m)] = Event.STUCK
         event[clean & (self._within >= self._hold)] = Event.SUCCESS
         event[hit] = Event.COLLISION
         left = np.minimum(self._way_left(), _FARTHEST * self._first)

@@ -1,15 +1,14 @@
 """A task whose episodes a person judges, because the robot cannot tell their outcome."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.tasks.task import Event, Outcome, Task
+from bhd_lerobot.tasks.task import ConfiguredTask, Event, Outcome, Task
 
 
-class OperatorTask:
+class OperatorTask(ConfiguredTask):
     """A task in front of a real robot that does not measure what the task is judged by.
 
     An episode ends when a person states how (`bhd_lerobot.rollout.marks`), or when its time is over. The brain is told
@@ -21,14 +20,11 @@ class OperatorTask:
         fps: frames a second [Hz].
     """
 
-    environment_names: tuple[str, ...] = ()
-    lasts = False
     needs: frozenset[str] | None = frozenset()
 
     def __init__(self, task: Task, n: int, fps: int) -> None:
-        self._task = task
-        self.name, self.robot_kind, self.duration_s = task.name, task.robot_kind, task.duration_s
-        self._frames, self._max_frames = np.zeros(n, np.int64), max(1, round(task.duration_s * fps))
+        super().__init__(task, n, fps)
+        self._task, self.name, self.robot_kind = task, task.name, task.robot_kind
 
     def sample(self, seed: int) -> Any:
         """Return the scene of the episode with this seed, which a person is to set up."""
@@ -38,19 +34,9 @@ class OperatorTask:
         """Return what a person would ask for in this scene."""
         return self._task.instruction(scene)
 
-    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
-        """Start episodes of some robots."""
-        self._frames[ids] = 0
-
-    def environment_state(self, truth: Any) -> NDArray[np.float64]:
-        """Report nothing to the brain, shape (n, 0)."""
-        return np.zeros((len(self._frames), 0))
-
     def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return no reward, and a time-out when the time is over, each of shape (n,)."""
-        self._frames += running
-        event = np.where(running & (self._frames >= self._max_frames), Event.TIMEOUT, Event.NOTHING)
-        return np.zeros(len(self._frames)), event.astype(np.int64)
+        return np.zeros(len(self.frame)), self.count_frame(running)
 
     def outcome(self, sim: int, event: Event) -> Outcome:
         """Return how an episode ended: as the person said."""

@@ -185,6 +185,7 @@ class PickTask(ArmTask):
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Start episodes in some simulations."""
+        super().begin(ids, scenes)
         for sim, scene in zip(ids, scenes, strict=True):
             if scene.target_object is None:
                 raise ConfigError(f"The scene {scene.name!r} names no object to pick up.")
@@ -201,7 +202,7 @@ class PickTask(ArmTask):
                 self._fixed[sim, number, :3] = 1.0, is_target, is_box
                 self._fixed[sim, number, 10:] = 2 * one.size_x, 2 * one.size_y, one.height, *colour
         self._best[ids] = self._height[ids] = 0.0
-        self._held[ids] = self.frame[ids] = 0
+        self._held[ids] = 0
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return what is on the table, as a camera sees it: 16 numbers for each place of an object, shape (n, 80).
@@ -228,17 +229,15 @@ class PickTask(ArmTask):
         gripped = truth.fingers_on_object[sims, target]
         up = (height >= config.lift_m) & gripped
         np.copyto(self._held, (self._held + 1) * up, where=running)
-        self.frame += running
         np.copyto(self._height, height, where=running)
         best = np.maximum(self._best, height)
         reward = (self._share(best) - self._share(self._best)) * running
         before = self._best.copy()
         np.copyto(self._best, best, where=running)
         at = truth.object_poses[sims, target]
-        event = np.zeros(len(running), np.int64)
+        event = self.count_frame(running)
         # What must not happen counts also in the last frame of a success: the later of these takes the earlier's place.
         for name, happened in (
-            (Event.TIMEOUT, self.frame >= self.max_frames),
             (Event.UNREACHABLE, np.hypot(at[:, 0], at[:, 1]) > _REACH),
             (Event.DROPPED, (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped),
             (Event.SUCCESS, self._held >= self._hold),

@@ -103,13 +103,14 @@ class ReachTask(ArmTask):
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Start episodes in some simulations."""
+        super().begin(ids, scenes)
         for sim, scene in zip(ids, scenes, strict=True):
             if scene.target_pose is None:
                 raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
             self._target[sim] = scene.target_pose
             self._camera_error[sim] = scene.variation.camera_error
             self._sensing.begin(sim, scene.report_seed)
-        self._within[ids] = self.frame[ids] = 0
+        self._within[ids] = 0
         self._started[ids] = False
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
@@ -134,9 +135,7 @@ class ReachTask(ArmTask):
         self._last[running], self._angle[running] = distance[running], angle[running]
         there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
         self._within[running] = np.where(there, self._within + 1, 0)[running]
-        self.frame[running] += 1
-        event = np.full(len(running), int(Event.NOTHING))
-        event[running & (self.frame >= self.max_frames)] = Event.TIMEOUT
+        event = self.count_frame(running)
         event[running & (self._within >= self._hold)] = Event.SUCCESS
         event[running & (truth.arm_on_table | truth.self_contact)] = Event.COLLISION
         return reward, event

@@ -177,7 +177,7 @@ class ConfiguredTask:
         fps: frames a second [Hz].
         duration_s: longest duration of an episode [s].
         max_frames: the same [frames].
-        frame: frames of each episode so far, shape (n,); `begin` sets them to 0, `judge` counts.
+        frame: frames of each episode so far, shape (n,); `begin` sets them to 0, `count_frame` counts.
 
     Args:
         config: the parameters, with a `duration_s`.
@@ -204,6 +204,19 @@ class ConfiguredTask:
     def in_frames(self, seconds: float) -> int:
         """Return a time in frames, at least 1."""
         return max(1, round(seconds * self.fps))
+
+    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
+        """Start episodes in some simulations."""
+        self.frame[ids] = 0
+
+    def count_frame(self, running: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Count a frame of the simulations that are running.
+
+        Returns:
+            `Event.TIMEOUT` where the time is over, and `Event.NOTHING` elsewhere, shape (n,)
+        """
+        self.frame += running
+        return np.where(running & (self.frame >= self.max_frames), int(Event.TIMEOUT), int(Event.NOTHING))
 
     def environment_state(self, truth: Any) -> NDArray[np.float64]:
         """Report nothing to the brain, shape (n, 0)."""

@@ -65,16 +65,17 @@ class Corridor(bhd.BaseTask):
 
     def begin(self, ids: np.ndarray, scenes: list[bhd.Arena]) -> None:
         """Start episodes."""
-        self.frame[ids], self._x[ids] = 0, [scene.start[0] for scene in scenes]
+        super().begin(ids, scenes)
+        self._x[ids] = [scene.start[0] for scene in scenes]
 
     def judge(self, truth: object, running: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Reward the way forward; a touch, the goal and the time end an episode."""
         x = np.where(running, truth.base_pose_in_world[:, 0], self._x)
         reward, self._x = x - self._x, x
-        self.frame[running] += 1
-        ends = [~running, truth.touched, x > self.config.goal_m, self.frame >= self.max_frames]
-        events = [bhd.Event.NOTHING, bhd.Event.COLLISION, bhd.Event.SUCCESS, bhd.Event.TIMEOUT]
-        return reward, np.select(ends, events, bhd.Event.NOTHING)
+        event = self.count_frame(running)
+        event[running & (x > self.config.goal_m)] = bhd.Event.SUCCESS
+        event[running & truth.touched] = bhd.Event.COLLISION
+        return reward, event
 
     def outcome(self, sim: int, event: bhd.Event) -> bhd.Outcome:
         """Return how an episode ended."""

@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -152,10 +153,10 @@ def environment(distribution: str = "kilted", *, messages: bool = False) -> RosE
 def free_domain() -> Iterator[int]:
     """Reserve a ROS domain that no other test on this machine uses; above 101 the ports are other programs'."""
     for domain in range(1, 102):
-        with (Path(tempfile.gettempdir()) / f"bhd-ros-domain-{domain}.lock").open("w") as lock:
+        with socket.socket(socket.AF_UNIX) as name:  # a name is of the machine, wherever its temporary files are
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                name.bind(f"\0bhd-ros-domain-{domain}")
+            except OSError:
                 continue
             yield domain
             return
@@ -194,8 +195,9 @@ class Peer:
         return self
 
     def _read(self, stream: IO[str]) -> None:
-        for line in stream:
-            self.lines.append(json.loads(line))
+        with stream:
+            for line in stream:
+                self.lines.append(json.loads(line))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.stop()

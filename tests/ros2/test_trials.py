@@ -1,6 +1,7 @@
 """Our robots and programs on the network with others by the real ROS 2 client library, in short.
 
-With BHD_TRIALS=full the first lasts ten minutes: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance`.
+In full: `BHD_TRIALS=full pytest tests/ros2/test_trials.py -k avoidance`: 10 min; `-k rule` and `-k checkpoint`: 20 min
+each, 100 episodes.
 """
 
 import itertools
@@ -15,8 +16,10 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import binomtest
 
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli import record, train
 from bhd_lerobot.cli.data.main import main as data
 from tests.ros2.peer_env import Peer, environment
 from tests.ros2.programs import Recording, Served, log_of
@@ -68,8 +71,15 @@ def test_what_is_recorded_is_what_the_robot_measured_and_was_sent(domain: int, t
     options = ("--clock-offset=-86400", "--wait", "--log", log)
     with Peer("standin_turtlebot3.py", PILLAR, *options, *faults, domain=domain) as robot:
         robot.wait_event("ready")
-        with Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=2", domain=domain, folder=tmp_path) as recording:
-            assert recording.process.wait() == 0, recording.text
+        for attempt in range(3):
+            folder = tmp_path / str(attempt)
+            folder.mkdir()
+            with Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=2", domain=domain, folder=folder) as recording:
+                if recording.process.wait() == 0:
+                    break
+                # On a busy machine the stand-in stands still for a third of a second: to us its wheels are blocked.
+                assert "watchdog: blocked" in recording.text, recording.text
+        assert recording.process.wait() == 0, recording.text
         until(lambda: robot.events("report")[-1]["command"] == [0.0, 0.0], "the robot stands")
     assert data(["check", str(recording.root)]) == 0
     columns = columns_of(recording.root)
@@ -239,3 +249,81 @@ def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
         assert "emergency stop" in message
         publish_until(False, "/emergency_stop/reset", "std_msgs/msg/Empty", "{}")
         assert talk(goal(*ASIDE)) == [(True, REACHED)]
+
+
+def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, tmp_path: Path) -> None:
+    log = tmp_path / "robot.jsonl"
+    move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=3", "--brain.type=random")
+    options = ("--brain.scale=0.02", "--dataset.num_episodes=1")
+    driver = ("--active=forward_position_controller", "--log", log)
+    with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
+        robot.wait_event("ready")
+        with Recording("ur5", *move, *options, domain=domain, folder=tmp_path) as recording:
+            assert recording.process.wait() == 0, recording.text
+    assert data(["check", str(recording.root)]) == 0
+    columns = columns_of(recording.root)
+    times = recording.starts[0] + columns["control.time"]
+    states = log_of(log, "state")
+    measured, positions = (np.array([line[key] for line in states]) for key in ("monotonic", "position"))
+    joints = columns["observation.state"][:, :6]
+    assert np.ptp(joints, axis=0).min() > 0.005  # [rad]: they moved
+    # It moves at up to 3 rad/s; between two of its messages, and until one has come, by far less than this.
+    for joint in range(6):
+        then = np.interp(times, measured, positions[:, joint])
+        np.testing.assert_allclose(joints[:, joint], then, atol=0.03)
+    sent = np.array([line["given"] for line in log_of(log, "positions")])
+    applied = columns["control.applied_action"][:, :6]
+    assert np.abs(sent[:, None] - applied[None]).max(axis=2).min(axis=0).max() < 0.02
+
+
+FULL_S, SHORT_S = 10, 4  # of an episode
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("kind", ["rule", "checkpoint"])
+@pytest.mark.thorough(but=1)
+def test_a_brain_does_over_ros_what_it_does_in_this_process(kind: str, domain: int, tmp_path: Path) -> None:
+    episodes, seconds = (100, FULL_S) if IS_FULL else (2, SHORT_S)
+    brain = ("--brain.type=avoidance",)
+    if kind == "checkpoint":
+        brain = ("--brain.type=learned", f"--brain.path={imitate_the_rule(tmp_path)}")
+    task = (
+        *("--task.type=avoid", "--task.arena=turtlebot3_world", "--task.random_start=true", "--task.min_path_m=0.3"),
+        *(f"--task.duration_s={seconds}", *brain, f"--dataset.num_episodes={episodes}"),
+    )
+    alone = tmp_path / "alone"
+    here = ("--robot.type=turtlebot3", "--dataset.repo_id=test/alone", "--preview_video=false")
+    assert record.main([*here, f"--dataset.root={alone}", f"--output_dir={tmp_path / 'here'}", *task]) == 0
+    with Served("turtlebot3", "--robot.arena=turtlebot3_world", domain=domain, log=tmp_path / "robot") as robot:
+        with Recording("turtlebot3", *task, domain=domain, folder=tmp_path) as recording:
+            assert recording.process.wait() == 0, recording.text
+        assert robot.stop() == 0
+    (low, high), (ros_low, ros_high) = (_success(outcomes_of(root)) for root in (alone, recording.root))
+    in_contact, ticks = robot.contacts
+    ages = columns_of(recording.root)["control.age"]
+    print(f"Success in this process {low:.3f} to {high:.3f}, over ROS {ros_low:.3f} to {ros_high:.3f}.")
+    print(f"In contact over ROS: {in_contact} of {ticks} control ticks.")
+    print(f"Age of an observation [s]: p50 {np.median(ages):.3f}, p99 {np.percentile(ages, 99):.3f}.")
+    assert in_contact == 0 or kind == "checkpoint"
+    assert low <= ros_high
+    assert ros_low <= high
+    timing = json.loads(pq.read_table(recording.root / "meta" / "episodes").to_pylist()[0]["bhd/timing"])
+    assert timing["age_max"] > 0
+    assert timing["inference_p99"] > 0
+
+
+def imitate_the_rule(tmp_path: Path) -> Path:
+    """Return a checkpoint that was trained on what the rule does."""
+    dataset, folder = f"--dataset.root={tmp_path / 'rule'}", tmp_path / "checkpoint"
+    size, learning = ((200, 32), ()) if IS_FULL else ((4, 4), ("--steps=100", "--eval_steps=0"))
+    some = (f"--dataset.num_episodes={size[0]}", f"--n_envs={size[1]}", f"--output_dir={tmp_path / 'run'}")
+    recipe = "--config_path=configs/{}_avoid.yaml"
+    assert record.main([recipe.format("record/turtlebot3"), dataset, *some, "--preview_video=false"]) == 0
+    assert train.main([recipe.format("train/bc_turtlebot3"), dataset, f"--output_dir={folder}", *learning]) == 0
+    return folder
+
+
+def _success(outcomes: list[str]) -> tuple[float, float]:
+    """Return the 95 % interval of the rate of success."""
+    found = binomtest(outcomes.count("success"), len(outcomes)).proportion_ci(method="wilson")
+    return found.low, found.high

@@ -39,7 +39,7 @@ class Channel:
         words: see `Word`.
         states: counts, times and numbers of the inputs.
         commands: numbers of the outputs.
-        images: of each camera.
+        images: of each camera, records of `image_dtypes`.
 
     Args:
         spec: the node.
@@ -61,7 +61,7 @@ class Channel:
             ]
         )
         self.command_dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (sent,))])
-        image_dtypes = [
+        self.image_dtypes = [
             np.dtype([("measured_ns", np.int64), ("pixels", np.uint8, (camera.height, camera.width, 3))])
             for camera in spec.cameras
         ]
@@ -69,7 +69,7 @@ class Channel:
             8 * len(Word),
             StateRing.nbytes(self.state_dtype, _STATES),
             StateRing.nbytes(self.command_dtype, _COMMANDS),
-            *(StateRing.nbytes(dtype, _IMAGES) for dtype in image_dtypes),
+            *(StateRing.nbytes(dtype, _IMAGES) for dtype in self.image_dtypes),
         ]
         offsets = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)]).tolist()
         if descriptor is None:
@@ -82,7 +82,8 @@ class Channel:
         self.states = StateRing(self.state_dtype, _STATES, memory[offsets[1] :])
         self.commands = StateRing(self.command_dtype, _COMMANDS, memory[offsets[2] :])
         self.images = [
-            StateRing(dtype, _IMAGES, memory[offset:]) for dtype, offset in zip(image_dtypes, offsets[3:], strict=False)
+            StateRing(dtype, _IMAGES, memory[offset:])
+            for dtype, offset in zip(self.image_dtypes, offsets[3:], strict=False)
         ]
 
     def show_life(self, word: Word) -> None:

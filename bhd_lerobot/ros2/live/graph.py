@@ -153,19 +153,28 @@ class Graph:
             qos: of our endpoint.
             is_publisher: whether ours is a publisher.
         """
-        ours, theirs = ("publisher", "subscription") if is_publisher else ("subscription", "publisher")
-        found = []
-        for one in self.endpoints():
-            if one.is_own or one.topic != topic or one.is_publisher == is_publisher:
-                continue
-            who = f"The {theirs} of {topic} in {one.node or 'an unnamed node'}"
-            if one.msgtype != msgtype:
-                found.append(f"{who} is of type {one.msgtype}; the {ours} here is of {msgtype}.")
-            else:
-                offered, wanted = (qos, one.qos) if is_publisher else (one.qos, qos)
-                if not offered.serves(wanted):
-                    found.append(f"{who} is {one.qos}; the {ours} here is {qos}, and no message passes.")
-        return found
+        return _mismatches(Endpoint(topic, msgtype, qos, is_publisher, "", is_own=True), self.endpoints())
+
+    def all_mismatches(self) -> list[str]:
+        """Return the same for all topics of this process."""
+        everyone = self.endpoints()
+        return [text for one in everyone if one.is_own for text in _mismatches(one, everyone)]
+
+
+def _mismatches(ours: Endpoint, everyone: list[Endpoint]) -> list[str]:
+    kinds = ("publisher", "subscription") if ours.is_publisher else ("subscription", "publisher")
+    found = []
+    for one in everyone:
+        if one.is_own or one.topic != ours.topic or one.is_publisher == ours.is_publisher:
+            continue
+        who = f"The {kinds[1]} of {one.topic} in {one.node or 'an unnamed node'}"
+        if one.msgtype != ours.msgtype:
+            found.append(f"{who} is of type {one.msgtype}; the {kinds[0]} here is of {ours.msgtype}.")
+        else:
+            offered, wanted = (ours.qos, one.qos) if ours.is_publisher else (one.qos, ours.qos)
+            if not offered.serves(wanted):
+                found.append(f"{who} is {one.qos}; the {kinds[0]} here is {ours.qos}, and no message passes.")
+    return found
 
 
 class _Present:

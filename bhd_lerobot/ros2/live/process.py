@@ -6,6 +6,7 @@ publishers alone, sends the stop.
 """
 
 import contextlib
+import math
 import os
 import select
 import signal
@@ -27,6 +28,7 @@ from bhd_lerobot.ros2.messages.images import decode_image
 
 _WAIT_S = 0.05  # the longest without a sign of life
 _AGAIN_S = 0.02  # between two stops at the end
+_FIRST_S = 1.0  # so long without a first message a topic is silent
 _CHECK_NS = 500_000_000  # between two looks at who else is there
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
@@ -123,6 +125,7 @@ class Receiver:
         self._checked_ns = 0
         self._start_ns = time.monotonic_ns()
         self._network_problem = ""
+        channel.states.publish(self._record)
 
     def step(self) -> None:
         """Take what has arrived, and publish it."""
@@ -184,7 +187,7 @@ class Receiver:
             self._wrong[camera.topic] = f"it is {width} x {height} px, not {camera.width} x {camera.height}"
             return
         self._wrong.pop(camera.topic, None)
-        record = np.zeros((), ring._state.dtype)
+        record = np.zeros((), self._channel.image_dtypes[index])
         clock = self._clocks[len(self._inputs) + index]
         record["measured_ns"] = clock.measured_ns(_header_stamp(received.data), received.arrived_ns)
         record["pixels"] = image
@@ -201,7 +204,8 @@ class Receiver:
         ]
         for one, arrived in listened:
             silent = (now_ns - max(int(arrived), self._start_ns)) / 1e9
-            if silent > one.silence_s:
+            # What has never come is named soon, for the one who waits for it.
+            if silent > (one.silence_s if arrived or math.isinf(one.silence_s) else min(one.silence_s, _FIRST_S)):
                 return self._why(one, silent, heard=bool(arrived))
         return ""
 

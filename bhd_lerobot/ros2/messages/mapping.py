@@ -110,7 +110,9 @@ class MappingConfig:
         """
         try:
             tree = yaml.safe_load(Path(path).read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except OSError as error:
+            raise ConfigError(f"The mapping {path} cannot be read: {error.strerror}.") from error
+        except (UnicodeDecodeError, yaml.YAMLError) as error:
             raise ConfigError(
                 f"The mapping {path} cannot be read: {as_text(error)}. In YAML a value with [ in it needs quotes."
             ) from error

@@ -24,6 +24,6 @@ def safety_status(mode: float, speed_scaling: float) -> SafetyStatus:
     """Return the status of a robot from its safety mode and its speed scaling [%]; NaN is what is not known."""
     if mode in _EMERGENCY:
         return SafetyStatus.EMERGENCY_STOP
-    if mode in _STOPPED or speed_scaling <= 0:
-        return SafetyStatus.STOPPED
-    return SafetyStatus.NORMAL if mode in _NORMAL or math.isnan(mode) else SafetyStatus.FAULT
+    if not math.isnan(mode) and mode not in _NORMAL + _STOPPED:
+        return SafetyStatus.FAULT
+    return SafetyStatus.STOPPED if mode in _STOPPED or speed_scaling <= 0 else SafetyStatus.NORMAL

@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.ros2.messages.arm import ARM_FRAME, TOOL, TOOL_FRAME
 from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, ODOM_FRAME, BaseNoise, OdometryPart
-from bhd_lerobot.ros2.messages.parts import Array, Frames, header
+from bhd_lerobot.ros2.messages.parts import Array, Frames, header, stamp_tree
 from bhd_lerobot.ros2.messages.serialize import encode
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -112,15 +112,14 @@ def still_frames(view: RobotView, motion: Motion) -> list[StaticFrame]:
 def moving_transforms(view: RobotView, frames: Frames, motion: Motion) -> list[bytes]:
     """Return messages for ``/tf`` of the links of a robot; none if no joint of it is recorded, nor its tool's pose."""
     transforms = []
+    stamp = stamp_tree(frames.stamps)
     for joint in view.joints:
         if joint.joint in motion.angles:
             half = motion.angles[joint.joint] / 2
             w, x, y, z = joint.rotation
             c, s = np.cos(half), np.sin(half)
-            turned = np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=1)
-            place = np.broadcast_to(joint.position, (len(half), 3))
-            pose = np.concatenate([place, turned], axis=1)
-            transforms.append(_transform(frames.stamps, joint.parent, joint.child, pose))
+            turned = w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s
+            transforms.append(_transform_tree(stamp, joint.parent, joint.child, joint.position, turned))
     if not transforms and motion.tool is not None:
         transforms.append(_transform(frames.stamps, ARM_FRAME, TOOL_FRAME, motion.tool))
     return encode(TF, {"transforms": transforms}, len(frames.stamps)) if transforms else []
@@ -189,10 +188,17 @@ def camera_info(frames: Frames, frame_id: str, size: tuple[int, int], fovy: floa
 
 
 def _transform(stamps: NDArray[np.int64], parent: str, child: str, poses: Array) -> dict[str, Any]:
-    translation = dict(zip(("x", "y", "z"), poses[:, :3].T, strict=True))
-    rotation = dict(zip(("w", "x", "y", "z"), poses[:, 3:].T, strict=True))
+    return _transform_tree(stamp_tree(stamps), parent, child, poses[:, :3].T, poses[:, 3:].T)
+
+
+def _transform_tree(
+    stamp: dict[str, Any], parent: str, child: str, position: Sequence[Any] | Array, rotation: Sequence[Any] | Array
+) -> dict[str, Any]:
     return {
-        "header": header(stamps, parent),
+        "header": {"stamp": stamp, "frame_id": parent},
         "child_frame_id": child,
-        "transform": {"translation": translation, "rotation": rotation},
+        "transform": {
+            "translation": dict(zip("xyz", position, strict=True)),
+            "rotation": dict(zip("wxyz", rotation, strict=True)),
+        },
     }

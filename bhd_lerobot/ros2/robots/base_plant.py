@@ -22,6 +22,7 @@ _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
+_MOST_RANGES = 10_000  # a multiple of those of any scanner; more would take seconds to resample
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class ScanReader:
 
     def read(self, message: Any) -> NDArray[np.float64]:
         """Return the ranges, counter-clockwise from ahead, shape (width,)."""
+        if len(message.ranges) > _MOST_RANGES:
+            raise DatasetError(f"the scan has {len(message.ranges)} ranges; at most {_MOST_RANGES} are read")
         geometry = {name: np.array([getattr(message, name)], np.float64) for name in GEOMETRY}
         [ranges] = resampled_scans(
             [message.ranges], geometry, lidar=self.lidar, beams=self.width, rotation=np.eye(3), topic=self.topic

@@ -9,7 +9,7 @@ import numpy as np
 
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.ros2.live.link import SILENCE_S, NodeLink
+from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec
 
 
@@ -62,7 +62,7 @@ class Ros2Plant(Plant):
         state = self.link.state
         silent_s = (time.monotonic_ns() - int(state["measured_ns"][0])) / 1e9
         is_old = silent_s > self._silence_s
-        self.link.check(self._silence_s / 2 if is_old else SILENCE_S)
+        self.link.check(self._silence_s / 2 if is_old else self._silence_s)
         if problem := bytes(state["problem"]).decode(errors="ignore"):
             raise RealtimeError(problem)
         if is_old:

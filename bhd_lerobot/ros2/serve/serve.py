@@ -57,7 +57,10 @@ class ServeConfig:
             raise ConfigError(f"foxglove_port is {self.foxglove_port}; it is from 1 to 65535, or 0 for no Foxglove.")
         robot: Any = self.robot
         if not hasattr(robot, "plant") or robot.plant:
-            raise ConfigError(f"robot.type is {robot.type!r}; a simulated robot of this package can be served.")
+            raise ConfigError(
+                f"robot.type is {robot.type!r}; what can be served is a simulated robot: turtlebot3 or ur5, without "
+                "robot.plant."
+            )
         robot.clock = "realtime"
         if isinstance(robot.body(), MobileBase):
             robot.odometry = robot.imu = True

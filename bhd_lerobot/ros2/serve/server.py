@@ -141,7 +141,8 @@ class Server:
         """Serve until `stop` returns true.
 
         Args:
-            report: takes a line about what was refused, at most one a second.
+            report: takes a line about what was refused, at most one a second, and about each node whose topic does not
+                fit one of the robot's.
 
         Raises:
             RealtimeError: a process of the robot has ended.
@@ -150,6 +151,7 @@ class Server:
         for output in self._outputs:
             output.due_ns = start
         reported, told_ns = dict(self.counts.refused), start
+        mismatches: set[str] = set()
         while not stop():
             now = time.monotonic_ns()
             for one in self._inputs:
@@ -164,6 +166,10 @@ class Server:
                     if count != reported.get(reason, 0):
                         report(f"refused {count - reported.get(reason, 0)}: {reason}")
                 reported = dict(self.counts.refused)
+                found = set(self._node.graph.all_mismatches())
+                for text in sorted(found - mismatches):
+                    report(text)
+                mismatches |= found
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))

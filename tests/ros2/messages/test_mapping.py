@@ -99,6 +99,11 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     assert load.read(decode(load.msgtype, load.encode(np.array([3.0]), 0))) == [3.0]
 
 
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no\.yaml cannot be read: No such file or directory\.$"):
+        MappingConfig.load(tmp_path / "no.yaml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [

@@ -61,8 +61,8 @@ def fill(message: Any, values: dict[str, Any]) -> Any:
         elif isinstance(value, list) and value and isinstance(value[0], dict):
             kind = load(types[name].removeprefix("sequence<").split(">")[0].split("[")[0].replace("/", "/msg/"))
             setattr(message, name, [fill(kind(), one) for one in value])
-        elif isinstance(value, list) and "double" in types[name] + "float":
-            setattr(message, name, [float(one) for one in value] if "uint8" not in types[name] else bytes(value))
+        elif isinstance(value, list) and ("double" in types[name] or "float" in types[name]):
+            setattr(message, name, [float(one) for one in value])
         else:
             setattr(message, name, type(field)(value))
     return message

@@ -9,6 +9,7 @@ Faults are named by topic, without its first slash, or all. Times count from the
 
 import json
 import math
+import signal
 import time
 from collections.abc import Callable
 from typing import Any
@@ -50,6 +51,8 @@ parser.add_argument("--most-jump", type=float, default=math.inf, help="a farther
 fault = add_faults(parser)
 fault.add_argument("--scaling", action="append", default=[], type=at("START:PERCENT"), metavar="START:PERCENT")
 fault.add_argument("--safety", action="append", default=[], type=at("START:MODE"), metavar="START:MODE")
+fault.add_argument("--on-usr1", choices=("scaling", "safety", "silence"), help="what happens on SIGUSR1")
+fault.add_argument("--value", type=float, default=0.0, help="the percentage or the mode of that")
 args = parser.parse_args()
 log_file = open(args.log, "w", buffering=1) if args.log else None  # noqa: SIM115
 
@@ -124,6 +127,7 @@ class Arm:
             status = new_node("io_and_status_controller")
             self.safety = status.create_publisher(SafetyMode, "/io_and_status_controller/safety_mode", latched)
             self.safety.publish(SafetyMode(mode=self.mode))
+        signal.signal(signal.SIGUSR1, self.on_usr1)
         states.create_timer(1 / args.hz, self.advance)
         speed.create_timer(1 / STATE_HZ, self.publish_speed)
         states.create_timer(1.0, self.report)
@@ -133,6 +137,14 @@ class Arm:
         return self.now - self.start
 
     # what comes in
+
+    def on_usr1(self, *_: object) -> None:
+        if args.on_usr1 == "silence":
+            self.joint_states.gaps.append((0.0, math.inf))
+        elif args.on_usr1 == "scaling":
+            args.scaling.append((self.elapsed(), args.value))
+        else:
+            self.set_mode(int(args.value))
 
     def on_positions(self, message: Float64MultiArray) -> None:
         given = np.array(message.data)

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +12,10 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError
-from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.images import COMPRESSED, encode_image
+from bhd_lerobot.ros2.messages.parts import Frames
 from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.robots.robot import Ros2Robot
 from tests.ros2.peer_env import Peer
@@ -68,6 +73,33 @@ def test_observations_actions_and_the_stop_when_actions_cease(tmp_path: Path, do
                 until(lambda: [forward(), False][1], "its end is noticed")
         finally:
             robot.disconnect()
+
+
+def test_images_arrive_with_the_time_at_which_they_were_taken(tmp_path: Path, domain: int) -> None:
+    robot = Ros2Robot(config_of(tmp_path, domain, "images: {front: {topic: /image, width: 64, height: 48}}"))
+    image = np.full((48, 64, 3), 200, np.uint8)
+    stop = threading.Event()
+    with Node("camera", NetworkConfig(domain)) as node:
+        publisher = node.publisher("/image", COMPRESSED)
+
+        def publish() -> None:
+            while not stop.wait(0.05):
+                frames = Frames(0, np.zeros(1, np.int64), np.array([time.time_ns()]))
+                publisher.send(encode_image(frames, "front", image, compressed=True))
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            robot.connect()
+            found = robot.get_observation()["front"]
+            np.testing.assert_allclose(found, image, atol=2)
+            taken = robot.cameras["front"].latest_timestamp
+            assert taken is not None
+            assert 0 <= time.perf_counter() - taken < 60
+        finally:
+            robot.disconnect()
+            stop.set()
+            thread.join()
 
 
 @pytest.mark.thorough

@@ -120,6 +120,7 @@ class MockArm(Robot):
         self._position = dict.fromkeys(JOINTS, 0.0)
         self._is_connected = False
         self.observed = self.sent = 0
+        self.is_blocked = False
         self._times: list[int] = []
 
     @property
@@ -179,10 +180,15 @@ class MockArm(Robot):
                 name = next(iter(self.cameras))
                 seen[name] = seen[name][:-1]
             case "block":
-                time.sleep(2.0)
+                self._block()
             case "slow":
                 time.sleep(0.15)
         return seen
+
+    def _block(self) -> None:
+        self.is_blocked = True
+        time.sleep(2.0)
+        self.is_blocked = False
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         self._check()
@@ -191,7 +197,7 @@ class MockArm(Robot):
             if self.config.fault == "send raises":
                 raise ConnectionError("the bus does not answer")
             if self.config.fault == "send blocks":
-                time.sleep(2.0)
+                self._block()
         if self.config.log:
             with open(self.config.log, "a", encoding="utf-8") as file:
                 file.write(" ".join(f"{action[name]!r}" for name in JOINTS) + "\n")
