@@ -1,7 +1,6 @@
 """The last check before the wire: what is really written to the actuators, whatever computed it."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -122,7 +121,7 @@ def check_commands(  # noqa: PLR0917
             is_near = -most[k] <= change <= most[k] and lower[k] <= value <= upper[k]  # not if it is no number
             # When commands were more than a tick apart, it is not known what was in between.
             is_bent = not is_sparse and abs(change - rate[sim, k]) > bend[k]
-            if is_bent and change != 0.0 and change * (position[sim, k] - value) >= 0.0:
+            if is_bent and (value <= position[sim, k] if change > 0.0 else change < 0.0 and value >= position[sim, k]):
                 is_bent = False
             unsafe[sim] |= is_bent or not is_near
         any_unsafe |= unsafe[sim]
@@ -159,7 +158,7 @@ class Guard:
         self.written, self.rate = np.zeros(shape), np.zeros(shape)
         self._unsafe, self._is_sparse = np.zeros(n, np.bool_), False  # the last commands were more than a tick apart
         bounds = limits.lower, limits.upper, limits.change, limits.bend
-        self._check = partial(check_commands.compiled, self.written, self.rate, self._unsafe, *bounds)
+        self._check = check_commands.bind(self.written, self.rate, self._unsafe, *bounds)
 
     def restart(self, ids: NDArray[np.intp], actuators: Array) -> None:
         """Start from commands that the next ones need not be near to: the robots were put or moved somewhere else.

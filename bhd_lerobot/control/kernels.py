@@ -1,15 +1,23 @@
-"""Loops over simulations that numba compiles: plain scalar Python, which runs as it stands with NUMBA_DISABLE_JIT=1."""
+"""Loops over simulations in plain scalar Python, and the machine code that numba makes of them once it is worth it.
+
+To load numba and its code takes as long as some 20,000 passes through all loops of a tick in Python: what is short runs
+as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
+"""
 
 import hashlib
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache, cached_property, update_wrapper
+from functools import cache, cached_property, partial, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+_PASSES = 20_000  # through a loop in Python, until it is compiled
+_is_eager = False
 
 
 class Kernel[**P, R]:
@@ -41,7 +49,7 @@ class Kernel[**P, R]:
             return numba.njit(error_model="numpy")(self.function)
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
-            print(f"Compiling {self.function.__name__} for this processor: some seconds, once", file=sys.stderr)
+            _announce()
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
             return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
@@ -50,15 +58,86 @@ class Kernel[**P, R]:
         finally:
             config.CACHE_DIR = before
 
+    def bind(self, *arguments: Any) -> "BoundKernel[R]":
+        """Return this kernel with its first arguments, to be called with the others."""
+        return BoundKernel(self, arguments)
+
+    @cached_property
+    def arrays(self) -> list[tuple[np.dtype[Any], int, bool] | None]:
+        """Type, dimensions and whether it must be C-contiguous of each argument; None for a number."""
+        kinds = re.findall(r"(\w+)(\[[^\]]*\])?", self.signature.partition("(")[2])
+        return [
+            (np.dtype(name.replace("b1", "?")), shape.count(":") - shape.count("::"), "::1" in shape) if shape else None
+            for name, shape in kinds
+        ]
+
     @property
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
 
 
+class BoundKernel[R]:
+    """A kernel with its first arguments: Python at first, machine code after `_PASSES` passes or `compile_at_once`.
+
+    Args:
+        kernel: the kernel.
+        bound: its first arguments.
+    """
+
+    __slots__ = ("_bound", "_call", "_is_checked", "_kernel", "_left")
+
+    def __init__(self, kernel: Kernel[..., R], bound: tuple[Any, ...]) -> None:
+        self._kernel, self._bound = kernel, bound
+        self._call: Callable[..., R] | None = None
+        self._left, self._is_checked = _PASSES, False
+        self._check(0, bound)
+        if _is_eager:
+            self._compile()
+
+    def __call__(self, *arguments: Any) -> R:
+        """Call it with the other arguments."""
+        if self._call is not None:
+            return self._call(*arguments)
+        self._left -= len(self._bound[0] if self._bound else arguments[0])
+        if self._left < 0:
+            return self._compile()(*arguments)
+        if not self._is_checked:
+            self._check(len(self._bound), arguments)
+            self._is_checked = True
+        return self._kernel.function(*self._bound, *arguments)
+
+    def _compile(self) -> Callable[..., R]:
+        self._call = partial(self._kernel.compiled, *self._bound)
+        return self._call
+
+    def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
+        """Refuse what the machine code would refuse."""
+        for at, argument in enumerate(arguments, first):
+            kind = self._kernel.arrays[at]
+            if kind and not (
+                argument.dtype == kind[0] and argument.ndim == kind[1] and (argument.flags.c_contiguous or not kind[2])
+            ):
+                raise TypeError(
+                    f"Argument {at} of {self._kernel.function.__name__} is an array of {argument.dtype} of shape "
+                    f"{argument.shape}; its types are {self._kernel.signature}."
+                )
+
+
+def compile_at_once() -> None:
+    """Compile kernels from now on when they are bound, not in the middle of a run: for a loop on the wall clock."""
+    global _is_eager  # noqa: PLW0603
+    _is_eager = True
+
+
 def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:
     """Make a kernel of a function, see `Kernel`."""
     return lambda function: Kernel(function, signature)
+
+
+@cache
+def _announce() -> None:
+    print("Compiling the control loop for this processor: some seconds, once", file=sys.stderr)
 
 
 @cache

@@ -1,7 +1,6 @@
 """Whether a reading can be a measurement of the present: finite, of this time, and no faster than joints can turn."""
 
 import math
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,8 +100,7 @@ class ReadingCheck:
         self._near = np.full((n, len(speed)), np.nan)  # follows the positions no faster than joints can turn
         self._elapsed, self._stamp = np.zeros((2, n), np.int64)
         self._wrong, self._beyond = np.zeros(n, np.bool_), np.zeros_like(self._near)
-        self._follow = partial(
-            follow_positions.compiled,
+        self._follow = follow_positions.bind(
             self._near,
             np.zeros_like(self._near),
             np.zeros(n, np.int64),

@@ -8,12 +8,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 import bhd_lerobot
-from bhd_lerobot.control.base.diff_drive import integrate
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control import kernels
+from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 from bhd_lerobot.control.kernels import Kernel
 from tests.control.test_wire import arm, base_rig, twist_rig
 
@@ -56,8 +59,16 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
             np.testing.assert_array_equal(np.signbit(mine), np.signbit(other), err_msg=f"argument {k}")
 
 
+@pytest.fixture
+def eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile kernels when they are bound."""
+    monkeypatch.setattr(kernels, "_is_eager", False)
+    kernels.compile_at_once()
+
+
 @pytest.mark.parametrize("make", [base_rig, twist_rig, arm])
-def test_a_tick_compiles_nothing(make: Callable[[], Any]) -> None:
+@pytest.mark.usefixtures("eager")
+def test_a_tick_of_a_loop_on_the_wall_clock_compiles_nothing(make: Callable[[], Any]) -> None:
     from numba.core.event import install_recorder
 
     rig = make()
@@ -70,9 +81,25 @@ def test_a_tick_compiles_nothing(make: Callable[[], Any]) -> None:
 
 
 def test_a_kernel_takes_no_other_types_than_it_was_compiled_for() -> None:
-    arrays = [np.zeros((1, 2), np.float32) for _ in range(3)]
-    with pytest.raises(TypeError, match="No matching definition"):
-        integrate.compiled(*arrays, 1.0, 1.0, 1.0)
+    good = [np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 3))]
+    for position in range(3):
+        for bad in (np.zeros((1, 3), np.float32), np.zeros(3), np.zeros((3, 1)).T[:, ::-1] if position else None):
+            arrays = [bad if k == position else one for k, one in enumerate(good)]
+            if bad is None:
+                continue
+            with pytest.raises(TypeError, match="No matching definition"):
+                integrate.compiled(*arrays, 1.0, 1.0, 1.0)
+            with pytest.raises(TypeError, match=f"Argument {position} of integrate is an array of"):
+                integrate.bind()(*arrays, 1.0, 1.0, 1.0)
+
+
+def test_after_a_while_a_kernel_is_compiled_and_continues_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "_PASSES", 30)
+    monkeypatch.setattr(integrate, "compiled", mock := Mock(side_effect=integrate.function))
+    drive = DiffDrive(turtlebot3_burger().drive, 3)
+    for tick in range(12):
+        drive.update_odometry(np.full((3, 2), 0.1 * tick))
+    assert mock.call_count == 2  # after ten passes of three robots
 
 
 def start(cache: Path, **environment: str) -> subprocess.Popen:
@@ -97,7 +124,7 @@ def test_processes_that_start_together_with_an_empty_cache_fill_it_once(tmp_path
     outputs = [one.communicate() for one in [start(tmp_path) for _ in range(3)]]
     assert len({out for out, _ in outputs}) == 1
     assert outputs[0][0].startswith("[[0.03")
-    assert all("Compiling integrate" in err for _, err in outputs)
+    assert all("Compiling the control loop" in err for _, err in outputs)
     assert start(tmp_path).communicate() == (outputs[0][0], "")  # it is loaded
 
 

@@ -1,7 +1,6 @@
 """The controller of arms with position servos: setpoints and goals to servo positions."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,7 +134,7 @@ class ArmController(Controller):
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
         state = self.command, self.velocity, self.actuators, self._limited_effort
-        self._lead_commands = partial(lead_commands.compiled, *state, self._lead, self._largest_error)
+        self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
 
     def limit_force(self, force: ForceLimit) -> None:
         """Stop an arm that presses too hard, from now on."""

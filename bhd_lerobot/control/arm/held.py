@@ -1,7 +1,5 @@
 """What grippers hold, as far as it can be known without eyes: something that stood on the table when they closed."""
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +59,7 @@ class HeldObjects:
         self._where = np.zeros((n, self._dof))  # the arm's posture when that began [rad]
         self._changed = np.zeros(n, np.bool_)
         stall_ticks = round(GRIPPER_STALL_S * control_hz)
-        self._follow = partial(follow_grippers.compiled, self._ticks, self._where, self._changed, stall_ticks)
+        self._follow = follow_grippers.bind(self._ticks, self._where, self._changed, stall_ticks)
 
     def update(self, reading: PlantReading, command: Array) -> list[tuple[int, Capsule | None]]:
         """Take one tick into account; return the arms that hold something from now on, or nothing any more.

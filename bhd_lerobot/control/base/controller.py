@@ -1,7 +1,5 @@
 """The controller of bases with two driven wheels."""
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -151,10 +149,10 @@ class BaseController(Controller):
         jerk = np.asarray(limits.jerk) / control_hz**2
         largest = np.asarray(limits.velocity), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
         state = self._target, self.command, self._before, self._rate, self._hard, self._limits
-        self._limit = partial(limit_command.compiled, *state, *largest)
+        self._limit = limit_command.bind(*state, *largest)
         looks = self._start, self._asked, self._turned, self._looks, self._look_at, self._limits, self.protective_stop
         numbers = np.array([*wheels[:2], turn, error, control_hz]), self._period, -1 if gyro is None else gyro
-        self._drive_wheels = partial(drive_wheels.compiled, self.command, self._wheel_speeds, *looks, *numbers)
+        self._drive_wheels = drive_wheels.bind(self.command, self._wheel_speeds, *looks, *numbers)
 
     def set_setpoint(self, values: Array, mask: Mask) -> None:
         """Head for new twists, with the normal accelerations."""

@@ -48,7 +48,7 @@ class DiffDrive:
         metres = drive.wheel_radius / self._count  # [m] that a wheel rolls in one encoder count
         self._per_count = self._count, metres / 2, metres / drive.wheel_separation
         self._encoder: Array = np.zeros((n, 2))
-        self._integrate = integrate.compiled
+        self._integrate = integrate.bind()
 
     def wheels_from_twist(self, twist: Array, out: Array) -> Array:
         """Write the wheel speeds of a twist.

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -112,7 +111,7 @@ class Supervisor:
         self._away = np.zeros((n, self._dof + 1))
         self._arm_away = self._away[:, : self._dof]
         self._off = np.zeros((n, self._dof), np.bool_)
-        self._follow = partial(follow_references.compiled, self._away, self._most_off, self._off, self._still)
+        self._follow = follow_references.bind(self._away, self._most_off, self._off, self._still)
 
     def begin(self, sim: int, command: BrainCommand, target: Array) -> None:
         """Forget the last goal; judge a new one, whose trajectory ends at a target of shape (dof + 1,)."""
