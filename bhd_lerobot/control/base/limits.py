@@ -16,7 +16,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _ARRIVED = 1e-12  # nearer than this it is there
-_FARTHEST = 1e300  # infinitely far is as far as this
 _NON_FINITE, _VELOCITY, _ACCELERATION = int(Limit.NON_FINITE), int(Limit.VELOCITY), int(Limit.ACCELERATION)
 
 
@@ -66,7 +65,7 @@ def limit_jerk(  # noqa: PLR0917
     for sim in range(len(requested)):
         for k in range(len(jerk)):
             step = requested[sim, k] - previous[sim, k]
-            way = min(abs(step) / jerk[k], _FARTHEST)
+            way = abs(step) / jerk[k]
             changed[sim, k] |= way > largest[k] / jerk[k]
             arrived[sim, k] = way <= _ARRIVED / jerk[k] and abs(rate[sim, k]) <= jerk[k]
             change = math.copysign(min(largest_change(way) * jerk[k], largest[k]), step)
