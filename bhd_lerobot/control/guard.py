@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -96,6 +97,46 @@ class WireLimits:
         return cls(lower, upper, change, bend, start)
 
 
+@kernel("b1(f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,:], f8[:,:], f8, b1)")
+def check_commands(  # noqa: PLR0917
+    written: Array,
+    rate: Array,
+    unsafe: NDArray[np.bool_],
+    lower: Array,
+    upper: Array,
+    most: Array,
+    bend: Array,
+    actuators: Array,
+    position: Array,
+    ticks: float,
+    is_sparse: bool,
+) -> bool:
+    """Take safe commands over into `written`; let others continue from there, at a falling speed. Return if any do."""
+    any_unsafe = False
+    for sim in range(len(written)):
+        unsafe[sim] = False
+        for k in range(len(lower)):
+            value = actuators[sim, k]
+            change = (value - written[sim, k]) / ticks
+            is_near = -most[k] <= change <= most[k] and lower[k] <= value <= upper[k]  # not if it is no number
+            # When commands were more than a tick apart, it is not known what was in between.
+            is_bent = not is_sparse and abs(change - rate[sim, k]) > bend[k]
+            if is_bent and (value <= position[sim, k] if change > 0.0 else change < 0.0 and value >= position[sim, k]):
+                is_bent = False
+            unsafe[sim] |= is_bent or not is_near
+        any_unsafe |= unsafe[sim]
+        for k in range(len(lower)):
+            before, value = written[sim, k], actuators[sim, k]
+            if unsafe[sim]:
+                slower = rate[sim, k] - clamp(rate[sim, k], -bend[k], bend[k])
+                value = clamp(before + slower, lower[k], upper[k])
+                rate[sim, k] = value - before
+            else:
+                rate[sim, k] = (value - before) / ticks
+            written[sim, k] = value
+    return any_unsafe
+
+
 class Guard:
     """Lets actuator commands through that are finite, in range, near enough to the last ones, and bent gradually.
 
@@ -105,6 +146,7 @@ class Guard:
 
     Attributes:
         written: what may be written, shape (n, actuators).
+        rate: its last change, for each tick, shape (n, actuators).
 
     Args:
         limits: what may be written.
@@ -112,23 +154,11 @@ class Guard:
     """
 
     def __init__(self, limits: WireLimits, n: int) -> None:
-        self.limits = limits
-        width = len(limits.lower)
-        # All checks at once: the distances from the last command, from the middle of the range, and from where the
-        # command would be if it went on changing as it does.
-        self._from = np.zeros((3, n, width))
-        self._from[1] = (limits.lower + limits.upper) / 2
-        self.written: Array = self._from[0]
-        self._rate: Array = np.zeros((n, width))
-        self._most = np.zeros((3, n, width))
-        self._most[0], self._most[1], self._most[2] = limits.change, (limits.upper - limits.lower) / 2, limits.bend
-        self._work, self._flags = np.zeros((3, n, width)), np.zeros((3, n, width), np.bool_)
-        self._all = self._flags.size
-        self._is_sparse = False  # the last commands were more than a tick apart
-        # Plain numbers are several times cheaper than arrays of a few.
-        bounds = (limits.lower, limits.upper, limits.change, limits.bend)
-        self._bounds = list(zip(*(bound.tolist() for bound in bounds), strict=True))
-        self._last, self._rates = [0.0] * width, [0.0] * width  # of a single robot
+        self.limits, shape = limits, (n, len(limits.lower))
+        self.written, self.rate = np.zeros(shape), np.zeros(shape)
+        self._unsafe, self._is_sparse = np.zeros(n, np.bool_), False  # the last commands were more than a tick apart
+        bounds = limits.lower, limits.upper, limits.change, limits.bend
+        self._check = check_commands.bind(self.written, self.rate, self._unsafe, *bounds)
 
     def restart(self, ids: NDArray[np.intp], actuators: Array) -> None:
         """Start from commands that the next ones need not be near to: the robots were put or moved somewhere else.
@@ -137,17 +167,7 @@ class Guard:
             ids: the robots.
             actuators: their commands, shape (n, actuators).
         """
-        if len(ids):
-            self.written[ids] = actuators[ids]
-            self.rate[ids] = 0.0
-            self._last, self._rates = self.written[0].tolist(), [0.0] * len(self._bounds)
-
-    @property
-    def rate(self) -> Array:
-        """The last change of `written`, for each tick, shape (n, actuators)."""
-        if len(self.written) == 1:
-            self._rate[0] = self._rates
-        return self._rate
+        self.written[ids], self.rate[ids] = actuators[ids], 0.0
 
     def start(self, actuators: Array, position: Array) -> None:
         """Start from where the robots are, because someone else held them there.
@@ -170,51 +190,7 @@ class Guard:
             ticks: how many ticks the last commands are old.
 
         Returns:
-            The robots whose commands were not safe, shape (n,); None if there are none.
+            The robots whose commands were not safe, shape (n,), until the next check; None if there are none.
         """
         is_sparse, self._is_sparse = self._is_sparse or ticks > 1, ticks > 1
-        if len(actuators) == 1 and not is_sparse and self._is_safe(actuators[0].tolist()):
-            self.written[:] = actuators
-            return None
-        np.add(self.written, self.rate, out=self._from[2])
-        work = np.subtract(actuators, self._from, out=self._work)
-        change = work[0] / max(ticks, 1)
-        np.abs(work, out=work)
-        if is_sparse:
-            np.abs(change, out=work[0])
-            work[2] = 0.0  # what was in between is not known
-        # What is not a number is not less than anything either.
-        np.less_equal(work, self._most, out=self._flags)
-        unsafe = None
-        if np.count_nonzero(self._flags) < self._all:
-            with np.errstate(all="ignore"):
-                self._flags[2] |= (change * (position - actuators) >= 0.0) & (change != 0.0)
-            unsafe = self._slow_down(change, actuators)
-        else:
-            self._rate[:], self.written[:] = change, actuators
-        if len(actuators) == 1:
-            self._last, self._rates = self.written[0].tolist(), self._rate[0].tolist()
-        return unsafe
-
-    def _slow_down(self, change: Array, actuators: Array) -> NDArray[np.bool_] | None:
-        """Take safe commands over; let those of other robots continue from the last safe ones, at a falling speed."""
-        good: NDArray[np.bool_] = np.asarray(self._flags.all(axis=(0, 2)))
-        limits, bend, rate = self.limits, self.limits.bend, self.rate
-        slower = rate - np.minimum(np.maximum(rate, -bend), bend)
-        on = np.minimum(np.maximum(self.written + slower, limits.lower), limits.upper)
-        after = np.where(good[:, None], actuators, on)
-        rate[:] = np.where(good[:, None], change, after - self.written)
-        self.written[:] = after
-        return None if good.all() else ~good
-
-    def _is_safe(self, values: list[float]) -> bool:
-        """Return what the three comparisons of `check` say about a single robot, and take its command over."""
-        rates: list[float] = []
-        for value, before, rate, bounds in zip(values, self._last, self._rates, self._bounds, strict=True):
-            lower, upper, most, bend = bounds
-            change = value - before
-            if not (lower <= value <= upper and -most <= change <= most and -bend <= change - rate <= bend):
-                return False
-            rates.append(change)
-        self._last, self._rates = values, rates
-        return True
+        return self._unsafe if self._check(actuators, position, float(max(ticks, 1)), is_sparse) else None

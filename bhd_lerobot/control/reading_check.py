@@ -6,16 +6,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.messages import NANOSECONDS
-from bhd_lerobot.control.plant import PlantReading, SafetyStatus
+from bhd_lerobot.control.plant import PlantReading
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Times = NDArray[np.int64]
 
 # Times the largest speed of a joint. In collisions of a simulated UR5 (`python -m benchmarks.contact`) no joint
 # exceeded 1.01 times its limit.
 _FASTER = 2.0
 _SLACK_PERIODS = 3  # by so much may stamps be off
 _TURN = 2 * math.pi
+
+
+@kernel(
+    "b1(f8[:,::1], f8[:,::1], i8[::1], i8[::1], b1[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], i8[::1], "
+    "i1[::1])"
+)
+def follow_positions(  # noqa: PLR0917
+    near: Array,
+    last: Array,
+    time_ns: Times,
+    elapsed_ns: Times,
+    wrong: Mask,
+    beyond: Array,
+    speed: Array,
+    step: Array,
+    slack: Array,
+    position: Array,
+    stamp_ns: Times,
+    safety: NDArray[np.int8],
+) -> bool:
+    """Follow positions no faster than joints can turn; return whether any robot's are `wrong`.
+
+    Those become the `last` that were measurements. `beyond` becomes the ways of joints that changed too fast, else 0.
+    """
+    any_wrong = False
+    for sim in range(len(near)):
+        elapsed_ns[sim], time_ns[sim] = max(stamp_ns[sim] - time_ns[sim], 0), stamp_ns[sim]
+        is_finite = is_known = is_still = True
+        for k in range(len(speed)):
+            is_finite &= math.isfinite(position[sim, k])
+            is_known &= math.isfinite(near[sim, k])
+            is_still &= abs(position[sim, k] - near[sim, k]) <= step[k]
+        wrong[sim], anew = not is_finite, is_finite and (is_still or not is_known or safety[sim] != 0)
+        for k in range(len(speed)):
+            if anew:
+                near[sim, k] = position[sim, k]
+            way, most = position[sim, k] - near[sim, k], speed[k] * max(elapsed_ns[sim], 1)
+            is_far = is_finite and abs(way - clamp(way, -most, most)) > slack[k]
+            beyond[sim, k] = way if is_far else 0.0
+            wrong[sim] |= is_far
+        any_wrong |= wrong[sim]
+        for k in range(len(speed)):
+            if wrong[sim]:
+                position[sim, k] = last[sim, k]
+            elif not anew:
+                most = speed[k] * max(elapsed_ns[sim], 1)
+                near[sim, k] += clamp(position[sim, k] - near[sim, k], -most, most)
+            last[sim, k] = position[sim, k]
+    return any_wrong
 
 
 class ReadingCheck:
@@ -44,12 +96,21 @@ class ReadingCheck:
             speed = np.array([*body.limits.velocity[:-1], np.inf])
         elif isinstance(body, MobileBase):
             self._names, speed = body.drive.joints, np.full(2, body.drive.max_wheel_speed)
-        self._speed = _FASTER * speed / NANOSECONDS  # [rad/ns]
-        self._step, self._slack = self._speed * period, _SLACK_PERIODS * self._speed * period
+        speed = _FASTER * speed / NANOSECONDS  # [rad/ns]
         self._near = np.full((n, len(speed)), np.nan)  # follows the positions no faster than joints can turn
-        self._last = np.zeros_like(self._near)  # the last positions that were measurements
-        self._work, self._flags = np.zeros_like(self._near), np.zeros(self._near.shape, np.bool_)
-        self._time = np.zeros(n, np.int64)  # of the reading before [ns]
+        self._elapsed, self._stamp = np.zeros((2, n), np.int64)
+        self._wrong, self._beyond = np.zeros(n, np.bool_), np.zeros_like(self._near)
+        self._follow = follow_positions.bind(
+            self._near,
+            np.zeros_like(self._near),
+            np.zeros(n, np.int64),
+            self._elapsed,
+            self._wrong,
+            self._beyond,
+            speed,
+            speed * period,
+            _SLACK_PERIODS * speed * period,
+        )
 
     def forget(self, ids: NDArray[np.intp]) -> None:
         """Accept the next positions of some robots, whatever they are."""
@@ -57,43 +118,17 @@ class ReadingCheck:
         self.problem = self.silence = ""
 
     def wrong_positions(self, reading: PlantReading, now_ns: int) -> Mask | None:
-        """Return the robots whose positions are not finite or changed too fast, shape (n,); None if there are none.
+        """Return the robots whose positions are not finite or changed too fast, shape (n,), until the next call.
 
-        Their positions in `reading` become the last that were measurements.
+        None if there are none. Their positions in `reading` become the last that were measurements.
         """
-        near, work = self._near, self._work
-        np.subtract(reading.position, near, out=work)
-        np.abs(work, out=work)
-        np.less_equal(work, self._step, out=self._flags)  # false for what is not a number
-        wrong = None
-        if np.count_nonzero(self._flags) == self._flags.size:
-            near[:] = reading.position
-        else:
-            wrong = self._follow(reading, now_ns)
-        self._time[:] = now_ns if reading.stamp_ns is None else reading.stamp_ns
-        self._last[:] = reading.position
-        return wrong
-
-    def _follow(self, reading: PlantReading, now_ns: int) -> Mask | None:
-        position, near = reading.position, self._near
-        finite = np.isfinite(position).all(axis=1)
-        anew = finite & (~np.isfinite(near).all(axis=1) | (reading.safety != SafetyStatus.NORMAL))
-        np.copyto(near, position, where=anew[:, None])
-        elapsed = np.maximum((now_ns if reading.stamp_ns is None else reading.stamp_ns) - self._time, 0)
-        way = position - near
-        most = self._speed * np.maximum(elapsed, 1)[:, None]
-        follow = np.minimum(np.maximum(way, -most), most)
-        far: Mask = np.greater(np.abs(way - follow), self._slack)
-        far[~finite] = False
-        wrong: Mask = np.asarray(~finite | far.any(axis=1))
-        np.add(near, follow, out=near, where=~wrong[:, None])
-        if not np.count_nonzero(wrong):
+        self._stamp[:] = now_ns if reading.stamp_ns is None else reading.stamp_ns
+        if not self._follow(reading.position, self._stamp, reading.safety):
             return None
-        if np.count_nonzero(far) and not self.problem:
-            sim, joint = (int(index) for index in np.argwhere(far)[0])
-            self.problem = self._explain(joint, float(way[sim, joint]), int(elapsed[sim]))
-        position[wrong] = self._last[wrong]
-        return wrong
+        if np.count_nonzero(self._beyond) and not self.problem:
+            sim, joint = (int(index) for index in np.argwhere(self._beyond)[0])
+            self.problem = self._explain(joint, float(self._beyond[sim, joint]), int(self._elapsed[sim]))
+        return self._wrong
 
     def _explain(self, joint: int, way: float, elapsed_ns: int) -> str:
         turns = round(way / _TURN)

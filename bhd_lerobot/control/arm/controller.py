@@ -13,12 +13,14 @@ from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
-from bhd_lerobot.control.gradual import largest_change
 from bhd_lerobot.control.guard import WireLimits
+from bhd_lerobot.control.kernels import kernel, largest_change
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
+
+Array = NDArray[np.float64]
 
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
@@ -33,6 +35,30 @@ _SPRINGS_RAD = 0.05  # [rad] by which what an arm leans on may push it on when i
 LIGHT_N = 20.0  # [N] an arm that presses less has given way
 _TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
+
+
+@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
+def lead_commands(  # noqa: PLR0917
+    reference: Array,
+    speed: Array,
+    actuators: Array,
+    limited_effort: NDArray[np.bool_],
+    lead: Array,
+    largest_error: Array,
+    position: Array,
+    velocity: Array,
+) -> bool:
+    """Lead the servos' commands by their damping; return whether any servo gives its largest effort."""
+    any_limited = False
+    for sim in range(len(reference)):
+        for k in range(len(lead)):
+            actuators[sim, k] = speed[sim, k] * lead[k] + reference[sim, k]
+            # A servo beyond its effort gives its largest: that is flagged, and the command stays as it is. Holding the
+            # command near the joint, to ask for no more, would be a second loop around the servo, which a few
+            # milliseconds of latency turn into a brake.
+            if abs(velocity[sim, k] * lead[k] + position[sim, k] - actuators[sim, k]) > largest_error[k]:
+                limited_effort[sim] = any_limited = True
+    return any_limited
 
 
 class ArmController(Controller):
@@ -107,6 +133,8 @@ class ArmController(Controller):
         self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
+        state = self.command, self.velocity, self.actuators, self._limited_effort
+        self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
 
     def limit_force(self, force: ForceLimit) -> None:
         """Stop an arm that presses too hard, from now on."""
@@ -201,21 +229,9 @@ class ArmController(Controller):
             self._yield(reading)
         if self._any_gives_way:
             self._give_way(reading)
-        np.multiply(self.velocity, self._lead, out=self.actuators)
-        self.actuators += self.command
-        # A servo beyond its effort gives its largest: that is flagged, and the command stays as it is.
-        # Holding the command near the joint, to ask for no more, would be a second loop around the servo, which a few
-        # milliseconds of latency turn into a brake.
-        work = self._work
-        np.multiply(reading.velocity, self._lead, out=work)
-        work += reading.position
-        work -= self.actuators
-        np.abs(work, out=work)
-        beyond = work > self._largest_error
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
-        if np.count_nonzero(beyond):
-            self._limited_effort |= beyond.any(axis=1)
+        if self._lead_commands(reading.position, reading.velocity):
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0

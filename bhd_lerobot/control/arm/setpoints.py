@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.arm.clearance import SetpointClearance
-from bhd_lerobot.control.gradual import largest_change
+from bhd_lerobot.control.kernels import largest_change
 
 # [1/s] How eagerly a remaining error is closed. With the jerk limit of a UR5 the first follows random setpoints best:
 # less lags, more overshoots. Without a jerk limit it may be twice as much.

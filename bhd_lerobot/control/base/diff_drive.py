@@ -4,6 +4,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import WheelDrive
+from bhd_lerobot.control.kernels import kernel
+
+Array = NDArray[np.float64]
+
+
+@kernel()
+def wheels_from_twist(twist: Array, per_speed: float, per_yaw: float, out: Array) -> None:
+    """Write the wheel speeds of a twist, see `DiffDrive.wheels_from_twist`."""
+    for sim in range(len(twist)):
+        straight, turn = twist[sim, 0] * per_speed, twist[sim, 1] * per_yaw
+        out[sim, 0], out[sim, 1] = straight - turn, straight + turn
+
+
+@kernel("void(f8[:,:], f8[:,::1], f8[:,::1], f8, f8, f8)")
+def integrate(  # noqa: PLR0917
+    angles: Array, encoder: Array, odometry: Array, count: float, per_count: float, yaw_per_count: float
+) -> None:
+    """Add the motion since the last update to `odometry`, and take the encoders' counts over into `encoder`."""
+    for sim in range(len(angles)):
+        left, right = np.floor(angles[sim, 0] * count), np.floor(angles[sim, 1] * count)
+        moved_left, moved_right = left - encoder[sim, 0], right - encoder[sim, 1]
+        encoder[sim, 0], encoder[sim, 1] = left, right
+        distance, turn = (moved_left + moved_right) * per_count, (moved_right - moved_left) * yaw_per_count
+        heading = turn * 0.5 + odometry[sim, 2]
+        odometry[sim, 0] += np.cos(heading) * distance
+        odometry[sim, 1] += np.sin(heading) * distance
+        odometry[sim, 2] += turn
 
 
 class DiffDrive:
@@ -17,32 +44,30 @@ class DiffDrive:
         self._per_speed = 1.0 / drive.wheel_radius  # [rad/m]
         self._per_yaw = drive.wheel_separation / 2 / drive.wheel_radius  # [rad/rad]
         self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
-        self.odometry: NDArray[np.float64] = np.zeros((n, 3))
-        self._metres = drive.wheel_radius / self._count  # [m] that a wheel rolls in one encoder count
-        self._encoder: NDArray[np.float64] = np.zeros((n, 2))
-        self._counts, self._moved, self._work = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((4, n))
+        self.odometry: Array = np.zeros((n, 3))
+        metres = drive.wheel_radius / self._count  # [m] that a wheel rolls in one encoder count
+        self._per_count = self._count, metres / 2, metres / drive.wheel_separation
+        self._encoder: Array = np.zeros((n, 2))
+        self._integrate = integrate.bind()
 
-    def wheels_from_twist(self, twist: NDArray[np.float64], out: NDArray[np.float64]) -> NDArray[np.float64]:
+    def wheels_from_twist(self, twist: Array, out: Array) -> Array:
         """Write the wheel speeds of a twist.
 
         Args:
             twist: shape (n, 2).
             out: wheel speeds [rad/s], shape (n, 2).
         """
-        straight = twist[:, 0] * self._per_speed
-        turn = twist[:, 1] * self._per_yaw
-        np.subtract(straight, turn, out=out[:, 0])
-        np.add(straight, turn, out=out[:, 1])
+        wheels_from_twist(twist, self._per_speed, self._per_yaw, out)
         return out
 
-    def twist_from_wheels(self, wheels: NDArray[np.float64]) -> NDArray[np.float64]:
+    def twist_from_wheels(self, wheels: Array) -> Array:
         """Return the twist of bases whose wheels turn at these speeds [rad/s] without slip, shape (n, 2)."""
         twist = np.empty_like(wheels)
         twist[:, 0] = (wheels[:, 0] + wheels[:, 1]) * (self.drive.wheel_radius / 2)
         twist[:, 1] = (wheels[:, 1] - wheels[:, 0]) * (self.drive.wheel_radius / self.drive.wheel_separation)
         return twist
 
-    def reset_odometry(self, ids: NDArray[np.intp], angles: NDArray[np.float64]) -> None:
+    def reset_odometry(self, ids: NDArray[np.intp], angles: Array) -> None:
         """Start odometry at the origin.
 
         Args:
@@ -51,7 +76,7 @@ class DiffDrive:
         self.odometry[ids] = 0.0
         self._encoder[ids] = np.floor(angles * self._count)
 
-    def update_odometry(self, angles: NDArray[np.float64]) -> None:
+    def update_odometry(self, angles: Array) -> None:
         """Integrate the motion since the last update, from encoder counts, along the chord of the arc.
 
         The encoders' resolution and the tyres' slip make it drift, as odometry does.
@@ -59,10 +84,9 @@ class DiffDrive:
         Args:
             angles: wheel angles [rad], shape (n, 2).
         """
-        self._integrate(angles, self.odometry)
-        self._encoder, self._counts = self._counts, self._encoder
+        self._integrate(angles, self._encoder, self.odometry, *self._per_count)
 
-    def odometry_at(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    def odometry_at(self, angles: Array) -> Array:
         """Return the odometry with the motion since the last update added, without updating it.
 
         Args:
@@ -72,27 +96,5 @@ class DiffDrive:
             x [m], y [m] and yaw [rad] since the last reset, shape (n, 3).
         """
         odometry = self.odometry.copy()
-        self._integrate(angles, odometry)
+        self._integrate(angles, self._encoder.copy(), odometry, *self._per_count)
         return odometry
-
-    def _integrate(self, angles: NDArray[np.float64], odometry: NDArray[np.float64]) -> None:
-        """Add the motion since the last update to `odometry`. Runs every tick: nothing is allocated."""
-        counts, moved, (distance, turn, heading, part) = self._counts, self._moved, self._work
-        np.multiply(angles, self._count, out=counts)
-        np.floor(counts, out=counts)
-        np.subtract(counts, self._encoder, out=moved)
-        left, right = moved.T
-        np.add(left, right, out=distance)
-        distance *= self._metres / 2
-        np.subtract(right, left, out=turn)
-        turn *= self._metres / self.drive.wheel_separation
-        x, y, yaw = odometry.T
-        np.multiply(turn, 0.5, out=heading)
-        heading += yaw
-        np.cos(heading, out=part)
-        part *= distance
-        x += part
-        np.sin(heading, out=part)
-        part *= distance
-        y += part
-        yaw += turn

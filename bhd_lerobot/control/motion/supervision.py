@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -43,18 +44,46 @@ class FollowingLimit:
     def __init__(self, arm: Arm, n: int) -> None:
         self._arm, self._n = arm, n
         self._acceleration = np.asarray(arm.limits.acceleration[: len(arm.chain.joints)])
-        self._latency_s = np.zeros(n)
+        self.latency_s = np.zeros(n)
         self.set_latency(np.arange(n), 0.0)
 
     def set_latency(self, ids: NDArray[np.intp], latency_s: ArrayLike) -> None:
         """Set by how much the servos of some simulations are late, beyond the body's latency [s]."""
-        self._latency_s[ids] = np.asarray(latency_s) + self._arm.latency_s
-        self._late = bool(self._latency_s.any())
-        self._at_rest = self._arm.blocked_rad + self._acceleration * self._latency_s[:, None] ** 2 / 2
+        self.latency_s[ids] = np.asarray(latency_s) + self._arm.latency_s
+        self.at_rest = self._arm.blocked_rad + self._acceleration * self.latency_s[:, None] ** 2 / 2
 
     def of(self, velocity: Array) -> Array:
         """Return the largest distances [rad], shape (n, dof), from references of these speeds, shape (n, dof)."""
-        return self._at_rest + np.abs(velocity) * self._latency_s[:, None] if self._late else self._at_rest
+        late = self.latency_s.any()  # 0 times infinity is no number
+        return self.at_rest + np.abs(velocity) * self.latency_s[:, None] if late else self.at_rest
+
+
+@kernel("b1(f8[:,::1], f8[:,::1], b1[:,::1], i8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1])")
+def follow_references(  # noqa: PLR0917
+    away: Array,
+    most: Array,
+    off: NDArray[np.bool_],
+    still: NDArray[np.int64],
+    at_rest: Array,
+    latency_s: Array,
+    reference: Array,
+    speed: Array,
+    position: Array,
+    velocity: Array,
+) -> bool:
+    """Compare joints with their references, and count for how long grippers stand still; return if any joint is off."""
+    any_off = False
+    for sim in range(len(off)):
+        for k in range(off.shape[1]):
+            away[sim, k] = abs(position[sim, k] - reference[sim, k])
+            most[sim, k] = at_rest[sim, k]
+            if latency_s[sim] != 0.0:  # 0 times infinity is no number
+                most[sim, k] += abs(speed[sim, k]) * latency_s[sim]
+            off[sim, k] = away[sim, k] > most[sim, k]
+            any_off |= off[sim, k]
+        stands = abs(velocity[sim, -1]) < GRIPPER_STILL and speed[sim, -1] == 0.0
+        still[sim] = still[sim] + 1 if stands else 0
+    return any_off
 
 
 class Supervisor:
@@ -67,7 +96,7 @@ class Supervisor:
     def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
         self._joints, self._dof = arm.chain.joints, len(arm.chain.joints)
         self.limit = FollowingLimit(arm, n)
-        self._most_off = self.limit.of(np.zeros((n, self._dof)))
+        self._most_off = np.zeros((n, self._dof))
         self._stall_ticks = round(GRIPPER_STALL_S * control_hz)
         self._settling_ticks = round(SETTLING_S * control_hz)
         self._gripping_ticks = round(GRIPPING_S * control_hz)
@@ -82,6 +111,7 @@ class Supervisor:
         self._away = np.zeros((n, self._dof + 1))
         self._arm_away = self._away[:, : self._dof]
         self._off = np.zeros((n, self._dof), np.bool_)
+        self._follow = follow_references.bind(self._away, self._most_off, self._off, self._still)
 
     def begin(self, sim: int, command: BrainCommand, target: Array) -> None:
         """Forget the last goal; judge a new one, whose trajectory ends at a target of shape (dof + 1,)."""
@@ -112,29 +142,16 @@ class Supervisor:
             reference: what the plant was last commanded: positions and velocities, each of shape (n, dof + 1).
             measured: what it did: positions and velocities, each of shape (n, dof + 1).
         """
-        # All rows, also of those that follow nothing, and nothing but comparisons: this runs every tick.
-        np.subtract(measured[0], reference[0], out=self._away)
-        np.abs(self._away, out=self._away)
-        self._most_off = self.limit.of(reference[1][:, : self._dof])
-        np.greater(self._arm_away, self._most_off, out=self._off)
         self._tick += 1
-        if np.count_nonzero(self._moves_gripper):
-            self._watch_grippers(reference[1], measured[1])
+        any_off = self._follow(self.limit.at_rest, self.limit.latency_s, *reference, *measured)
         on_time = self._tick < self._next_deadline
-        if on_time and np.count_nonzero(playing[ids]) == len(ids) and not np.count_nonzero(self._off):
+        if on_time and np.count_nonzero(playing[ids]) == len(ids) and not any_off:
             return []
         due = ids if not on_time else ids[~playing[ids] | self._off[ids].any(axis=1)]
         verdicts = [self._judge(int(sim), bool(playing[sim]), measured) for sim in due]
         if not on_time:
             self._next_deadline = int(self._deadline[ids].min())
         return [verdict for verdict in verdicts if verdict is not None]
-
-    def _watch_grippers(self, reference: Array, measured: Array) -> None:
-        """Count for how long grippers have not moved though they are not to be at rest."""
-        still = np.abs(measured[:, self._dof]) < GRIPPER_STILL
-        still &= reference[:, self._dof] == 0.0
-        self._still += 1
-        self._still *= still
 
     def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]

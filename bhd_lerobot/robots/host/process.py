@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body, Rates
+from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.timing import TimingStatistics
@@ -102,6 +103,7 @@ class LiveProcess:
     """The process's side of the pipe."""
 
     def __init__(self, spec: LiveSpec, connection: Connection) -> None:
+        compile_at_once()
         self._connection = connection
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words

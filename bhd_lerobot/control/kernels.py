@@ -1,0 +1,182 @@
+"""Loops over simulations in plain scalar Python, and the machine code that numba makes of them once it is worth it.
+
+To load numba and its code takes as long as some 20,000 passes through all loops of a tick in Python: what is short runs
+as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
+"""
+
+import hashlib
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache, cached_property, partial, update_wrapper
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_PASSES = 20_000  # through a loop in Python, until it is compiled
+_is_eager = False
+
+
+class Kernel[**P, R]:
+    """A function of numbers and arrays; other kernels may call it.
+
+    Called as it is, it runs as plain Python.
+
+    Args:
+        function: the function.
+        signature: the types of its arguments, in numba's words; empty for what only other kernels call.
+    """
+
+    def __init__(self, function: Callable[P, R], signature: str) -> None:
+        self.function, self.signature = function, signature
+        update_wrapper(self, function)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:  # noqa: D102
+        return self.function(*args, **kwargs)
+
+    @cached_property
+    def compiled(self) -> Callable[P, R]:
+        """The machine code, compiled at the first access, or loaded from the user's cache; it takes no other types."""
+        import numba
+
+        config: Any = numba.config
+        if config.DISABLE_JIT:
+            return self.function
+        if not self.signature:
+            return numba.njit(error_model="numpy")(self.function)
+        folder = _folder()
+        if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
+            _announce()
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        try:
+            return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
+        except Exception:  # a full disk, or a damaged file: compiled at every start
+            return numba.njit(self.signature, error_model="numpy")(self.function)
+        finally:
+            config.CACHE_DIR = before
+
+    def bind(self, *arguments: Any) -> "BoundKernel[R]":
+        """Return this kernel with its first arguments, to be called with the others."""
+        return BoundKernel(self, arguments)
+
+    @cached_property
+    def arrays(self) -> list[tuple[np.dtype[Any], int, bool] | None]:
+        """Type, dimensions and whether it must be C-contiguous of each argument; None for a number."""
+        kinds = re.findall(r"(\w+)(\[[^\]]*\])?", self.signature.partition("(")[2])
+        return [
+            (np.dtype(name.replace("b1", "?")), shape.count(":") - shape.count("::"), "::1" in shape) if shape else None
+            for name, shape in kinds
+        ]
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba takes it for inside of other kernels."""
+        return self.compiled._numba_type_  # type: ignore[attr-defined]
+
+
+class BoundKernel[R]:
+    """A kernel with its first arguments: Python at first, machine code after `_PASSES` passes or `compile_at_once`.
+
+    Args:
+        kernel: the kernel.
+        bound: its first arguments.
+    """
+
+    __slots__ = ("_bound", "_call", "_is_checked", "_kernel", "_left")
+
+    def __init__(self, kernel: Kernel[..., R], bound: tuple[Any, ...]) -> None:
+        self._kernel, self._bound = kernel, bound
+        self._call: Callable[..., R] | None = None
+        self._left, self._is_checked = _PASSES, False
+        self._check(0, bound)
+        if _is_eager:
+            self._compile()
+
+    def __call__(self, *arguments: Any) -> R:
+        """Call it with the other arguments."""
+        if self._call is not None:
+            return self._call(*arguments)
+        self._left -= len(self._bound[0] if self._bound else arguments[0])
+        if self._left < 0:
+            return self._compile()(*arguments)
+        if not self._is_checked:
+            self._check(len(self._bound), arguments)
+            self._is_checked = True
+        return self._kernel.function(*self._bound, *arguments)
+
+    def _compile(self) -> Callable[..., R]:
+        self._call = partial(self._kernel.compiled, *self._bound)
+        return self._call
+
+    def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
+        """Refuse what the machine code would refuse."""
+        for at, argument in enumerate(arguments, first):
+            kind = self._kernel.arrays[at]
+            if kind and not (
+                argument.dtype == kind[0] and argument.ndim == kind[1] and (argument.flags.c_contiguous or not kind[2])
+            ):
+                raise TypeError(
+                    f"Argument {at} of {self._kernel.function.__name__} is an array of {argument.dtype} of shape "
+                    f"{argument.shape}; its types are {self._kernel.signature}."
+                )
+
+
+def compile_at_once() -> None:
+    """Compile kernels from now on when they are bound, not in the middle of a run: for a loop on the wall clock."""
+    global _is_eager  # noqa: PLW0603
+    _is_eager = True
+
+
+def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Make a kernel of a function, see `Kernel`."""
+    return lambda function: Kernel(function, signature)
+
+
+@cache
+def _announce() -> None:
+    print("Compiling the control loop for this processor: some seconds, once", file=sys.stderr)
+
+
+@cache
+def _folder() -> Path | None:
+    """Return the folder of the compiled kernels of this code on this processor; None if it cannot be written."""
+    from llvmlite import binding
+
+    code = hashlib.sha256(f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}".encode())
+    for source in sorted(Path(__file__).parent.rglob("*.py")):  # numba notices no change of what a kernel calls
+        code.update(source.read_bytes())
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = root / "bhd_lerobot" / "kernels" / code.hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except (OSError, RuntimeError):
+        return None
+    return folder
+
+
+@kernel()
+def clamp(value: float, low: float, high: float) -> float:
+    """Return the value, or the bound that it is beyond; what is not a number stays so."""
+    if value < low:
+        return low
+    return high if value > high else value
+
+
+@kernel()
+def largest_change(way: Any) -> Any:
+    """Return the largest change of this tick from which changes can still fall to nothing at the end of a way.
+
+    They may fall by 1 from tick to tick. Changes of 1, 2, … k add up to k (k + 1) / 2; what is left of the way is
+    spread over these ticks.
+
+    Args:
+        way: what the changes have to add up to, not negative, in units of the largest difference of two changes; a
+            number, or an array of any shape.
+    """
+    whole = np.floor(np.sqrt(way * 2.0 + 0.25) - 0.5)
+    # whole + (way - whole (whole + 1) / 2) / (whole + 1)
+    return way / (whole + 1.0) + whole * 0.5
