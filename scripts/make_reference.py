@@ -34,6 +34,7 @@ from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.ros2.serve.serve import ServeConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.config import BhdTrainConfig, own_fields
@@ -55,7 +56,7 @@ written `null`.
 | [`bhd-replay`](options/replay.md) | of a replay |
 | [`bhd-eval`](options/eval.md) | of an evaluation, also with `env` |
 | [`bhd-train`](options/train.md) | of a training, also with `algorithm: ppo` and `algorithm: dagger` |
-| [`bhd-ros2 topics`](options/ros2.md) | of what is on a ROS 2 network |
+| [`bhd-ros2`](options/ros2.md) | of a simulated robot on a ROS 2 network, and of what is on one |
 | [`teleop`](options/teleop.md) | of each teleoperator of ours, for LeRobot's own commands, too |
 | [`robot`](options/robot.md), [`brain`](options/brain.md), [`task`](options/task.md) | of each type |
 """
@@ -106,7 +107,10 @@ def pages() -> dict[Path, str]:
             f"## `teleop.type={chosen}`\n",
             *_options(one, "teleop.", "teleop.md", listed, own),
         ]
-    texts["ros2"] = ["# `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())]
+    texts["ros2"] = [
+        *("# `bhd-ros2`\n", "## `bhd-ros2 serve`\n", *_options(ServeConfig, "", "ros2.md", listed)),
+        *("## `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())),
+    ]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():
         page = "\n".join(parts)
