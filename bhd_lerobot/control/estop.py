@@ -105,6 +105,14 @@ class EstopInputs:
         self._waker, self._wake = os.pipe()
         self._poll.register(self._waker, select.POLLIN)
 
+    def cause(self, is_pressed: bool) -> str:
+        """Return what an emergency stop came from, as text.
+
+        Args:
+            is_pressed: whether the word of the emergency stop is set, which the robot's own stop does not do.
+        """
+        return ", ".join(self.causes) or ("from another process" if is_pressed else "the robot's own")
+
     # --- inputs ------------------------------------------------------------------------------------------------------
 
     def add(self, source: Source, name: str = "", period_s: float = POLL_S) -> None:

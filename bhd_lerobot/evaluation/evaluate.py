@@ -192,7 +192,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
             )
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs) or (config.by_person and robots.estop_pressed):
-            estop = ", ".join(pressed.causes) or "from another process"
+            estop = pressed.cause(robots.estop_pressed)
         faulty = [brain_run.loop for brain_run in runs if brain_run.loop.fault]
         fault = faulty[0].problem or robots.problem if faulty else None
     results = summary()

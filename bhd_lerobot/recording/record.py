@@ -89,7 +89,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         if loop.fault:
             result.fault = loop.problem or robots.problem
         if loop.emergency_stop:
-            result.estop = ", ".join(pressed.causes) or "from another process"
+            result.estop = pressed.cause(robots.estop_pressed)
     if album.added:
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
         album.draw(output_dir / "trajectories.png", heading)

@@ -276,6 +276,47 @@ def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, 
     assert np.abs(sent[:, None] - applied[None]).max(axis=2).min(axis=0).max() < 0.02
 
 
+STOPPED = {  # what happens to the driver or to a process of ours; what is printed of it
+    "protective stop": (("--on-usr1=safety", "--value=3"), "its safety status is STOPPED"),
+    "emergency stop": (("--on-usr1=safety", "--value=7"), "Emergency stop (the robot's own)"),
+    "silence": (("--on-usr1=silence",), "/joint_states has sent no message for"),
+    "node": ((), "The process of the ROS 2 node ended with status -9"),
+    "cerebellum": ((), "The cerebellum's process was killed by signal 9"),
+}
+
+
+@pytest.mark.parametrize("what", STOPPED)
+@pytest.mark.thorough(but=1)
+def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cause(
+    what: str, domain: int, tmp_path: Path
+) -> None:
+    options, cause = STOPPED[what]
+    log = tmp_path / "robot.jsonl"
+    move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=2", "--brain.type=random")
+    environment(messages=True)
+    driver = ("--active=forward_position_controller", "--log", log, *options)
+    with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
+        robot.wait_event("ready")
+        given = (*move, "--brain.scale=0.02", "--dataset.num_episodes=9")
+        with Recording("ur5", *given, domain=domain, folder=tmp_path, silence_s=0.4) as recording:
+            recording.wait_for_episode(2)
+            until(lambda: np.ptp([line["position"] for line in log_of(log, "state")], axis=0).max() > 0.01, "it moves")
+            if options:
+                robot.signal(signal.SIGUSR1)
+            else:
+                process = {"node": "ros2.live.process node", "cerebellum": "robots.host.process"}[what]
+                os.kill(recording.pid_of(process), signal.SIGKILL)
+            assert recording.process.wait() != 0
+            assert cause in recording.text
+        before = log_of(log, "state")[-1]
+        until(lambda: log_of(log, "state")[-1]["monotonic"] > before["monotonic"] + 0.5, "time passes")
+        assert log_of(log, "state")[-1]["position"] == pytest.approx(before["position"], abs=1e-3)
+    assert data(["check", str(recording.root)]) == 0
+    first, *rest = outcomes_of(recording.root)
+    assert first == "timeout"
+    assert rest in ([], ["fault"], ["estop"])
+
+
 FULL_S, SHORT_S = 10, 4  # of an episode
 
 
