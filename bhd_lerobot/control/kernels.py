@@ -92,7 +92,7 @@ class BoundKernel[R]:
         self._call: Callable[..., R] | None = None
         self._left, self._is_checked = _PASSES, False
         self._check(0, bound)
-        if _is_eager:
+        if _is_eager or "compiled" in vars(kernel):  # by another one
             self._compile()
 
     def __call__(self, *arguments: Any) -> R:
