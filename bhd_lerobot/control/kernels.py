@@ -5,19 +5,22 @@ as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the s
 """
 
 import hashlib
+import math
 import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, cached_property, partial, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-_PASSES = 20_000  # through a loop in Python, until it is compiled
-_is_eager = False
+_passes: float = 20_000  # through a loop in Python, until it is compiled
+# The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
+_CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
 
 
 class Kernel[**P, R]:
@@ -78,7 +81,7 @@ class Kernel[**P, R]:
 
 
 class BoundKernel[R]:
-    """A kernel with its first arguments: Python at first, machine code after `_PASSES` passes or `compile_at_once`.
+    """A kernel with its first arguments: Python at first, machine code after `_passes` passes.
 
     Args:
         kernel: the kernel.
@@ -90,9 +93,9 @@ class BoundKernel[R]:
     def __init__(self, kernel: Kernel[..., R], bound: tuple[Any, ...]) -> None:
         self._kernel, self._bound = kernel, bound
         self._call: Callable[..., R] | None = None
-        self._left, self._is_checked = _PASSES, False
+        self._left, self._is_checked = _passes, False
         self._check(0, bound)
-        if _is_eager or "compiled" in vars(kernel):  # by another one
+        if not _passes or "compiled" in vars(kernel):  # by another one
             self._compile()
 
     def __call__(self, *arguments: Any) -> R:
@@ -126,8 +129,19 @@ class BoundKernel[R]:
 
 def compile_at_once() -> None:
     """Compile kernels from now on when they are bound, not in the middle of a run: for a loop on the wall clock."""
-    global _is_eager  # noqa: PLW0603
-    _is_eager = True
+    global _passes  # noqa: PLW0603
+    _passes = 0
+
+
+@contextmanager
+def never_compiled() -> Iterator[None]:
+    """Bind kernels that stay Python: where a loop on the wall clock is running already."""
+    global _passes  # noqa: PLW0603
+    before, _passes = _passes, math.inf
+    try:
+        yield
+    finally:
+        _passes = before
 
 
 def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:
@@ -146,8 +160,7 @@ def _folder() -> Path | None:
     from llvmlite import binding
 
     code = hashlib.sha256(f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}".encode())
-    for source in sorted(Path(__file__).parent.rglob("*.py")):  # numba notices no change of what a kernel calls
-        code.update(source.read_bytes())
+    code.update(_CODE)
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = root / "bhd_lerobot" / "kernels" / code.hexdigest()[:16]

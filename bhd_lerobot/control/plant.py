@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,12 @@ class PlantReading:
         self.safety = np.zeros(n, np.int8)
         self.sensors = np.zeros((n, sensors))
         self.sensors_ns = np.zeros(n, np.int64)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set `has_effort` or `stamp_ns`; others hold these arrays, too, and a plant writes into them."""
+        if name not in ("has_effort", "stamp_ns") and vars(self).get(name, value) is not value:
+            raise TypeError(f"PlantReading.{name} is not to be replaced: write into it, out.{name}[:] = values.")
+        super().__setattr__(name, value)
 
 
 class Plant(Protocol):

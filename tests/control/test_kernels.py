@@ -6,9 +6,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,8 +16,10 @@ import pytest
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 from bhd_lerobot.control.kernels import Kernel
+from bhd_lerobot.control.plant import PlantReading
 from tests.control.test_wire import arm, base_rig, twist_rig
 
 ROOT = Path(bhd_lerobot.__file__).parents[1]
@@ -62,7 +64,7 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile kernels when they are bound."""
-    monkeypatch.setattr(kernels, "_is_eager", False)
+    monkeypatch.setattr(kernels, "_passes", 1)
     kernels.compile_at_once()
 
 
@@ -90,16 +92,59 @@ def test_a_kernel_takes_no_other_types_than_it_was_compiled_for() -> None:
             with pytest.raises(TypeError, match="No matching definition"):
                 integrate.compiled(*arrays, 1.0, 1.0, 1.0)
             with pytest.raises(TypeError, match=f"Argument {position} of integrate is an array of"):
-                integrate.bind()(*arrays, 1.0, 1.0, 1.0)
+                Kernel(integrate.function, integrate.signature).bind()(*arrays, 1.0, 1.0, 1.0)
 
 
-def test_after_a_while_a_kernel_is_compiled_and_continues_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernels, "_PASSES", 30)
-    monkeypatch.setattr(integrate, "compiled", mock := Mock(side_effect=integrate.function))
-    drive = DiffDrive(turtlebot3_burger().drive, 3)
-    for tick in range(12):
-        drive.update_odometry(np.full((3, 2), 0.1 * tick))
-    assert mock.call_count == 2  # after ten passes of three robots
+@pytest.fixture
+def compilations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the names of the kernels that are compiled from now on; they stay Python."""
+    names: list[str] = []
+
+    def compiled(one: Kernel[..., Any]) -> Callable[..., Any]:
+        names.append(one.function.__name__)
+        return one.function
+
+    monkeypatch.setattr(Kernel, "compiled", property(compiled))
+    for one in KERNELS.values():
+        monkeypatch.delitem(vars(one), "compiled", raising=False)
+    monkeypatch.setattr(kernels, "_passes", 30)
+    return names
+
+
+def drive(ticks: int) -> None:
+    base = DiffDrive(turtlebot3_burger().drive, 3)
+    for tick in range(ticks):
+        base.update_odometry(np.full((3, 2), 0.1 * tick))
+
+
+def test_a_kernel_is_compiled_once_it_has_run_for_long(compilations: list[str]) -> None:
+    drive(10)  # of three robots
+    assert compilations == []
+    drive(12)
+    assert compilations == ["integrate"]
+    with kernels.never_compiled():
+        drive(12)
+    assert compilations == ["integrate"]
+    kernels.compile_at_once()
+    drive(0)
+    assert compilations == ["integrate", "integrate"]
+
+
+def test_arrays_of_a_reading_are_not_replaced() -> None:
+    reading = PlantReading(1, 2)
+    reading.has_effort, reading.stamp_ns = True, np.zeros(1, np.int64)
+    reading.position += 1.0
+    assert reading.values[0].tolist() == [[1.0, 1.0]]
+    with pytest.raises(
+        TypeError, match=r"PlantReading.position is not to be replaced: write into it, out.position\[:\]"
+    ):
+        reading.position = np.zeros((1, 3))
+
+
+def test_limits_may_be_whole_numbers() -> None:
+    body = turtlebot3_burger()
+    whole = replace(body, limits=replace(body.limits, velocity=(1, 2)))
+    assert BaseController(whole, 1, 100).command.tolist() == [[0.0, 0.0]]
 
 
 def start(cache: Path, **environment: str) -> subprocess.Popen:

@@ -147,7 +147,7 @@ class BaseController(Controller):
         turn, error = drive.wheel_radius / drive.wheel_separation, drive.max_torque / drive.servo_gain
         change = np.array([limits.acceleration, limits.stop_deceleration]) / control_hz
         jerk = np.asarray(limits.jerk) / control_hz**2
-        largest = np.asarray(limits.velocity), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
+        largest = np.asarray(limits.velocity, float), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
         state = self._target, self.command, self._before, self._rate, self._hard, self._limits
         self._limit = limit_command.bind(*state, *largest)
         looks = self._start, self._asked, self._turned, self._looks, self._look_at, self._limits, self.protective_stop

@@ -103,7 +103,6 @@ class LiveProcess:
     """The process's side of the pipe."""
 
     def __init__(self, spec: LiveSpec, connection: Connection) -> None:
-        compile_at_once()
         self._connection = connection
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
@@ -273,6 +272,7 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
     # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     spec: LiveSpec = connection.recv()
+    compile_at_once()
     try:
         with Privileges() as privileges:
             process = make(spec, connection)

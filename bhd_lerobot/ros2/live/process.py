@@ -112,7 +112,8 @@ class Receiver:
         self._columns = spec.columns
         self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
-        self._clocks = ClockOffsets(len(self._inputs) + len(self._cameras))
+        self._clocks = ClockOffsets(len(self._inputs), are_one=spec.has_one_clock)
+        self._camera_clocks = ClockOffsets(len(self._cameras))
         self._stamps = [0] * len(self._inputs)  # newest of each [ns]
         self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
@@ -188,8 +189,8 @@ class Receiver:
             return
         self._wrong.pop(camera.topic, None)
         record = np.zeros((), self._channel.image_dtypes[index])
-        topic = len(self._inputs) + index
-        record["measured_ns"] = self._clocks.measured_ns(topic, _header_stamp(received.data), received.arrived_ns)
+        stamp = _header_stamp(received.data)
+        record["measured_ns"] = self._camera_clocks.measured_ns(index, stamp, received.arrived_ns)
         record["pixels"] = image
         ring.publish(record)
         self._images_ns[index] = received.arrived_ns

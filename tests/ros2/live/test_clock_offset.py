@@ -35,12 +35,18 @@ def test_a_clock_that_is_set_begins_anew_and_stamps_of_zero_are_none() -> None:
     assert clock.measured_ns(0, 0, 123) == 123
 
 
-@pytest.mark.parametrize(("offset", "is_same"), [(0, True), (SECOND // 10, True), (3600 * SECOND, False)])
-def test_topics_of_one_clock_share_the_smallest_delay(offset: int, is_same: bool) -> None:
-    """A scan that is stamped a turn before it is sent is a turn old, unless its clock is another one."""
-    clock, turn, delay = ClockOffsets(2), SECOND // 5, SECOND // 500
+@pytest.mark.parametrize(
+    ("are_one", "offset", "is_same"),
+    [(True, 0, True), (True, 3600 * SECOND, False), (False, 0, False)],
+    ids=["one clock", "not set yet", "several clocks"],
+)
+def test_topics_of_one_clock_share_the_smallest_delay(are_one: bool, offset: int, is_same: bool) -> None:
+    """A scan that is stamped a turn before it is sent is a turn old."""
+    clock, turn, delay = ClockOffsets(2, are_one=are_one), SECOND // 5, SECOND // 500
     for k in range(1, 50):
         now = (1000 + k) * turn
         clock.measured_ns(0, now - delay + 7 * SECOND, now)
         found = clock.measured_ns(1, now - turn - offset + 7 * SECOND, now)
-    assert now - found == (turn - delay + offset if is_same else 0)
+    assert now - found == (turn - delay if is_same else 0)
+    later = now + 10 * SECOND  # the other topic has fallen silent, and clocks drift
+    assert clock.measured_ns(1, later - turn - offset + 7 * SECOND, later) == later
