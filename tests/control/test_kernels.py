@@ -85,10 +85,8 @@ def test_a_tick_of_a_loop_on_the_wall_clock_compiles_nothing(make: Callable[[], 
 def test_a_kernel_takes_no_other_types_than_it_was_compiled_for() -> None:
     good = [np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 3))]
     for position in range(3):
-        for bad in (np.zeros((1, 3), np.float32), np.zeros(3), np.zeros((3, 1)).T[:, ::-1] if position else None):
+        for bad in (np.zeros((1, 3), np.float32), np.zeros(3)):
             arrays = [bad if k == position else one for k, one in enumerate(good)]
-            if bad is None:
-                continue
             with pytest.raises(TypeError, match="No matching definition"):
                 integrate.compiled(*arrays, 1.0, 1.0, 1.0)
             with pytest.raises(TypeError, match=f"Argument {position} of integrate is an array of"):

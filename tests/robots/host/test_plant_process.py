@@ -22,7 +22,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
@@ -414,27 +414,37 @@ def live(kind: Any, plant_timeout_s: float = LONG) -> Any:
 def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
     """Yield a robot that moves, and what its plant publishes."""
     robot: Any = TurtleBot3(live(TurtleBot3Config)) if kind == "turtlebot3" else UR5(live(UR5Config))
-    robot.connect()
     block = None
     try:
-        block = LiveBlock.attach(robot.host.link.block.name)
-        link = PlantLink.of(block)
-        assert link is not None
-        names, command = robot.action_names, robot.host.bridge.latest["command"][0].tolist()
-        target = {"x.vel": 0.2, "theta.vel": 0.0} if kind == "turtlebot3" else dict(zip(names, command, strict=True))
-        while True:
-            if kind == "ur5":
-                target["shoulder_pan.pos"] += 0.04
-            robot.send_action(target)
-            time.sleep(0.04)
-            state: Any = link.states.latest()
-            if np.abs(state["velocity"]).max() > (3.0 if kind == "turtlebot3" else 0.5):
+        for attempt in range(5):
+            robot.connect()
+            block = LiveBlock.attach(robot.host.link.block.name)
+            link = PlantLink.of(block)
+            assert link is not None
+            try:
+                _set_in_motion(robot, link, kind)
                 break
+            except CommandRefusedError:  # on a busy machine its plant or its cerebellum were too late
+                assert attempt < 4
+                robot.disconnect()
+                block.close()
         yield robot, link
     finally:
         robot.disconnect()
         if block is not None:
             block.close()
+
+
+def _set_in_motion(robot: Any, link: PlantLink, kind: str) -> None:
+    names, command = robot.action_names, robot.host.bridge.latest["command"][0].tolist()
+    target = {"x.vel": 0.2, "theta.vel": 0.0} if kind == "turtlebot3" else dict(zip(names, command, strict=True))
+    state: Any = link.states.latest()
+    while np.abs(state["velocity"]).max() < (3.0 if kind == "turtlebot3" else 0.5):
+        if kind == "ur5":
+            target["shoulder_pan.pos"] += 0.04
+        robot.send_action(target)
+        time.sleep(0.04)
+        state = link.states.latest()
 
 
 @pytest.mark.thorough(but=1)
