@@ -20,7 +20,7 @@ import numpy as np
 
 from bhd_lerobot.errors import BhdError, DatasetError, as_text
 from bhd_lerobot.ros2.live.channel import PROBLEM_BYTES, Channel, Word
-from bhd_lerobot.ros2.live.clock_offset import ClockOffsets
+from bhd_lerobot.ros2.live.clock_offset import ClockOffset
 from bhd_lerobot.ros2.live.graph import Endpoint
 from bhd_lerobot.ros2.live.node import Node, Publisher, Received
 from bhd_lerobot.ros2.live.spec import NodeSpec
@@ -112,8 +112,7 @@ class Receiver:
         self._columns = spec.columns
         self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
-        self._clocks = ClockOffsets(len(self._inputs), are_one=spec.has_one_clock)
-        self._camera_clocks = ClockOffsets(len(self._cameras))
+        self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
         self._stamps = [0] * len(self._inputs)  # newest of each [ns]
         self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
@@ -171,7 +170,7 @@ class Receiver:
         self._heard[index][received.sender] = received.arrived_ns
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
-        record["measured_ns"][index] = self._clocks.measured_ns(index, stamp, received.arrived_ns)
+        record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
         record["values"][self._columns[index]] = values
         return True
 
@@ -189,8 +188,8 @@ class Receiver:
             return
         self._wrong.pop(camera.topic, None)
         record = np.zeros((), self._channel.image_dtypes[index])
-        stamp = _header_stamp(received.data)
-        record["measured_ns"] = self._camera_clocks.measured_ns(index, stamp, received.arrived_ns)
+        clock = self._clocks[len(self._inputs) + index]
+        record["measured_ns"] = clock.measured_ns(_header_stamp(received.data), received.arrived_ns)
         record["pixels"] = image
         ring.publish(record)
         self._images_ns[index] = received.arrived_ns

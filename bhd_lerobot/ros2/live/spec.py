@@ -112,7 +112,6 @@ class NodeSpec:
             [Hz].
         timeout_s: without a command for so long the stop is sent instead [s].
         is_alone: whether another publisher on a topic that is sent is a problem.
-        has_one_clock: whether one machine stamps all inputs; cameras may be of another.
     """
 
     name: str
@@ -123,7 +122,6 @@ class NodeSpec:
     command_hz: float = 50.0
     timeout_s: float = 0.2
     is_alone: bool = True
-    has_one_clock: bool = False
 
     @property
     def columns(self) -> tuple[slice, ...]:

@@ -35,7 +35,6 @@ class Ros2Plant(Plant):
             tuple(replace(one, topic=network.in_namespace(one.topic)) for one in outputs),
             command_hz=network.command_hz or self.command_hz,
             timeout_s=network.timeout_s,
-            has_one_clock=True,
         )
         self.link = NodeLink(spec)
         self._parts = spec.columns
