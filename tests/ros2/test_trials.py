@@ -298,7 +298,8 @@ def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cau
     with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
         robot.wait_event("ready")
         given = (*move, "--brain.scale=0.02", "--dataset.num_episodes=9")
-        with Recording("ur5", *given, domain=domain, folder=tmp_path) as recording:
+        silence_s = 0.4 if what == "silence" else 5
+        with Recording("ur5", *given, domain=domain, folder=tmp_path, silence_s=silence_s) as recording:
             recording.wait_for_episode(2)
             until(lambda: np.ptp([line["position"] for line in log_of(log, "state")], axis=0).max() > 0.01, "it moves")
             if options:
