@@ -19,6 +19,7 @@ from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.host import LeRobotHost
 from tests.robots.external.mock_devices import MockArm, MockArmConfig
 from tests.robots.external.mock_devices.devices import MockCameraConfig
+from tests.waiting import until
 
 FPS = 50
 ONLY = np.zeros(1, np.intp)
@@ -43,6 +44,12 @@ def action(value: float) -> np.ndarray:
 def start(host: LeRobotHost) -> None:
     host.reset(ONLY, [None], [0])
     host.observe()
+
+
+def frames_pass(host: LeRobotHost, frames: int) -> None:
+    """Wait until the robot has been observed in so many further frames."""
+    before = host.robot.observed
+    until(lambda: host.robot.observed >= before + frames, "frames pass")
 
 
 def test_actions_reach_the_robot_and_frames_lie_on_an_absolute_grid(tmp_path: Path) -> None:
@@ -88,7 +95,7 @@ def test_a_late_brain_misses_frames_and_does_not_hold_up_the_robot(tmp_path: Pat
         host.observe()
         host.step(action(1.0))
         host.observe()
-        time.sleep(5.5 / FPS)
+        frames_pass(host, 5)
         report = host.step(action(2.0))
         host.stop(ONLY)
     assert len(report.missed) >= 4
@@ -105,17 +112,17 @@ def test_a_chunk_does_not_make_the_robot_hurry(tmp_path: Path) -> None:
     with closing(make(tmp_path)) as host:
         start(host)
         host.observe()
-        host.step(Chunk(rows))
-        for command in (None, None):
+        reports = [host.step(Chunk(rows))]
+        for missed in (0, 0, 3):
             host.observe()
-            host.step(command)
-        host.observe()
-        time.sleep(3.2 / FPS)
-        host.step(None)
+            frames_pass(host, missed)
+            reports.append(host.step(None))
         host.stop(ONLY)
     values = [row[0] for row in sent(tmp_path)]
-    assert values[:3] == [1.0, 2.0, 3.0]
-    assert values[3] >= 6.0
+    assert values == [float(one.requested[0, 0]) for one in reports]
+    late = [min(1.0 + one.number - reports[0].number, 8.0) - value for one, value in zip(reports, values, strict=True)]
+    assert set(late) <= {0.0, 1.0}, "a frame may begin while the action is chosen"
+    assert values[3] >= values[2] + 3
 
 
 def test_goals_are_refused(tmp_path: Path) -> None:
@@ -343,12 +350,13 @@ def test_an_action_that_waits_behind_a_blocked_call_is_not_sent_after_the_fault(
         start(host)
         host.observe()
         host.step(action(1.0))
-        time.sleep(0.1)  # the hold of the late brain blocks for 2 s
+        until(lambda: host.robot.is_blocked, "the hold of the late brain blocks")
         host.observe()
         report = host.step(action(50.0))
         host.stop(ONLY)
         assert report.mode[0] == Mode.FAULT
-        time.sleep(2.2)
+        until(lambda: not host.robot.is_blocked, "the call returns")
+        time.sleep(0.3)
     assert {row[0] for row in sent(tmp_path)} == {1.0}
 
 
@@ -359,7 +367,7 @@ def test_after_a_hold_a_base_speeds_up_from_rest(tmp_path: Path) -> None:
         for _ in range(5):
             host.observe()
             host.step(np.array([[0.5, 0.0]]))
-        time.sleep(0.2)
+        until(lambda: robot.rows[-1][0] == 0.0, "it is held")
         host.observe()
         host.step(np.array([[0.5, 0.0]]))
         host.stop(ONLY)
@@ -417,7 +425,7 @@ def test_a_robot_may_use_the_array_of_an_image_again(tmp_path: Path) -> None:
     with closing(LeRobotHost(robot, FPS, GateConfig())) as host:
         start(host)
         host.observe()
-        time.sleep(4.5 / FPS)
+        frames_pass(host, 4)
         report = host.step(action(1.0))
         for one in report.missed:
             one.truth()
