@@ -181,7 +181,7 @@ class LockstepBridge(Bridge):
 
     def cancel(self, task_id: str, sim: int = 0) -> ResultCode:
         """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
-        return self.cerebellum.cancel(sim, task_id)
+        return self.cerebellum.controller.cancel(sim, task_id)
 
     def take_results(self, sim: int = 0) -> list[CommandResult]:
         """Return the results of one simulation's goals that were not taken yet, in the order in which they came."""

@@ -58,7 +58,6 @@ class Cerebellum:
         readings: checks that what the plant reads can be a measurement of the present.
         requested: the setpoint that was last taken, before all limits, shape (n, width).
         setpoints_taken: how many have been taken.
-
     """
 
     def __init__(
@@ -86,8 +85,7 @@ class Cerebellum:
         self.reading = PlantReading(n, self.controller.joints, sensors)
         self.requested = np.zeros((n, width))
         self.setpoints_taken = 0
-        self.ticks = self._now_ns = 0
-
+        self._now_ns = 0
         self.stamp_origin_ns = 0
         self.readings = ReadingCheck(body, n, control_hz)
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
@@ -103,7 +101,6 @@ class Cerebellum:
         self._deadline: int | None = None  # when the first command of a moving robot becomes too old [ns]
         self._stopping = False
         self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
-        self.estop_latched = np.zeros(n, np.bool_)
         self._by_goal = np.zeros(n, np.bool_)  # moves because of a goal, not because of setpoints
         self._watchdog = np.zeros(n, np.int64)
 
@@ -131,17 +128,13 @@ class Cerebellum:
             self.plant.set_mode(self.mode)
         if self._may_write:
             self.plant.write(self.guard.written)
-        self.ticks += 1
 
     def _supervise(self, now_ns: int) -> None:
         """Emergency stop, plant faults and watchdogs: changes of mode that were not requested."""
         # This runs several times a tick: counting is several times cheaper than `any`.
         pressed = self.estop.see()
         if np.count_nonzero(pressed):
-            hit = pressed & (self.mode != Mode.ESTOP)
-            if hit.any():
-                self._set_mode(hit, Mode.ESTOP)
-                self.estop_latched |= hit
+            self._set_mode(pressed & (self.mode != Mode.ESTOP), Mode.ESTOP)
         self._now_ns = now_ns
         self._judge_reading()
         if self.reading.stamp_ns is not None:
@@ -173,10 +166,7 @@ class Cerebellum:
             bad |= wrong
         # What is no measurement must not spread: it is treated as a joint at rest where the encoder last was.
         reading.velocity[bad] = reading.effort[bad] = 0.0
-        pressed = (reading.safety == SafetyStatus.EMERGENCY_STOP) & (self.mode != Mode.ESTOP)
-        if np.count_nonzero(pressed):
-            self._set_mode(pressed, Mode.ESTOP)
-            self.estop_latched |= pressed
+        self._set_mode((reading.safety == SafetyStatus.EMERGENCY_STOP) & (self.mode != Mode.ESTOP), Mode.ESTOP)
         faulty = bad | (reading.safety != SafetyStatus.NORMAL)
         faulty &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
         self._watchdog[faulty] |= Watchdog.PLANT
@@ -323,10 +313,6 @@ class Cerebellum:
             self._update_deadline()
         return refusal
 
-    def cancel(self, sim: int, task_id: str) -> ResultCode:
-        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
-        return self.controller.cancel(sim, task_id)
-
     def offer(self, setpoint: Setpoint, mask: NDArray[np.bool_] | None = None) -> SendResult:
         """Check a setpoint and put it into the queue.
 
@@ -399,7 +385,6 @@ class Cerebellum:
         if request == Request.RESET:
             # A press after another latch has not been seen yet: the next tick will.
             self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP))
-            self.estop_latched &= ~allowed
             if np.count_nonzero(allowed):
                 self._recover(allowed)
         self._set_mode(allowed, result)
@@ -447,7 +432,6 @@ class Cerebellum:
         self._sent_due[ids] = np.iinfo(np.int64).min
         self._last_due[ids] = 0
         self._deactivating[ids] = False
-        self.estop_latched[ids] = False
         self._by_goal[ids] = False
         self.refusals[:, ids] = 0
         self._watchdog[ids] = 0
@@ -493,28 +477,7 @@ class Cerebellum:
             measured=self.controller.measured(self.reading),
             mode=self.mode.copy(),
             is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
-            emergency_stop=self.estop_latched.copy(),
-        )
-
-    @staticmethod
-    def state_dtype(n: int, joints: int, width: int, odometry: int, wrench: int) -> np.dtype:
-        """Return the dtype of published states: the fields of `CerebellumState`."""
-        per_joint, per_command = (np.float64, (n, joints)), (np.float64, (n, width))
-        return np.dtype(
-            [
-                ("stamp_ns", np.int64),
-                ("joint_positions", *per_joint),
-                ("joint_velocities", *per_joint),
-                ("joint_efforts", *per_joint),
-                ("contact_wrench", np.float64, (n, wrench)),
-                ("command", *per_command),
-                ("measured", *per_command),
-                ("odometry", np.float64, (n, odometry)),
-                ("mode", np.int8, (n,)),
-                ("is_moving", np.bool_, (n,)),
-                ("emergency_stop", np.bool_, (n,)),
-            ],
-            align=True,
+            emergency_stop=self.mode == Mode.ESTOP,
         )
 
     # --- modes -------------------------------------------------------------------------------------------------------

@@ -41,14 +41,12 @@ class Kernel[**P, R]:
         return self.function(*args, **kwargs)
 
     @cached_property
-    def compiled(self) -> Callable[P, R]:
+    def compiled(self) -> Callable[..., R]:
         """The machine code, compiled at the first access, or loaded from the user's cache; it takes no other types."""
         import numba
 
         config: Any = numba.config
-        if config.DISABLE_JIT:
-            return self.function
-        if not self.signature:
+        if config.DISABLE_JIT or not self.signature:
             return numba.njit(error_model="numpy")(self.function)
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
@@ -61,70 +59,52 @@ class Kernel[**P, R]:
         finally:
             config.CACHE_DIR = before
 
-    def bind(self, *arguments: Any) -> "BoundKernel[R]":
-        """Return this kernel with its first arguments, to be called with the others."""
-        return BoundKernel(self, arguments)
+    def bind(self, *bound: Any) -> Callable[..., R]:
+        """Return it with its first arguments: Python at first, machine code after `_passes` passes."""
+        self._check(0, bound)
+        if not _passes or "compiled" in vars(self):  # by another one
+            return partial(self.compiled, *bound)
+        left, is_checked = _passes, False
+        python: Callable[..., R] = self.function
+        machine: Callable[..., R] | None = None
+
+        def call(*arguments: Any) -> R:
+            nonlocal left, is_checked, machine
+            if machine is not None:
+                return machine(*arguments)
+            left -= len(bound[0] if bound else arguments[0])
+            if left < 0:
+                machine = partial(self.compiled, *bound)
+                return machine(*arguments)
+            if not is_checked:
+                self._check(len(bound), arguments)
+                is_checked = True
+            return python(*bound, *arguments)
+
+        return call
 
     @cached_property
     def arrays(self) -> list[tuple[np.dtype[Any], int, bool] | None]:
         """Type, dimensions and whether it must be C-contiguous of each argument; None for a number."""
         kinds = re.findall(r"(\w+)(\[[^\]]*\])?", self.signature.partition("(")[2])
-        return [
-            (np.dtype(name.replace("b1", "?")), shape.count(":") - shape.count("::"), "::1" in shape) if shape else None
-            for name, shape in kinds
-        ]
+        return [(np.dtype(name), shape.count(",") + 1, "::1" in shape) if shape else None for name, shape in kinds]
+
+    def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
+        """Refuse what the machine code would refuse."""
+        for at, argument in enumerate(arguments, first):
+            kind = self.arrays[at]
+            if kind and not (
+                argument.dtype == kind[0] and argument.ndim == kind[1] and (argument.flags.c_contiguous or not kind[2])
+            ):
+                raise TypeError(
+                    f"Argument {at} of {self.function.__name__} is an array of {argument.dtype} of shape "
+                    f"{argument.shape}; its types are {self.signature}."
+                )
 
     @property
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
-
-
-class BoundKernel[R]:
-    """A kernel with its first arguments: Python at first, machine code after `_passes` passes.
-
-    Args:
-        kernel: the kernel.
-        bound: its first arguments.
-    """
-
-    __slots__ = ("_bound", "_call", "_is_checked", "_kernel", "_left")
-
-    def __init__(self, kernel: Kernel[..., R], bound: tuple[Any, ...]) -> None:
-        self._kernel, self._bound = kernel, bound
-        self._call: Callable[..., R] | None = None
-        self._left, self._is_checked = _passes, False
-        self._check(0, bound)
-        if not _passes or "compiled" in vars(kernel):  # by another one
-            self._compile()
-
-    def __call__(self, *arguments: Any) -> R:
-        """Call it with the other arguments."""
-        if self._call is not None:
-            return self._call(*arguments)
-        self._left -= len(self._bound[0] if self._bound else arguments[0])
-        if self._left < 0:
-            return self._compile()(*arguments)
-        if not self._is_checked:
-            self._check(len(self._bound), arguments)
-            self._is_checked = True
-        return self._kernel.function(*self._bound, *arguments)
-
-    def _compile(self) -> Callable[..., R]:
-        self._call = partial(self._kernel.compiled, *self._bound)
-        return self._call
-
-    def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
-        """Refuse what the machine code would refuse."""
-        for at, argument in enumerate(arguments, first):
-            kind = self._kernel.arrays[at]
-            if kind and not (
-                argument.dtype == kind[0] and argument.ndim == kind[1] and (argument.flags.c_contiguous or not kind[2])
-            ):
-                raise TypeError(
-                    f"Argument {at} of {self._kernel.function.__name__} is an array of {argument.dtype} of shape "
-                    f"{argument.shape}; its types are {self._kernel.signature}."
-                )
 
 
 def compile_at_once() -> None:

@@ -71,8 +71,7 @@ class PlantShape:
     def state_dtype(self) -> np.dtype:
         """Return the dtype of states. Times are monotonic [ns].
 
-        - ``index``, ``due_ns``, ``start_ns``: the tick on the plant's grid; ``executed``, ``skipped``, ``overruns``: of
-          them so far.
+        - ``index``, ``due_ns``, ``start_ns``: the tick on the plant's grid.
         - ``phase``: a `PlantPhase`; ``stops``: how often the plant has stopped by itself; ``stopped_ns``: the tick at
           which it last did.
         - ``command``, ``command_ns``: number and stamp of the newest command; ``actuators``: what the actuators got in
@@ -83,19 +82,8 @@ class PlantShape:
           ``effort``: of the joints; ``qpos``, ``qvel``: of the physics.
         - ``sensors``: the newest further values; ``sensors_ns``: when the oldest of them was measured.
         """
-        names: tuple[str, ...] = (
-            "index",
-            "due_ns",
-            "start_ns",
-            "executed",
-            "skipped",
-            "overruns",
-            "phase",
-            "stops",
-            "stopped_ns",
-        )
-        names += ("command", "command_ns", "stamp_ns", "tick", "oldest", "sensors_ns")
-        numbers = [(name, np.int64) for name in names]
+        names = "index due_ns start_ns phase stops stopped_ns command command_ns stamp_ns tick oldest sensors_ns"
+        numbers = [(name, np.int64) for name in names.split()]
         sizes = dict.fromkeys(("actuators", "position", "velocity", "effort"), self.joints)
         sizes |= {"observation": self.features, "qpos": self.positions, "qvel": self.velocities}
         sizes["sensors"] = self.sensors

@@ -67,7 +67,6 @@ def request_dtype(dof: int) -> np.dtype:
 EVENT_DTYPE = np.dtype(
     [
         ("number", np.int64),
-        ("tick", np.int64),
         ("kind", np.int8),
         ("code", np.int8),
         ("refused", np.bool_),
@@ -124,7 +123,7 @@ class RequestServer:
             self.invalid += 1
             return
         event = np.zeros(1, EVENT_DTYPE)[0]
-        event["number"], event["tick"], event["kind"] = request["number"], cerebellum.ticks, EventKind.REPLY
+        event["number"], event["kind"] = request["number"], EventKind.REPLY
         if kind == RequestKind.MODE:
             event["code"] = cerebellum.request(mode).reasons[0]
         elif kind == RequestKind.GOAL:
@@ -132,13 +131,13 @@ class RequestServer:
             if refusal is not None:
                 event["refused"], event["code"], event["result"] = True, refusal.code, encode_result(refusal)
         else:
-            event["code"] = cerebellum.cancel(0, name)
+            event["code"] = cerebellum.controller.cancel(0, name)
         self._events.post(event)
 
     def _post(self) -> None:
         while self._unposted and not self._events.full:
             event = np.zeros(1, EVENT_DTYPE)[0]
-            event["tick"], event["kind"] = self._cerebellum.ticks, EventKind.RESULT
+            event["kind"] = EventKind.RESULT
             event["result"] = encode_result(self._unposted.popleft())
             self._events.post(event)
 

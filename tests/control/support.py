@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import WheelDrive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.base.diff_drive import DiffDrive
+from bhd_lerobot.control.base.diff_drive import wheels_from_twist
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
@@ -20,12 +21,18 @@ TICK_NS = NANOSECONDS // HZ
 BODY = turtlebot3_burger()
 
 
+def wheel_speeds(twist: NDArray[np.float64], drive: WheelDrive = BODY.drive) -> NDArray[np.float64]:
+    """Return the wheel speeds of twists, shape (n, 2) [rad/s]."""
+    wheels = np.empty_like(twist)
+    wheels_from_twist(twist, 1.0 / drive.wheel_radius, drive.wheel_separation / 2 / drive.wheel_radius, wheels)
+    return wheels
+
+
 class PerfectPlant(Plant):
     """Wheels that turn as commanded, and that a test can break."""
 
     def __init__(self, n: int = 1, takes: str = "actuators") -> None:
         self.n, self.takes = n, takes
-        self._drive = DiffDrive(BODY.drive, n)
         self.position = np.zeros((n, 2))
         self.velocity = np.zeros((n, 2))
         self.fault = np.zeros(n, np.bool_)
@@ -43,7 +50,7 @@ class PerfectPlant(Plant):
         assert np.isfinite(ctrl).all()
         self.written[:] = ctrl
         if self.takes == "twist":
-            self._drive.wheels_from_twist(ctrl, self.velocity)
+            self.velocity[:] = wheel_speeds(ctrl)
         else:
             self.velocity[:] = ctrl
         self.position += self.velocity / HZ

@@ -21,7 +21,6 @@ from tests.control.support import BODY, PerfectPlant
 HZ, FPS = 200, 10
 TICK = 1_000_000_000 // HZ
 F = HZ // FPS
-STATE = Cerebellum.state_dtype(1, 2, 2, 3, 0)
 
 
 class Rig:
@@ -33,15 +32,15 @@ class Rig:
             "requests": Mailbox.nbytes(request_dtype(0)),
             "events": Mailbox.nbytes(EVENT_DTYPE),
         }
-        extended = np.dtype([*[(name, STATE[name].base, STATE[name].shape) for name in STATE.names or ()],
-                             ("tick", np.int64), ("due_ns", np.int64)])  # fmt: skip
+        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ))
+        own = {name: np.asarray(value) for name, value in vars(self.cerebellum.state(0)).items()}
+        numbers = [("tick", np.int64), ("due_ns", np.int64)]
+        extended = np.dtype([*((name, value.dtype, value.shape) for name, value in own.items()), *numbers])
         layout = LiveLayout(2, extended, 16, 64, sizes)
         self.block = layout.create(f"test-bridge-{os.getpid()}", {})
         other = LiveBlock.attach(self.block.name)
         self.other = other
-        self.cerebellum = Cerebellum(
-            BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ), fifo=other.fifo, estop=other.estop
-        )
+        self.cerebellum.fifo, self.cerebellum.estop = other.fifo, other.estop
         requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
                             Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
         self.server = RequestServer(self.cerebellum, requests, events)
@@ -67,8 +66,8 @@ class Rig:
             self.server.serve(self.now)
             self.cerebellum.tick(elapsed)
             state = self.cerebellum.state(elapsed)
-            for name in STATE.names or ():
-                self.record[name] = getattr(state, name)
+            for name, value in vars(state).items():
+                self.record[name] = value
             self.record["tick"], self.record["due_ns"] = self.ticks, self.start + elapsed
             self.other.ring.publish(self.record)
             self.ticks += 1

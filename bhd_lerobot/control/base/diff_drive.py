@@ -11,7 +11,12 @@ Array = NDArray[np.float64]
 
 @kernel()
 def wheels_from_twist(twist: Array, per_speed: float, per_yaw: float, out: Array) -> None:
-    """Write the wheel speeds of a twist, see `DiffDrive.wheels_from_twist`."""
+    """Write the wheel speeds of twists [rad/s], shape (n, 2).
+
+    Args:
+        per_speed: a wheel's speed for each forward speed [rad/m].
+        per_yaw: and for each yaw rate [rad/rad].
+    """
     for sim in range(len(twist)):
         straight, turn = twist[sim, 0] * per_speed, twist[sim, 1] * per_yaw
         out[sim, 0], out[sim, 1] = straight - turn, straight + turn
@@ -41,24 +46,12 @@ class DiffDrive:
 
     def __init__(self, drive: WheelDrive, n: int) -> None:
         self.drive = drive
-        self._per_speed = 1.0 / drive.wheel_radius  # [rad/m]
-        self._per_yaw = drive.wheel_separation / 2 / drive.wheel_radius  # [rad/rad]
         self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
         self.odometry: Array = np.zeros((n, 3))
         metres = drive.wheel_radius / self._count  # [m] that a wheel rolls in one encoder count
         self._per_count = self._count, metres / 2, metres / drive.wheel_separation
         self._encoder: Array = np.zeros((n, 2))
         self._integrate = integrate.bind()
-
-    def wheels_from_twist(self, twist: Array, out: Array) -> Array:
-        """Write the wheel speeds of a twist.
-
-        Args:
-            twist: shape (n, 2).
-            out: wheel speeds [rad/s], shape (n, 2).
-        """
-        wheels_from_twist(twist, self._per_speed, self._per_yaw, out)
-        return out
 
     def twist_from_wheels(self, wheels: Array) -> Array:
         """Return the twist of bases whose wheels turn at these speeds [rad/s] without slip, shape (n, 2)."""

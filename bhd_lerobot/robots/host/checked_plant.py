@@ -176,10 +176,7 @@ class CheckedPlant(Plant):
         """Write the newest readings into `out`."""
         out.stamp_ns = self._stamp_ns
         out.safety[:] = SafetyStatus.NORMAL  # if the plant does not say otherwise
-        try:
-            self._plant.read(out)
-        except Exception as error:  # of another package's code: the loop continues, and stops the robot
-            self._fail(error)
+        self._try(self._plant.read, out)
         if out.stamp_ns is not self._stamp_ns:
             self._stamp_ns[:] = 0 if out.stamp_ns is None else out.stamp_ns
             out.stamp_ns = self._stamp_ns
@@ -217,8 +214,5 @@ class CheckedPlant(Plant):
         try:
             return call(*arguments)
         except Exception as error:  # of another package's code: the loop continues, and stops the robot
-            self._fail(error)
+            self.problem = self.problem or as_text(error)
             return None
-
-    def _fail(self, error: Exception) -> None:
-        self.problem = self.problem or as_text(error)

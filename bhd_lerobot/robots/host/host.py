@@ -39,15 +39,9 @@ class Host(ABC):
 
     Attributes:
         robot_kind: what tasks and brains are for: ``"base"`` or ``"arm"``.
-        config: the robot's configuration.
         n: how many robots.
         rates: the rates.
         body: the robot's hardware.
-        cerebellum: what controls the robots.
-        bridge: how commands get there.
-        action_names: names of the action's floats, in order.
-        observation_names: names of the observation's floats, in order.
-        camera_names: the cameras that are observed.
         running: which robots are in an episode, shape (n,).
         tick: control ticks that have gone by.
         world: the simulated world, which can be placed, stored and rendered; None of a real robot.
@@ -103,15 +97,7 @@ class Host(ABC):
 
     @abstractmethod
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the robot was in recorded states: the pose of its base, or of its tool.
-
-        Args:
-            states: recorded `physics_state`, shape (frames, nq + nv); of a robot without a world, its observations,
-                shape (frames, features).
-
-        Returns:
-            x, y, z [m] and a quaternion w, x, y, z, shape (frames, 7).
-        """
+        """Return where the robot was in recorded states, shape (frames, 7); see `Robots.track`."""
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:
@@ -184,17 +170,12 @@ class Host(ABC):
         return Frame(state, now, now - measured, physics)
 
     def step(self, command: Command) -> FrameReport:
-        """Send a command to the running robots and let one frame go by.
-
-        Args:
-            command: what they are to do; None continues with the last chunk or goal.
-        """
+        """Send a command to the running robots and let one frame go by."""
         return self._frame(self.send(command), command)
 
     def act(self, command: Command) -> Acted:
         """Do what LeRobot's `send_action` does: here, let a frame go by."""
-        report = self.step(command)
-        return Acted(report.sent, report.refusals, report.mode, report.applied, report.results)
+        return self.step(command)
 
     def begin(self) -> None:
         """Let the time of an episode begin, if it does not begin with the first observation."""
@@ -318,13 +299,7 @@ class Host(ABC):
         return
 
     def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
-        """Return what a camera of one robot sees now, as an image to come; the robots may continue meanwhile.
-
-        Args:
-            sim: the robot.
-            camera: the camera.
-            deliver: called with the image, in the order of the calls, on another thread.
-        """
+        """Return what a camera of one robot sees now, as an image to come; see `Robots.render_later`."""
         raise self._no_camera(camera)
 
     def _no_camera(self, camera: str) -> ConfigError:

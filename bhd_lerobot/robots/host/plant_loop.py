@@ -33,7 +33,6 @@ class PlantTick:
 
     slot: Slot
     start_ns: int
-    grid: TickGrid
     actuators: NDArray[np.float64]
 
 
@@ -104,13 +103,13 @@ class PlantLoop:
             if left > 0:
                 sleep(left / NANOSECONDS)
                 now = clock()
-            self.tick(grid.begin(now), now, grid)
+            self.tick(grid.begin(now), now)
             ended = clock()
             grid.end(ended)
             self.words[alive] = ended
         return grid
 
-    def tick(self, slot: Slot, now_ns: int, grid: TickGrid) -> None:
+    def tick(self, slot: Slot, now_ns: int) -> None:
         """Run one tick.
 
         Args:
@@ -132,7 +131,7 @@ class PlantLoop:
                 world.advance()
             self._actuators[:] = actuators
         world.read(reading)
-        world.publish(PlantTick(slot, now_ns, grid, self._actuators), reading, guard)
+        world.publish(PlantTick(slot, now_ns, self._actuators), reading, guard)
 
     def _is_over(self) -> bool:
         words = self.words

@@ -22,7 +22,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import BhdError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
-from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.grid import Slot
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink
 from bhd_lerobot.robots.host.plant_loop import PlantLoop, PlantTick
 from bhd_lerobot.robots.host.plant_stop import make_stop
@@ -75,9 +75,7 @@ class SensedWorld:
                 field["touches"][0, number] += 1
                 flag[0] = False
         field["index"][0], field["due_ns"][0], field["start_ns"][0] = tick.slot.index, tick.slot.due_ns, tick.start_ns
-        field["executed"][0], field["skipped"][0] = tick.grid.executed, tick.grid.skipped
-        field["overruns"][0], field["phase"][0] = tick.grid.overruns, guard.phase
-        field["stops"][0], field["stopped_ns"][0] = guard.stops, guard.stopped_ns
+        field["phase"][0], field["stops"][0], field["stopped_ns"][0] = guard.phase, guard.stops, guard.stopped_ns
         field["command"][0], field["command_ns"][0] = guard.number, guard.stamp_ns
         field["actuators"][0] = tick.actuators
         field["position"][0], field["velocity"][0] = reading.position, reading.velocity
@@ -102,7 +100,8 @@ class PlantProcess:
         link = PlantLink.of(block)
         if link is None:
             raise RealtimeError(f"The block {spec.block!r} has no place for a plant.")
-        self._simulation = simulation = spec.make_simulation()
+        self._simulation: Simulation = spec.make_host()
+        simulation = self._simulation
         self._world = SensedWorld(simulation, link.states, link.shape.state_dtype)
         control_hz = spec.rates.control_hz
         wire = Guard(WireLimits.of(simulation.body, control_hz), 1)
@@ -146,19 +145,18 @@ class PlantProcess:
     def _place(self, scene: Any, seed: int) -> None:
         loop, world = self._loop, self._world
         world.place(scene, seed)
-        grid = TickGrid(0, loop.period_ns)
         if not self._warm:
             # Warm-up ticks: the first executions take longest.
             for index in range(self._warm_up_ticks):
                 world.read(loop.reading)
                 world.write(loop.stop.command(loop.reading))
                 world.advance()
-                world.publish(PlantTick(Slot(index, 0, 0, 0), 0, grid, loop.guard.actuators), loop.reading, loop.guard)
+                world.publish(PlantTick(Slot(index, 0, 0, 0), 0, loop.guard.actuators), loop.reading, loop.guard)
             world.place(scene, seed)
             self._warm = True
         loop.guard.place()
         # What is so before the first tick: the cerebellum starts from it.
-        loop.tick(Slot(-1, time.monotonic_ns(), 0, 0), time.monotonic_ns(), grid)
+        loop.tick(Slot(-1, time.monotonic_ns(), 0, 0), time.monotonic_ns())
         gc.collect()  # the loop runs without a collector
 
     def close(self) -> None:

@@ -1,7 +1,5 @@
 """How a plant that gets no commands any more brings its robot to rest, by itself and with its own sensors only."""
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,20 +11,6 @@ Array = NDArray[np.float64]
 
 _SLOW = 0.2  # [rad/s] a joint slower than this is held where it is
 _HOLD_RATE = 20.0  # [rad/s] of the critically damped spring that holds an arm with torque motors
-
-
-class PlantStop(Protocol):
-    """What the actuators get from a plant that stops by itself."""
-
-    def begin(self, actuators: Array) -> None:
-        """Start a stop.
-
-        Args:
-            actuators: the last commands, shape (1, joints).
-        """
-
-    def command(self, reading: PlantReading) -> Array:
-        """Return the commands of one tick, shape (1, joints); the array is the stop's own."""
 
 
 class WheelStop:
@@ -103,6 +87,10 @@ class TorqueStop:
         np.minimum(np.maximum(torque, -self._effort), self._effort, out=self._actuators[:, :dof])
         self._actuators[:, dof:] = hold[:, dof:]
         return self._actuators
+
+
+PlantStop = WheelStop | ServoStop | TorqueStop
+"""What the actuators get, from the last commands on, shape (1, joints), and for each tick's reading."""
 
 
 def make_stop(body: Body, joints: int) -> PlantStop:

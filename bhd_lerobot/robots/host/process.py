@@ -11,8 +11,8 @@ shared memory only.
 
 import contextlib
 import gc
-import importlib
 import os
+import pkgutil
 import signal
 import sys
 import time
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -40,9 +40,6 @@ from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.state import StatePublisher
-
-if TYPE_CHECKING:  # it imports MuJoCo, which the process of a real robot does without
-    from bhd_lerobot.robots.host.simulation import Simulation
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02
@@ -77,26 +74,14 @@ class LiveSpec:
         """A reading of a plant that is older than this is none of the present [ns]; at least three ticks."""
         return max(3 * NANOSECONDS // self.rates.control_hz, round(self.limits.plant_timeout_s * NANOSECONDS))
 
-    def make_simulation(self, planning: Planning | None = None) -> "Simulation":
-        """Return a simulation of one robot."""
-        kind = _load(self.host)
-        made: Simulation = kind(self._config, 1, 1) if planning is None else kind(self._config, 1, 1, planning)
-        return made
-
     def make_plant(self) -> CheckedPlant:
         """Return the plant; it is not opened yet."""
         return CheckedPlant.made(self.plant, self._config, self.body, self.oldest_ns)
 
-    def make_host(self, plant: CheckedPlant, planning: Planning | None = None) -> Host:
-        """Return the host of a plant; the arguments as for `make_simulation`."""
-        kind = _load(self.host)
-        made: Host = kind(self._config, plant) if planning is None else kind(self._config, plant, planning)
-        return made
-
-
-def _load(name: str) -> Any:
-    module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    def make_host(self, *plant: CheckedPlant, planning: Planning | None = None) -> Any:
+        """Return the host of a plant, or without one a simulation of one robot."""
+        planned = () if planning is None else (planning,)
+        return pkgutil.resolve_name(self.host)(self._config, *(plant or (1, 1)), *planned)
 
 
 class LiveProcess:
@@ -113,15 +98,15 @@ class LiveProcess:
         link, sensed_ns = PlantLink.of(self._block), time.monotonic_ns
         if self._plant is not None:
             self._plant.open()
-            self._host = spec.make_host(self._plant, planning)
+            self._host = spec.make_host(self._plant, planning=planning)
             sensed_ns = self._stamp_ns
         elif link is not None:
             from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
 
-            self._host = remote = RemoteSimulation(spec.make_simulation(planning), link)
+            self._host = remote = RemoteSimulation(spec.make_host(planning=planning), link)
             sensed_ns = remote.sensed_ns
         else:
-            self._host = spec.make_simulation(planning)
+            self._host = spec.make_host(planning=planning)
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)

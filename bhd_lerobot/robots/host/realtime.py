@@ -242,7 +242,8 @@ class LiveHost:
             RealtimeError: a process has ended, or is stopped.
         """
         receipt = self.send(command)
-        return Acted(receipt.sent, receipt.refusals, self.modes, self.to_action(self.bridge.latest["command"]))
+        applied = self.to_action(self.bridge.latest["command"])
+        return Acted(sent=receipt.sent, refusals=receipt.refusals, mode=self.modes, applied=applied)
 
     def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
         """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report."""

@@ -34,36 +34,45 @@ class Frame:
     columns: Mapping[str, NDArray] = field(default_factory=dict)
 
 
-@dataclass
-class FrameReport:
-    """Report of a frame, of n robots.
+@dataclass(kw_only=True)
+class Acted:
+    """What became of a command, of n robots.
 
     Attributes:
-        applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
+        sent: the outcome of the setpoints.
+        refusals: as text why they were refused, by simulation, where a `Reason` does not say it all.
+        mode: `Mode` now, shape (n,).
+        applied: the command that is applied now, in the space of the actions, shape (n, actions).
+        results: how goals ended meanwhile, or were refused, by simulation.
+    """
+
+    sent: SendResult
+    refusals: Mapping[int, str] = field(default_factory=dict)
+    mode: NDArray[np.int8]
+    applied: NDArray[np.float64]
+    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True)
+class FrameReport(Acted):
+    """Report of a frame, at its end, of n robots.
+
+    Attributes:
         requested: the action that the brain had requested by then, shape (n, actions); of a goal, the command.
-        sent: the outcome of the setpoints that the frame began with.
         limits: `Limit` flags, shape (n,).
         watchdog: `Watchdog` flags, shape (n,).
-        mode: `Mode` at the end of the frame, shape (n,).
         truth: returns what a task judges by, as it was at the end of the frame.
         columns: further columns of the dataset, by key, each of shape (n,) or (n, k); see `Robots.columns`.
-        results: how goals ended, or were refused, during the frame, by simulation.
-        refusals: as text why setpoints were refused, by simulation, where a `Reason` does not say it all.
         number: of the frame in its episode, on the wall clock: frames may be lost.
         seen: the observation at its start, of a frame on the wall clock.
         missed: the frames before this one that went by on the wall clock during inference.
     """
 
-    applied: NDArray[np.float64]
     requested: NDArray[np.float64]
-    sent: SendResult
     limits: NDArray[np.int64]
     watchdog: NDArray[np.int64]
-    mode: NDArray[np.int8]
     truth: Callable[[], Any]
     columns: dict[str, NDArray] = field(default_factory=dict)
-    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
-    refusals: Mapping[int, str] = field(default_factory=dict)
     number: int = 0
     seen: Frame | None = None
     missed: list["FrameReport"] = field(default_factory=list)
@@ -90,25 +99,6 @@ class Receipt:
     def all_results(self, sim: int, ended: list[CommandResult]) -> list[CommandResult]:
         """Return the goals of a robot that ended, with its refused ones: a refusal is a result, too, but only once."""
         return [result for result in self.results.get(sim, ()) if result not in ended] + ended
-
-
-@dataclass(frozen=True)
-class Acted:
-    """What `act` did with a command.
-
-    Attributes:
-        sent: the outcome of the setpoints.
-        refusals: as text why they were refused, by simulation, where a `Reason` does not say it all.
-        mode: `Mode` now, shape (n,).
-        applied: the command that is applied now, in the space of the actions, shape (n, actions).
-        results: how goals ended meanwhile, by simulation.
-    """
-
-    sent: SendResult
-    refusals: Mapping[int, str]
-    mode: NDArray[np.int8]
-    applied: NDArray[np.float64]
-    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
 
 
 class Clock(Protocol):

@@ -33,7 +33,6 @@ class Simulation(Host):
         options: those of `Host`.
 
     Attributes:
-        world: the physics.
         host_class: the class of its host without a world, for a plant of its own.
         view: the camera outside of the robot, for videos.
         video_speed: how much faster than the robot was a video of it is shown.
@@ -78,16 +77,7 @@ class Simulation(Host):
     # --- episodes ----------------------------------------------------------------------------------------------------
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
-        """Start episodes: put the robots into their scenes, at rest at the start, and take first readings.
-
-        Args:
-            ids: the simulations.
-            scenes: where each of them is.
-            seeds: a seed for each of them; their sensors' noise follows from it.
-
-        Returns:
-            The complete states of the world, shape (len(ids), k).
-        """
+        """Start episodes, see `Host.reset`; the noise of the sensors follows from the seeds."""
         for sim, seed in zip(ids, seeds, strict=True):
             self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
         super().reset(ids, scenes, seeds)
@@ -112,22 +102,12 @@ class Simulation(Host):
         return self._camera.render(sim, camera)
 
     def start_rendering(self) -> None:
-        """Get ready for `render_later`.
-
-        Raises:
-            RenderingError: no image can be rendered here.
-        """
+        """Get ready for `render_later`."""
         if self._render_thread is None:
             self._render_thread = RenderThread(self.world, self.config.camera_width, self.config.camera_height)
 
     def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
-        """Return what a camera of one robot sees now, as an image to come; the simulation may continue meanwhile.
-
-        Args:
-            sim: the robot.
-            camera: the camera.
-            deliver: called with the image, in the order of the calls, on another thread.
-        """
+        """Return what a camera of one robot sees now, as an image to come; see `Robots.render_later`."""
         self.start_rendering()
         if self._render_thread is None:
             raise AssertionError("Rendering was just started.")

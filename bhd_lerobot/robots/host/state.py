@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.cerebellum import MOVING, Cerebellum
+from bhd_lerobot.control.cerebellum import MOVING
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.control.messages import Limit, Reason, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, encode_feedback
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.robots.host.host import Host
@@ -43,14 +43,12 @@ def state_dtype(host: Host) -> np.dtype:
     - ``physics``: the simulator's generalised positions and velocities; of no width without one.
     """
     cerebellum = host.cerebellum
-    controller = cerebellum.controller
-    widths = controller.odometry().shape[1], controller.contact_wrench.shape[1]
-    own = Cerebellum.state_dtype(1, controller.joints, cerebellum.width, *widths)
+    own = vars(cerebellum.state(0))
     physics = sum(part.shape[1] for part in host.physics)
     return np.dtype(
         [
             *((name, np.int64) for name in _NUMBERS),
-            *((name, own[name].base, own[name].shape) for name in own.names or () if name != "stamp_ns"),
+            *((name, value.dtype, value.shape) for name, value in own.items() if name != "stamp_ns"),
             ("requested", np.float64, (1, cerebellum.width)),
             ("limits", np.int64, (len(LIMITS),)),
             ("watchdogs", np.int64, (len(WATCHDOGS),)),
@@ -113,7 +111,7 @@ class StatePublisher:
         field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
         np.abs(reading.velocity, out=self._speed)
         field["is_moving"][:] = np.count_nonzero(self._speed > MOVING) > 0
-        field["emergency_stop"][:] = cerebellum.estop_latched
+        field["emergency_stop"][:] = cerebellum.mode == Mode.ESTOP
         field["refusals"][:] = cerebellum.refusals[:, 0]
         field["observation"][:], oldest = host.sense()
         self._numbers[:] = (

@@ -296,7 +296,7 @@ def act(rig: Rig, kind: str, value: float) -> None:
             rig.send(off(j0=value, j2=value / 5))
             rig.tick(FRAME)
     elif kind == "cancel":
-        rig.cerebellum.cancel(0, str(rig.names))
+        rig.cerebellum.controller.cancel(0, str(rig.names))
     elif kind == "estop":
         rig.cerebellum.estop.press()
     elif kind == "nan":

@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.diff_drive import DiffDrive
+from tests.control.support import wheel_speeds
 
 DRIVE = turtlebot3_burger().drive
 RADIUS, SEPARATION = 0.033, 0.160
@@ -30,14 +31,11 @@ def follow(speed: float, yaw_rate: float, seconds: float, start: tuple[float, fl
 
 @given(twist=arrays(np.float64, (4, 2), elements=st.floats(-3, 3)))
 def test_twist_to_wheels_and_back(twist: np.ndarray) -> None:
-    drive = DiffDrive(DRIVE, 4)
-    wheels = np.empty((4, 2))
-    assert drive.wheels_from_twist(twist, wheels) is wheels
-    np.testing.assert_allclose(drive.twist_from_wheels(wheels), twist, atol=1e-12)
+    np.testing.assert_allclose(DiffDrive(DRIVE, 4).twist_from_wheels(wheel_speeds(twist)), twist, atol=1e-12)
 
 
 def test_wheels_by_hand() -> None:
-    wheels = DiffDrive(DRIVE, 3).wheels_from_twist(np.array([(0.033, 0.0), (0.0, 1.0), (0.08, 1.0)]), np.empty((3, 2)))
+    wheels = wheel_speeds(np.array([(0.033, 0.0), (0.0, 1.0), (0.08, 1.0)]))
     turn = 0.08 / 0.033
     np.testing.assert_allclose(wheels, [(1, 1), (-turn, turn), (0, 2 * turn)], atol=1e-12)
 

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
-from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -22,6 +21,7 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
+from tests.control.support import wheel_speeds
 
 START = np.array([3.0, -1.4, 1.5, -1.6, -1.5, 0.2, 0.04])
 FIRST = np.zeros(1, np.intp)
@@ -345,15 +345,14 @@ class Twisted(Perfect):
     """A base whose own controller turns twists into wheel speeds."""
 
     takes = "twist"
-    drive = DiffDrive(TurtleBot3Config().body().drive, 1)
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         self.written.append(ctrl[0].copy())
-        self.position = self.position + self.drive.wheels_from_twist(ctrl, np.zeros((1, 2)))[0] / 200
+        self.position = self.position + wheel_speeds(ctrl)[0] / 200
 
     def read(self, out: PlantReading) -> None:
         super().read(out)
-        out.velocity[:] = self.drive.wheels_from_twist(np.array(self.written[-1:] or [[0.0, 0.0]]), np.zeros((1, 2)))
+        out.velocity[:] = wheel_speeds(np.array(self.written[-1:] or [[0.0, 0.0]]))
 
 
 def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> None:

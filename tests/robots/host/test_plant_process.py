@@ -24,7 +24,7 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
-from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.grid import Slot
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
 from bhd_lerobot.realtime.shared_memory import names
 from bhd_lerobot.robots.base_simulation import BaseSimulation
@@ -269,7 +269,7 @@ class Parts:
             is_orphan=lambda: False,
         )
         self.period = self.loop.period_ns
-        self.grid, self.slot = TickGrid(0, self.period), Slot(0, 0, 0, 0)
+        self.slot = Slot(0, 0, 0, 0)
         self.sims = [self.whole, self.remote]
         self.scene = ARENA if kind == "turtlebot3" else UR5(UR5Config()).make_scene()
         self.place()
@@ -277,13 +277,13 @@ class Parts:
     def place(self) -> None:
         self.world.place(self.scene, 5)
         self.guard.place()
-        self.loop.tick(self.slot, self.now, self.grid)
+        self.loop.tick(self.slot, self.now)
         for simulation in self.sims:
             simulation.reset(np.zeros(1, np.intp), [self.scene], [5])
 
     def plant_tick(self) -> None:
         self.now += self.period
-        self.loop.tick(self.slot, self.now, self.grid)
+        self.loop.tick(self.slot, self.now)
 
     def hang(self) -> None:
         """Let the plant go on alone until it stops."""
