@@ -23,6 +23,7 @@ from bhd_lerobot.control.plant import PlantReading
 Array = NDArray[np.float64]
 
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
+_EFFORT = int(Limit.EFFORT)
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
 _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
@@ -37,12 +38,12 @@ _TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
-@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
+@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
 def lead_commands(  # noqa: PLR0917
     reference: Array,
     speed: Array,
     actuators: Array,
-    limited_effort: NDArray[np.bool_],
+    limits: NDArray[np.int64],
     lead: Array,
     largest_error: Array,
     position: Array,
@@ -57,7 +58,8 @@ def lead_commands(  # noqa: PLR0917
             # command near the joint, to ask for no more, would be a second loop around the servo, which a few
             # milliseconds of latency turn into a brake.
             if abs(velocity[sim, k] * lead[k] + position[sim, k] - actuators[sim, k]) > largest_error[k]:
-                limited_effort[sim] = any_limited = True
+                limits[sim] |= _EFFORT
+                any_limited = True
     return any_limited
 
 
@@ -94,7 +96,7 @@ class ArmController(Controller):
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
         self.protective_stop = np.zeros(n, np.int64)
-        self._any_stopped = self._any_bad = False
+        self._any_stopped = False
         self.force: ForceLimit | None = None
         self.contact_wrench = np.zeros((n, 0))
         self.busy = self.goals.busy  # the same array
@@ -131,9 +133,9 @@ class ArmController(Controller):
         self._lowest_effort = -self._effort
         self._largest_error = self._effort / self._stiffness
         self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
-        self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.limits = self.setpoints.limits  # the same array
         self._work = np.zeros((n, width))
-        state = self.command, self.velocity, self.actuators, self._limited_effort
+        state = self.command, self.velocity, self.actuators, self.limits
         self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
 
     def limit_force(self, force: ForceLimit) -> None:
@@ -153,8 +155,7 @@ class ArmController(Controller):
         """Head for new setpoints; goals that are still followed end, because the newer command counts."""
         # Commands are checked when they are sent; a queue in shared memory is written by another process.
         if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
-            self._limited_finite |= bad
-            self._any_bad = True
+            self.limits[bad] |= int(Limit.NON_FINITE)
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
         if np.count_nonzero(self.busy & mask):
@@ -385,8 +386,6 @@ class ArmController(Controller):
             self.force.restart(ids)
         if self.held is not None:
             self.held.restart(ids)
-        for flags in (self._limited_finite, self._limited_effort):
-            flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------
 
@@ -395,31 +394,6 @@ class ArmController(Controller):
         """Whether each arm follows a goal, shape (n,)."""
         phase = self.goals.phase
         return np.asarray((phase == _CONVERTING) | (phase == _EXECUTING))
-
-    def take_limits(self) -> NDArray[np.int64]:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        setpoints = self.setpoints
-        if not np.count_nonzero(self._limited_effort) and not setpoints.limited and not self._any_bad:
-            return np.zeros(len(self.busy), np.int64)
-        limits = np.asarray(
-            self._limited_finite * int(Limit.NON_FINITE)
-            + setpoints.limited_position * int(Limit.POSITION)
-            + setpoints.limited_velocity * int(Limit.VELOCITY)
-            + setpoints.limited_acceleration * int(Limit.ACCELERATION)
-            + setpoints.limited_clearance * int(Limit.CLEARANCE)
-            + self._limited_effort * int(Limit.EFFORT)
-        )
-        for flags in (
-            self._limited_finite,
-            self._limited_effort,
-            setpoints.limited_position,
-            setpoints.limited_velocity,
-            setpoints.limited_acceleration,
-            setpoints.limited_clearance,
-        ):
-            flags[:] = False
-        setpoints.limited = self._any_bad = False
-        return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""

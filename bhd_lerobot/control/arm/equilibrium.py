@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.arm.rotations import rotation_vectors, turned
+from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -50,6 +51,7 @@ class Equilibrium:
         opening: of the gripper [m], shape (n, 1).
         speed: velocity of the tool, linear [m/s] then angular [rad/s], in the base frame, shape (n, 6).
         active: whether a setpoint is followed, shape (n,).
+        limits: the `Limit` flags raised since they were last cleared, shape (n,).
 
     Args:
         control_hz: ticks a second [Hz].
@@ -64,8 +66,7 @@ class Equilibrium:
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.speed = np.zeros((n, 6))
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
         self._opening_speed = np.zeros((n, 1))
         self._hz, self._frame_ticks, self._left = control_hz, frame_ticks, np.zeros(n, np.int64)
         self._limits = (
@@ -163,8 +164,8 @@ class Equilibrium:
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * hardest * size))
         wanted = feed + error * (closing / np.maximum(size, 1e-12))
         change = _clip(wanted, fastest) - speed
-        self.limited_velocity |= _norm(wanted)[:, 0] > fastest
-        self.limited_acceleration |= self.active & (_norm(change)[:, 0] * self._hz > hardest)
+        self.limits[_norm(wanted)[:, 0] > fastest] |= int(Limit.VELOCITY)
+        self.limits[self.active & (_norm(change)[:, 0] * self._hz > hardest)] |= int(Limit.ACCELERATION)
         speed += _clip(change, hardest / self._hz)
 
 
