@@ -93,7 +93,7 @@ class Rig:
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
-            self.manager.tick(*self.reference, self.measured_position, self.measured_velocity)
+            self.manager.tick(self.reference, (self.measured_position, self.measured_velocity))
             self._stopped.append(self.hard.copy())
             if self.hard.any():
                 self.hard &= self.velocity.any(axis=1) | self.acceleration.any(axis=1)
@@ -127,7 +127,7 @@ class Rig:
 
     def stop(self, code: ResultCode, hard: bool, mask: NDArray[np.bool_] | None = None) -> None:
         mask = np.ones(self.n, np.bool_) if mask is None else mask
-        self.manager.stop(mask, code, hard, *self.reference)
+        self.manager.stop(mask, code, hard, self.reference)
         self.hard |= mask & hard
 
     def results(self, sim: int = 0) -> list[tuple[str, ResultCode]]:

@@ -164,7 +164,8 @@ class ArmController(Controller):
             # speed. Going on from the speed at the end would change the command's own by half a tick's acceleration
             # on top of what is allowed.
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
-            self.goals.drop_for_setpoint(mask)
+            message = "A setpoint came, and the newer command counts."
+            self.goals.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, message)
         self._gives_way[mask] = 0
         self._unwatched &= ~mask
         self.setpoints.set_setpoint(values, mask, self.command)
@@ -180,7 +181,7 @@ class ArmController(Controller):
             self._begin_giving_way(mask & ~self._stopped)
             np.copyto(self._aim, self.command[:, :-1], where=mask[:, None] & ~self._yields[:, None])
         self._leave_setpoints(mask)
-        self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
+        self.goals.stop(mask, _STOP_CODES[cause], hard, (self.command, self.velocity, self.acceleration))
 
     def _begin_giving_way(self, mask: NDArray[np.bool_]) -> None:
         self._stopped |= mask
@@ -213,12 +214,13 @@ class ArmController(Controller):
             self.goals.hold(sim, held)
             if self.setpoints.clearance is not None:
                 self.setpoints.clearance.hold(sim, held)
+        reference = self.command, self.velocity, self.acceleration
         if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
             if np.count_nonzero(self.busy):
                 self._leave_setpoints(self.busy)
-            self.setpoints.run(self.command, self.velocity, self.acceleration)
-        self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
+            self.setpoints.run(*reference)
+        self.goals.tick(reference, (reading.position, reading.velocity))
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
         self._trail.note(reading, self._gives_way)
@@ -295,7 +297,7 @@ class ArmController(Controller):
         self._any_stopped = True
         self._off_ticks[mask] = 0
         self._leave_setpoints(mask)
-        self.goals.end_all(mask, message)
+        self.goals.end_all(mask, ResultCode.PATH_TOLERANCE, message)
         self._begin_giving_way(mask)
         off = reading.position[:, :-1] - self.actuators[:, :-1]
         aim = self.actuators[:, :-1] + np.minimum(np.maximum(off, -self._reach), self._reach)
@@ -353,12 +355,8 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        return (
-            np.asarray((np.abs(self.velocity) < _REST).all(axis=1))
-            & ~self.busy
-            & (self._gives_way == 0)
-            & ~self._yields
-        )
+        still: NDArray[np.bool_] = (np.abs(self.velocity) < _REST).all(axis=1)
+        return still & ~self.busy & ~self._yields & (self._gives_way == 0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""

@@ -17,7 +17,7 @@ from bhd_lerobot.control.motion.trajectory import PlanFailure, State, to_target
 
 Array = NDArray[np.float64]
 Reference = tuple[Array, Array, Array]
-"""Position, velocity and acceleration, each of shape (n, dof + 1)."""
+"""Position [rad, and m for the gripper], velocity and acceleration, each of shape (n, dof + 1)."""
 
 
 class _Motion(IntEnum):
@@ -83,18 +83,10 @@ class GoalManager:
     # --- requests of a brain -----------------------------------------------------------------------------------------
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
-        """Take a goal; it starts as soon as it is planned.
+        """Take a goal, see `Controller.submit`; it starts as soon as it is planned.
 
         A refusal is also among the results, except for a goal that has the name of one that is followed or waits: that
         one still gets its own. A name counts as used even if its goal was refused.
-
-        Args:
-            sim: the arm.
-            command: the goal.
-            blocked: why the arm takes no goals now; None if it does.
-
-        Returns:
-            None if it was accepted, otherwise the refusal.
         """
         book = self._books[sim]
         refusal = book.admit(command, blocked, self.planner.check)
@@ -105,11 +97,7 @@ class GoalManager:
         return refusal
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
-        """Cancel a goal: one that waits ends at once, one that is followed when the arm has come to rest.
-
-        Returns:
-            SUCCEEDED, or UNKNOWN_ID if no such goal is followed or waits.
-        """
+        """Cancel a goal: one that waits ends at once, one that is followed when the arm has come to rest."""
         book = self._books[sim]
         code = book.cancel(task_id)
         if book.followed is None and not book.waiting and self.phase[sim] == GoalPhase.CONVERTING:
@@ -137,48 +125,32 @@ class GoalManager:
         """Plan with something in an arm's gripper from now on; with nothing if None."""
         self._held[sim] = held
 
-    def stop(  # noqa: PLR0917  the reference is three arrays
-        self,
-        mask: NDArray[np.bool_],
-        code: ResultCode,
-        hard: bool,
-        position: Array,
-        velocity: Array,
-        acceleration: Array,
-    ) -> None:
+    def stop(self, mask: NDArray[np.bool_], code: ResultCode, hard: bool, reference: Reference) -> None:
         """End all goals of some arms at once, and brake from the next tick on.
 
         Args:
             mask: the arms, shape (n,).
             code: how their goals end.
             hard: whether to brake with the limits of a stop; a stop that has begun hard stays so.
-            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
-            velocity: shape (n, dof + 1).
-            acceleration: shape (n, dof + 1).
+            reference: where they are.
         """
         for sim in np.flatnonzero(mask).tolist():
             self._end_all(sim, code, REASONS.get(code, "The arm was stopped."))
             wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
             if self._motion[sim] < wanted:
-                self._brake(sim, (position, velocity, acceleration), wanted)
+                self._brake(sim, reference, wanted)
             self._changed(sim)
 
-    def drop_for_setpoint(self, mask: NDArray[np.bool_]) -> None:
-        """End all goals of some arms, and let the owner have the reference. `mask` has shape (n,)."""
-        for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, ResultCode.REPLACED_BY_SETPOINT, "A setpoint came, and the newer command counts.")
-            self._rest(sim)
-            self._changed(sim)
-
-    def end_all(self, mask: NDArray[np.bool_], message: str) -> None:
-        """End all goals of arms that something is in the way of, with PATH_TOLERANCE; their reference stays as it is.
+    def end_all(self, mask: NDArray[np.bool_], code: ResultCode, message: str) -> None:
+        """End all goals of some arms, and let the owner have the reference, which stays as it is.
 
         Args:
             mask: the arms, shape (n,).
+            code: how their goals end.
             message: why.
         """
         for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, ResultCode.PATH_TOLERANCE, message)
+            self._end_all(sim, code, message)
             self._rest(sim)
             self._changed(sim)
 
@@ -187,7 +159,7 @@ class GoalManager:
 
         Args:
             mask: the arms, shape (n,).
-            reference: position, velocity and acceleration, each of shape (n, dof + 1).
+            reference: where they are.
             target: within the limits, shape (n, dof + 1).
         """
         for sim in np.flatnonzero(mask).tolist():
@@ -216,24 +188,17 @@ class GoalManager:
             self.phase[sim] = GoalPhase.IDLE
             self._changed(sim)
 
-    def tick(
-        self, position: Array, velocity: Array, acceleration: Array, measured_position: Array, measured_velocity: Array
-    ) -> None:
+    def tick(self, reference: Reference, measured: tuple[Array, Array]) -> None:
         """Judge what is followed, start what is next, and advance the reference by one tick, in place.
 
         Args:
-            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
-            velocity: shape (n, dof + 1).
-            acceleration: shape (n, dof + 1).
-            measured_position: what the reference before this tick led to, shape (n, dof + 1).
-            measured_velocity: shape (n, dof + 1).
+            reference: where the arms are commanded to be.
+            measured: what the reference before this tick led to: positions and velocities, each of shape (n, dof + 1).
         """
         if self._idle:
             return
         self._orders.tick += 1
-        reference = (position, velocity, acceleration)
         if len(self._judged):
-            measured = (measured_position, measured_velocity)
             for verdict in self._supervisor.judge(self._judged, self._player.active, reference[:2], measured):
                 self._end(verdict.sim, verdict.code, verdict.message)
                 self._brake(verdict.sim, reference, _Motion.BRAKE)
@@ -248,7 +213,7 @@ class GoalManager:
             for sim in sorted(self._waiting):
                 if self._serve(sim, reference):
                     self._changed(sim)
-        self._player.tick(position, velocity, acceleration)
+        self._player.tick(*reference)
 
     # --- the state machine -------------------------------------------------------------------------------------------
 

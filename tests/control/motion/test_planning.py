@@ -208,13 +208,13 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig.stop(ResultCode.ESTOP, hard=True)
         due = [("b", ResultCode.ESTOP)]
     elif way == "setpoint":
-        rig.manager.drop_for_setpoint(mask)
+        rig.manager.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, "a setpoint")
         due = [("b", ResultCode.REPLACED_BY_SETPOINT)]
         assert not rig.manager.following.any()
         rig.velocity[:] = rig.acceleration[:] = 0.0  # what follows setpoints brings it to rest
         rig._rows, rig._stopped = [np.stack(rig.reference)], []
     elif way == "retreat":
-        rig.manager.end_all(mask, "in the way")
+        rig.manager.end_all(mask, ResultCode.PATH_TOLERANCE, "in the way")
         rig.hard[:] = True
         rig.manager.retreat(mask, rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
         due = [("b", ResultCode.PATH_TOLERANCE)]
