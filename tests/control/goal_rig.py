@@ -10,6 +10,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.motion.trajectory import MotionLimits
 
 Array = NDArray[np.float64]
@@ -76,9 +77,9 @@ def broken_limit(rows: Array, hard: NDArray[np.bool_]) -> str:
 class Rig:
     """Goals of n arms on a clock of ticks."""
 
-    def __init__(self, n: int = 1, **options: int) -> None:
+    def __init__(self, n: int = 1, planning: Planning | None = None) -> None:
         self.n = n
-        self.manager = GoalManager(ARM, n, HZ, KINEMATICS, **options)
+        self.manager = GoalManager(ARM, n, HZ, planning)
         self.position = np.tile(HOME, (n, 1))
         self.velocity, self.acceleration = np.zeros((n, 7)), np.zeros((n, 7))
         self.measured_position, self.measured_velocity = self.position.copy(), self.velocity.copy()

@@ -85,7 +85,7 @@ class ArmController(Controller):
         limits = arm.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
-        self.goals = GoalManager(arm, n, control_hz, planning=planning)
+        self.goals = GoalManager(arm, n, control_hz, planning)
         share = acceleration_share(arm)  # setpoints are not planned: their torques have to suffice in any posture
         calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
         clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)

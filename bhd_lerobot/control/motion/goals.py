@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
@@ -44,22 +43,11 @@ class GoalManager:
         arm: the arm.
         n: number of arms.
         control_hz: ticks a second [Hz].
-        kinematics: the arm's; made from its chain if None.
-        queue: how many goals may wait.
         planning: who plans; planned in the tick that a goal starts in if None.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        n: int,
-        control_hz: int,
-        kinematics: ArmKinematics | None = None,
-        queue: int = 8,
-        *,
-        planning: Planning | None = None,
-    ) -> None:
-        self.planner = GoalPlanner(arm, control_hz, kinematics)
+    def __init__(self, arm: Arm, n: int, control_hz: int, planning: Planning | None = None) -> None:
+        self.planner = GoalPlanner(arm, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
@@ -68,8 +56,7 @@ class GoalManager:
         self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
         self._supervisor = Supervisor(arm, n, control_hz)
         self.limit = self._supervisor.limit
-        self._capacity = queue
-        self._books = [GoalBook(queue) for _ in range(n)]
+        self._books = [GoalBook() for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is
         self._held: list[Capsule | None] = [None] * n
         self._planned = np.ones(n, np.int64)  # ticks of the trajectory of the goal that is followed
@@ -182,7 +169,7 @@ class GoalManager:
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else, results included."""
         for sim in np.asarray(ids).tolist():
-            self._books[sim] = GoalBook(self._capacity)
+            self._books[sim] = GoalBook()
             self._held[sim] = None
             self._rest(sim)
             self.phase[sim] = GoalPhase.IDLE
