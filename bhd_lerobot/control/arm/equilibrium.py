@@ -1,41 +1,19 @@
 """Where an impedance's spring is at rest: a tool pose and an opening that move within limits."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.arm.rotations import rotation_vectors, turned
 from bhd_lerobot.control.messages import Limit
-from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
 
+# How fast an equilibrium may move beside a person: ISO 10218-1 permits 250 mm/s, the others are estimates.
+SPEED, ACCELERATION = 0.25, 1.0  # [m/s, m/s^2]
+TURN_SPEED, TURN_ACCELERATION = 1.0, 4.0  # [rad/s, rad/s^2]
 _GAIN = 50.0  # [1/s] how eagerly a remaining error is closed
 _APPROACH = 0.7  # share of the acceleration that approaching a target may count on: room for discrete time
 _REST = 1e-6  # [m/s, rad/s] slower than this is at rest
-
-
-@dataclass(frozen=True)
-class EquilibriumLimits:
-    """How fast an equilibrium may move; the defaults are those of an arm beside a person (ISO 10218-1: 250 mm/s).
-
-    Attributes:
-        speed: [m/s].
-        acceleration: [m/s^2].
-        turn_speed: [rad/s].
-        turn_acceleration: [rad/s^2].
-    """
-
-    speed: float = 0.25
-    acceleration: float = 1.0
-    turn_speed: float = 1.0
-    turn_acceleration: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 < value < float("inf"):
-                raise ConfigError(f"{name} is {value}; it must be positive and finite.")
 
 
 class Equilibrium:
@@ -59,9 +37,7 @@ class Equilibrium:
         opening_limits: largest speed [m/s] and acceleration [m/s^2] of the opening.
     """
 
-    def __init__(
-        self, n: int, control_hz: int, frame_ticks: int, limits: EquilibriumLimits, opening_limits: tuple[float, float]
-    ) -> None:
+    def __init__(self, n: int, control_hz: int, frame_ticks: int, opening_limits: tuple[float, float]) -> None:
         self.position, self.opening = np.zeros((n, 3)), np.zeros((n, 1))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.speed = np.zeros((n, 6))
@@ -69,11 +45,7 @@ class Equilibrium:
         self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
         self._opening_speed = np.zeros((n, 1))
         self._hz, self._frame_ticks, self._left = control_hz, frame_ticks, np.zeros(n, np.int64)
-        self._limits = (
-            (limits.speed, limits.acceleration),
-            (limits.turn_speed, limits.turn_acceleration),
-            opening_limits,
-        )
+        self._limits = (SPEED, ACCELERATION), (TURN_SPEED, TURN_ACCELERATION), opening_limits
         # Target, where it is at the end of the frame, and its speed: of position, rotation and opening.
         self._target, self._goal = self.position.copy(), self.position.copy()
         self._target_rotation, self._goal_rotation = self.rotation.copy(), self.rotation.copy()

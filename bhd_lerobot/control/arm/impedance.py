@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
-from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.arm.equilibrium import Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
 from bhd_lerobot.control.controller import Controller
@@ -51,8 +51,6 @@ class ImpedanceController(Controller):
         n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
-        compliance: stiffness and damping to start with; the default if None.
-        limits: how fast the equilibrium may move; the default if None.
 
     Raises:
         ConfigError: the arm does not take torques.
@@ -60,16 +58,7 @@ class ImpedanceController(Controller):
 
     width = WIDTH
 
-    def __init__(
-        self,
-        arm: Arm,
-        n: int,
-        control_hz: int,
-        frame_ticks: int,
-        *,
-        compliance: Compliance | None = None,
-        limits: EquilibriumLimits | None = None,
-    ) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
         if arm.actuation != "torque":
             raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
         self.arm, self.n = arm, n
@@ -79,7 +68,7 @@ class ImpedanceController(Controller):
         self.contact = ContactObserver(n, dof, control_hz, OBSERVER_GAIN)
         self.contact_wrench = self.contact.wrench
         opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
-        self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
+        self.equilibrium = Equilibrium(n, control_hz, frame_ticks, opening_limits)
         self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))
         self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         self.wrench: Array = np.zeros((n, 6))
@@ -98,7 +87,7 @@ class ImpedanceController(Controller):
         self._held = np.zeros(n, np.bool_)  # stopped hard
         self._still = np.ones(n, np.bool_)
         self.limits = self.equilibrium.limits  # the same array
-        self.set_compliance(Compliance() if compliance is None else compliance)
+        self.set_compliance(Compliance())
         self.restart(np.arange(n))
 
     # --- what a brain may set beside commands ------------------------------------------------------------------------
