@@ -50,11 +50,6 @@ class Equilibrium:
         self._target, self._goal = self.position.copy(), self.position.copy()
         self._target_rotation, self._goal_rotation = self.rotation.copy(), self.rotation.copy()
         self._target_opening, self._goal_opening = self.opening.copy(), self.opening.copy()
-        self._targets = (
-            (self._target, self.position),
-            (self._target_rotation, self.rotation),
-            (self._target_opening, self.opening),
-        )
         self._feed, self._feed_opening = np.zeros((n, 6)), np.zeros((n, 1))
 
     def set_setpoint(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
@@ -67,8 +62,8 @@ class Equilibrium:
             mask: the arms that they are for, shape (n,).
         """
         new = mask & ~self.active
-        for target, present in self._targets:
-            target[new] = present[new]
+        self._target[new], self._target_opening[new] = self.position[new], self.opening[new]
+        self._target_rotation[new] = self.rotation[new]
         self._goal[mask], self._goal_rotation[mask], self._goal_opening[mask] = (
             position[mask],
             rotation[mask],
@@ -131,19 +126,16 @@ class Equilibrium:
     def _approach(self, speed: Array, error: Array, feed: Array, limits: tuple[float, float]) -> None:
         """Change a velocity of shape (n, k), in place, towards the one that leads to the target."""
         fastest, hardest = limits
-        size = _norm(error)
+        size = np.linalg.norm(error, axis=1, keepdims=True)
         # Faster than this it could not slow down in time to stop at the target.
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * hardest * size))
         wanted = feed + error * (closing / np.maximum(size, 1e-12))
         change = _clip(wanted, fastest) - speed
-        self.limits[_norm(wanted)[:, 0] > fastest] |= int(Limit.VELOCITY)
-        self.limits[self.active & (_norm(change)[:, 0] * self._hz > hardest)] |= int(Limit.ACCELERATION)
+        self.limits[np.linalg.norm(wanted, axis=1) > fastest] |= int(Limit.VELOCITY)
+        hard = np.linalg.norm(change, axis=1) * self._hz > hardest
+        self.limits[self.active & hard] |= int(Limit.ACCELERATION)
         speed += _clip(change, hardest / self._hz)
 
 
-def _norm(vectors: Array) -> Array:
-    return np.asarray(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)))
-
-
 def _clip(vectors: Array, longest: float) -> Array:
-    return vectors * (longest / np.maximum(_norm(vectors), longest))
+    return vectors * (longest / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest))
