@@ -167,9 +167,15 @@ class PlanOrders:
             command: the goal; the same one as long as the arm waits for its plan.
             opening: where the gripper is commanded to [m]; None: where it is.
         """
+
+        def order_for(lead: int) -> _Order:
+            self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
+            self._planning.request(sim, command, order.state, opening, self.tick + lead, held)
+            return order
+
         order = self._orders[sim]
         if order is None:
-            order = self._order(sim, command, self._planning.lead, ahead, opening, held)
+            order = order_for(self._planning.lead)
         if order.answer is None:
             order.answer = self._planning.poll(sim)
             order.arrived_tick = self.tick
@@ -188,21 +194,8 @@ class PlanOrders:
             return answer
         if order.lead >= MOST_LEADS * self._planning.lead:
             return self._give_up(sim, self._slowness(order))
-        self._order(sim, command, 2 * order.lead, ahead, opening, held)
+        order_for(2 * order.lead)
         return None
-
-    def _order(  # noqa: PLR0917
-        self,
-        sim: int,
-        command: BrainCommand,
-        lead: int,
-        ahead: Callable[[int], State],
-        opening: float | None,
-        held: Capsule | None,
-    ) -> _Order:
-        self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
-        self._planning.request(sim, command, order.state, opening, self.tick + lead, held)
-        return order
 
     def _give_up(self, sim: int, message: str) -> PlanFailure:
         self.drop(sim)
