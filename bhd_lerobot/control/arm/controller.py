@@ -74,8 +74,6 @@ class ArmController(Controller):
         held: finds out what the grippers hold, which is then kept away from things like the arm; nothing does if None.
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
         planning: who plans goals; they are planned in the tick that they start in if None.

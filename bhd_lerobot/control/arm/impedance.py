@@ -48,7 +48,6 @@ class ImpedanceController(Controller):
 
     Args:
         arm: the arm; its actuation is ``"torque"``.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
 

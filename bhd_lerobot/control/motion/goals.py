@@ -40,8 +40,6 @@ class GoalManager:
         limit: how far joints may be from their references.
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         planning: who plans; planned in the tick that a goal starts in if None.
     """
@@ -142,13 +140,7 @@ class GoalManager:
             self._changed(sim)
 
     def retreat(self, mask: NDArray[np.bool_], reference: Reference, target: Array) -> None:
-        """Bring the reference of arms that follow nothing somewhere else.
-
-        Args:
-            mask: the arms, shape (n,).
-            reference: where they are.
-            target: within the limits, shape (n, dof + 1).
-        """
+        """Bring the reference of arms that follow nothing to a target within the limits, shape (n, dof + 1)."""
         for sim in np.flatnonzero(mask).tolist():
             state = State.of(*(array[sim] for array in reference))
             way = to_target(state, target[sim], self.planner.stop_limits, self._hz)

@@ -91,7 +91,6 @@ class GoalPlanner:
         """Return how a goal is reached from a commanded state.
 
         Args:
-            command: the goal.
             position: the state [rad, and m for the gripper], shape (dof + 1,).
             velocity: shape (dof + 1,).
             acceleration: shape (dof + 1,).

@@ -44,8 +44,6 @@ class Planning(Protocol):
         """Request a plan; an earlier request is dropped.
 
         Args:
-            sim: the arm.
-            command: the goal.
             state: where the plan is to start [rad, and m for the gripper], each of shape (dof + 1,).
             opening: where the gripper is commanded to [m], for goals that leave it as it is; None: where it is.
             start_tick: the tick that the plan is to start at.
