@@ -27,6 +27,7 @@ class Controller(ABC):
             others.
         contact_wrench: what the surroundings put on the tools, estimated from the motors' efforts, in the base frame:
             forces [N], and moments about the tool centre points [N m], shape (n, 6), or (n, 0) if nobody asks for it.
+        limits: the `Limit` flags raised since they were last taken, shape (n,).
     """
 
     width: int
@@ -36,6 +37,7 @@ class Controller(ABC):
     busy: NDArray[np.bool_]
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
+    limits: NDArray[np.int64]
 
     @abstractmethod
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
@@ -91,9 +93,11 @@ class Controller(ABC):
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about robots that were put somewhere else."""
 
-    @abstractmethod
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
+        limits = self.limits.copy()
+        self.limits[:] = 0
+        return limits
 
     @abstractmethod
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:

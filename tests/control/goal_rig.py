@@ -10,6 +10,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.motion.trajectory import MotionLimits
 
 Array = NDArray[np.float64]
@@ -76,9 +77,9 @@ def broken_limit(rows: Array, hard: NDArray[np.bool_]) -> str:
 class Rig:
     """Goals of n arms on a clock of ticks."""
 
-    def __init__(self, n: int = 1, **options: int) -> None:
+    def __init__(self, n: int = 1, planning: Planning | None = None) -> None:
         self.n = n
-        self.manager = GoalManager(ARM, n, HZ, KINEMATICS, **options)
+        self.manager = GoalManager(ARM, n, HZ, planning)
         self.position = np.tile(HOME, (n, 1))
         self.velocity, self.acceleration = np.zeros((n, 7)), np.zeros((n, 7))
         self.measured_position, self.measured_velocity = self.position.copy(), self.velocity.copy()
@@ -93,7 +94,7 @@ class Rig:
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
-            self.manager.tick(*self.reference, self.measured_position, self.measured_velocity)
+            self.manager.tick(self.reference, (self.measured_position, self.measured_velocity))
             self._stopped.append(self.hard.copy())
             if self.hard.any():
                 self.hard &= self.velocity.any(axis=1) | self.acceleration.any(axis=1)
@@ -127,7 +128,7 @@ class Rig:
 
     def stop(self, code: ResultCode, hard: bool, mask: NDArray[np.bool_] | None = None) -> None:
         mask = np.ones(self.n, np.bool_) if mask is None else mask
-        self.manager.stop(mask, code, hard, *self.reference)
+        self.manager.stop(mask, code, hard, self.reference)
         self.hard |= mask & hard
 
     def results(self, sim: int = 0) -> list[tuple[str, ResultCode]]:

@@ -16,13 +16,13 @@ from bhd_lerobot.control.motion.planning import MIN_LEAD
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
-from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
+from tests.control.goal_rig import ARM, HOME, HZ, Rig, joints, moved
 from tests.control.motion.test_goal_properties import actions, follow
 from tests.control.support import shared_block
 from tests.forks import Fork
 from tests.realtime.mail_support import DURATION_S, RampPlanner, serve_plans
 
-PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
+PLANNER = GoalPlanner(ARM, HZ)
 STATE = State.of(*np.arange(21.0).reshape(3, 7))
 
 
@@ -308,7 +308,7 @@ class LateLink(PlanningLink):
 @settings(max_examples=30)
 @given(st.lists(actions, min_size=1, max_size=7), st.lists(st.integers(0, 300), max_size=10), st.integers(MIN_LEAD, 40))
 def test_whatever_happens_while_another_process_plans(script: list, latencies: list[int], lead: int) -> None:
-    rig = Rig(planning=LateLink(latencies, lead))  # type: ignore[arg-type]
+    rig = Rig(planning=LateLink(latencies, lead))
     due = follow(rig, 0, script)
     rig.run()  # checks position, speed, acceleration and jerk at every tick
     results = rig.taken + rig.manager.take_results(0)

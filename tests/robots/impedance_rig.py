@@ -45,7 +45,9 @@ class Rig:
         self.world.qpos[:, :6] = forward_posture()
         self.world.qpos[:, 6:8] = 0.0
         self.world.hold()
-        self.controller = ImpedanceController(ARM, n, 500, RATES.ticks_per_frame, compliance=compliance)
+        self.controller = ImpedanceController(ARM, n, 500, RATES.ticks_per_frame)
+        if compliance is not None:
+            self.controller.set_compliance(compliance)
         self.cerebellum = Cerebellum(ARM, SimulatedPlant(self.world), 500, controller=self.controller)
         self.bridge = LockstepBridge(self.cerebellum, RATES, self._advance)
         self.log: dict[str, list[Array]] = {"force": [], "tool": [], "estimate": [], "torque": [], "command": []}

@@ -410,7 +410,7 @@ def test_what_is_gripped_does_not_slip() -> None:
         return np.array([table.object_poses[sim, 0, :3] - table.tool_pose[sim, :3] for sim in range(4)])
 
     start, slips = offset(), []
-    planner = GoalPlanner(BODY, BODY.physics_hz, KINEMATICS)
+    planner = GoalPlanner(BODY, BODY.physics_hz)
     for there in ((*spot, 0.20), (0.5, -0.20, 0.20)):
         goal = BrainCommand(
             "a", target_pose=pose(tool_at(there)), motion="line", max_velocity=0.5, max_acceleration=2.5

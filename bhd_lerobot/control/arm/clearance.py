@@ -118,7 +118,8 @@ class SetpointClearance:
         q, velocity, speed, reached = q[near], velocity[near], speed[near], reached[near]
         every = self._model.each(np.concatenate((q, (q + ways[:, near]).reshape(-1, self.dof))))
         self._known[ids[near]], self._distances[ids[near]] = q, every[:, : len(near)].T
-        least = self._smallest(every).reshape(2, 1 + len(ways), len(near))
+        kinds = every[: self._pairs], every[self._pairs :]  # from itself, and from the table
+        least = np.stack([kind.min(axis=0, initial=np.inf) for kind in kinds]).reshape(2, 1 + len(ways), len(near))
         here = least[:, 0]
         free = self._free(here, least[:, 1:] - _WIDER * length[:, near])
         slow = np.flatnonzero(free < 1.0)
@@ -135,8 +136,7 @@ class SetpointClearance:
         tried = _TRIED * share
         again = np.tile(slow, len(_TRIED))
         _, ways, length = self._ways(velocity[again], (tried[:, :, None] * speed[slow]).reshape(-1, self.dof))
-        every = self._model.each((q[again] + ways).reshape(-1, self.dof))
-        slower = self._smallest(every).reshape(2, len(ways), len(again)) - _WIDER * length
+        slower = np.stack(self._model.distances(q[again] + ways)) - _WIDER * length
         good = self._free(here[:, again], slower).reshape(tried.shape) >= 1.0
         shares[near[slow]] = np.where(good.any(axis=0), tried[good.argmax(axis=0), np.arange(len(slow))], 0.0)
         return shares
@@ -169,13 +169,6 @@ class SetpointClearance:
         braking = np.minimum(np.maximum(time - self._ramp, 0.0), duration)
         way = fast * (np.minimum(time, self._ramp) + braking) - self._acceleration * braking * braking / 2
         return np.copysign(way, speed)
-
-    def _smallest(self, every: Array) -> Array:
-        """Return the smallest of each kind of distances, shape (2, k): from itself, and from the table."""
-        none = np.inf
-        return np.stack(
-            (every[: self._pairs].min(axis=0, initial=none), every[self._pairs :].min(axis=0, initial=none))
-        )
 
     def _free(self, here: Array, distances: Array) -> Array:
         """Return which shares of ways are free, shape (k,).

@@ -23,6 +23,7 @@ from bhd_lerobot.control.plant import PlantReading
 Array = NDArray[np.float64]
 
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
+_EFFORT = int(Limit.EFFORT)
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
 _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
@@ -37,12 +38,12 @@ _TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
-@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
+@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
 def lead_commands(  # noqa: PLR0917
     reference: Array,
     speed: Array,
     actuators: Array,
-    limited_effort: NDArray[np.bool_],
+    limits: NDArray[np.int64],
     lead: Array,
     largest_error: Array,
     position: Array,
@@ -57,7 +58,8 @@ def lead_commands(  # noqa: PLR0917
             # command near the joint, to ask for no more, would be a second loop around the servo, which a few
             # milliseconds of latency turn into a brake.
             if abs(velocity[sim, k] * lead[k] + position[sim, k] - actuators[sim, k]) > largest_error[k]:
-                limited_effort[sim] = any_limited = True
+                limits[sim] |= _EFFORT
+                any_limited = True
     return any_limited
 
 
@@ -72,8 +74,6 @@ class ArmController(Controller):
         held: finds out what the grippers hold, which is then kept away from things like the arm; nothing does if None.
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
         planning: who plans goals; they are planned in the tick that they start in if None.
@@ -83,7 +83,7 @@ class ArmController(Controller):
         limits = arm.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
-        self.goals = GoalManager(arm, n, control_hz, planning=planning)
+        self.goals = GoalManager(arm, n, control_hz, planning)
         share = acceleration_share(arm)  # setpoints are not planned: their torques have to suffice in any posture
         calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
         clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)
@@ -94,7 +94,7 @@ class ArmController(Controller):
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
         self.protective_stop = np.zeros(n, np.int64)
-        self._any_stopped = self._any_bad = False
+        self._any_stopped = False
         self.force: ForceLimit | None = None
         self.contact_wrench = np.zeros((n, 0))
         self.busy = self.goals.busy  # the same array
@@ -131,9 +131,9 @@ class ArmController(Controller):
         self._lowest_effort = -self._effort
         self._largest_error = self._effort / self._stiffness
         self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
-        self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.limits = self.setpoints.limits  # the same array
         self._work = np.zeros((n, width))
-        state = self.command, self.velocity, self.actuators, self._limited_effort
+        state = self.command, self.velocity, self.actuators, self.limits
         self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
 
     def limit_force(self, force: ForceLimit) -> None:
@@ -153,8 +153,7 @@ class ArmController(Controller):
         """Head for new setpoints; goals that are still followed end, because the newer command counts."""
         # Commands are checked when they are sent; a queue in shared memory is written by another process.
         if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
-            self._limited_finite |= bad
-            self._any_bad = True
+            self.limits[bad] |= int(Limit.NON_FINITE)
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
         if np.count_nonzero(self.busy & mask):
@@ -163,7 +162,8 @@ class ArmController(Controller):
             # speed. Going on from the speed at the end would change the command's own by half a tick's acceleration
             # on top of what is allowed.
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
-            self.goals.drop_for_setpoint(mask)
+            message = "A setpoint came, and the newer command counts."
+            self.goals.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, message)
         self._gives_way[mask] = 0
         self._unwatched &= ~mask
         self.setpoints.set_setpoint(values, mask, self.command)
@@ -179,7 +179,7 @@ class ArmController(Controller):
             self._begin_giving_way(mask & ~self._stopped)
             np.copyto(self._aim, self.command[:, :-1], where=mask[:, None] & ~self._yields[:, None])
         self._leave_setpoints(mask)
-        self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
+        self.goals.stop(mask, _STOP_CODES[cause], hard, (self.command, self.velocity, self.acceleration))
 
     def _begin_giving_way(self, mask: NDArray[np.bool_]) -> None:
         self._stopped |= mask
@@ -212,12 +212,13 @@ class ArmController(Controller):
             self.goals.hold(sim, held)
             if self.setpoints.clearance is not None:
                 self.setpoints.clearance.hold(sim, held)
+        reference = self.command, self.velocity, self.acceleration
         if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
             if np.count_nonzero(self.busy):
                 self._leave_setpoints(self.busy)
-            self.setpoints.run(self.command, self.velocity, self.acceleration)
-        self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
+            self.setpoints.run(*reference)
+        self.goals.tick(reference, (reading.position, reading.velocity))
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
         self._trail.note(reading, self._gives_way)
@@ -294,7 +295,7 @@ class ArmController(Controller):
         self._any_stopped = True
         self._off_ticks[mask] = 0
         self._leave_setpoints(mask)
-        self.goals.end_all(mask, message)
+        self.goals.end_all(mask, ResultCode.PATH_TOLERANCE, message)
         self._begin_giving_way(mask)
         off = reading.position[:, :-1] - self.actuators[:, :-1]
         aim = self.actuators[:, :-1] + np.minimum(np.maximum(off, -self._reach), self._reach)
@@ -352,12 +353,8 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        return (
-            np.asarray((np.abs(self.velocity) < _REST).all(axis=1))
-            & ~self.busy
-            & (self._gives_way == 0)
-            & ~self._yields
-        )
+        still: NDArray[np.bool_] = (np.abs(self.velocity) < _REST).all(axis=1)
+        return still & ~self.busy & ~self._yields & (self._gives_way == 0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -385,8 +382,6 @@ class ArmController(Controller):
             self.force.restart(ids)
         if self.held is not None:
             self.held.restart(ids)
-        for flags in (self._limited_finite, self._limited_effort):
-            flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------
 
@@ -395,31 +390,6 @@ class ArmController(Controller):
         """Whether each arm follows a goal, shape (n,)."""
         phase = self.goals.phase
         return np.asarray((phase == _CONVERTING) | (phase == _EXECUTING))
-
-    def take_limits(self) -> NDArray[np.int64]:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        setpoints = self.setpoints
-        if not np.count_nonzero(self._limited_effort) and not setpoints.limited and not self._any_bad:
-            return np.zeros(len(self.busy), np.int64)
-        limits = np.asarray(
-            self._limited_finite * int(Limit.NON_FINITE)
-            + setpoints.limited_position * int(Limit.POSITION)
-            + setpoints.limited_velocity * int(Limit.VELOCITY)
-            + setpoints.limited_acceleration * int(Limit.ACCELERATION)
-            + setpoints.limited_clearance * int(Limit.CLEARANCE)
-            + self._limited_effort * int(Limit.EFFORT)
-        )
-        for flags in (
-            self._limited_finite,
-            self._limited_effort,
-            setpoints.limited_position,
-            setpoints.limited_velocity,
-            setpoints.limited_acceleration,
-            setpoints.limited_clearance,
-        ):
-            flags[:] = False
-        setpoints.limited = self._any_bad = False
-        return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""

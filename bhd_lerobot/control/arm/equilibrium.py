@@ -1,40 +1,19 @@
 """Where an impedance's spring is at rest: a tool pose and an opening that move within limits."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.arm.rotations import rotation_vectors, turned
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.control.messages import Limit
 
 Array = NDArray[np.float64]
 
+# How fast an equilibrium may move beside a person: ISO 10218-1 permits 250 mm/s, the others are estimates.
+SPEED, ACCELERATION = 0.25, 1.0  # [m/s, m/s^2]
+TURN_SPEED, TURN_ACCELERATION = 1.0, 4.0  # [rad/s, rad/s^2]
 _GAIN = 50.0  # [1/s] how eagerly a remaining error is closed
 _APPROACH = 0.7  # share of the acceleration that approaching a target may count on: room for discrete time
 _REST = 1e-6  # [m/s, rad/s] slower than this is at rest
-
-
-@dataclass(frozen=True)
-class EquilibriumLimits:
-    """How fast an equilibrium may move; the defaults are those of an arm beside a person (ISO 10218-1: 250 mm/s).
-
-    Attributes:
-        speed: [m/s].
-        acceleration: [m/s^2].
-        turn_speed: [rad/s].
-        turn_acceleration: [rad/s^2].
-    """
-
-    speed: float = 0.25
-    acceleration: float = 1.0
-    turn_speed: float = 1.0
-    turn_acceleration: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 < value < float("inf"):
-                raise ConfigError(f"{name} is {value}; it must be positive and finite.")
 
 
 class Equilibrium:
@@ -50,6 +29,7 @@ class Equilibrium:
         opening: of the gripper [m], shape (n, 1).
         speed: velocity of the tool, linear [m/s] then angular [rad/s], in the base frame, shape (n, 6).
         active: whether a setpoint is followed, shape (n,).
+        limits: the `Limit` flags raised since they were last cleared, shape (n,).
 
     Args:
         control_hz: ticks a second [Hz].
@@ -57,31 +37,19 @@ class Equilibrium:
         opening_limits: largest speed [m/s] and acceleration [m/s^2] of the opening.
     """
 
-    def __init__(
-        self, n: int, control_hz: int, frame_ticks: int, limits: EquilibriumLimits, opening_limits: tuple[float, float]
-    ) -> None:
+    def __init__(self, n: int, control_hz: int, frame_ticks: int, opening_limits: tuple[float, float]) -> None:
         self.position, self.opening = np.zeros((n, 3)), np.zeros((n, 1))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.speed = np.zeros((n, 6))
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
         self._opening_speed = np.zeros((n, 1))
         self._hz, self._frame_ticks, self._left = control_hz, frame_ticks, np.zeros(n, np.int64)
-        self._limits = (
-            (limits.speed, limits.acceleration),
-            (limits.turn_speed, limits.turn_acceleration),
-            opening_limits,
-        )
+        self._limits = (SPEED, ACCELERATION), (TURN_SPEED, TURN_ACCELERATION), opening_limits
         # Target, where it is at the end of the frame, and its speed: of position, rotation and opening.
         self._target, self._goal = self.position.copy(), self.position.copy()
         self._target_rotation, self._goal_rotation = self.rotation.copy(), self.rotation.copy()
         self._target_opening, self._goal_opening = self.opening.copy(), self.opening.copy()
-        self._targets = (
-            (self._target, self.position),
-            (self._target_rotation, self.rotation),
-            (self._target_opening, self.opening),
-        )
         self._feed, self._feed_opening = np.zeros((n, 6)), np.zeros((n, 1))
 
     def set_setpoint(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
@@ -94,8 +62,8 @@ class Equilibrium:
             mask: the arms that they are for, shape (n,).
         """
         new = mask & ~self.active
-        for target, present in self._targets:
-            target[new] = present[new]
+        self._target[new], self._target_opening[new] = self.position[new], self.opening[new]
+        self._target_rotation[new] = self.rotation[new]
         self._goal[mask], self._goal_rotation[mask], self._goal_opening[mask] = (
             position[mask],
             rotation[mask],
@@ -158,19 +126,16 @@ class Equilibrium:
     def _approach(self, speed: Array, error: Array, feed: Array, limits: tuple[float, float]) -> None:
         """Change a velocity of shape (n, k), in place, towards the one that leads to the target."""
         fastest, hardest = limits
-        size = _norm(error)
+        size = np.linalg.norm(error, axis=1, keepdims=True)
         # Faster than this it could not slow down in time to stop at the target.
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * hardest * size))
         wanted = feed + error * (closing / np.maximum(size, 1e-12))
         change = _clip(wanted, fastest) - speed
-        self.limited_velocity |= _norm(wanted)[:, 0] > fastest
-        self.limited_acceleration |= self.active & (_norm(change)[:, 0] * self._hz > hardest)
+        self.limits[np.linalg.norm(wanted, axis=1) > fastest] |= int(Limit.VELOCITY)
+        hard = np.linalg.norm(change, axis=1) * self._hz > hardest
+        self.limits[self.active & hard] |= int(Limit.ACCELERATION)
         speed += _clip(change, hardest / self._hz)
 
 
-def _norm(vectors: Array) -> Array:
-    return np.asarray(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)))
-
-
 def _clip(vectors: Array, longest: float) -> Array:
-    return vectors * (longest / np.maximum(_norm(vectors), longest))
+    return vectors * (longest / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest))

@@ -41,8 +41,6 @@ class ForceLimit:
         exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         largest: with which the tool may press [N].
         wrench: estimate also the wrenches.

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
-from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.arm.equilibrium import Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
 from bhd_lerobot.control.controller import Controller
@@ -48,11 +48,8 @@ class ImpedanceController(Controller):
 
     Args:
         arm: the arm; its actuation is ``"torque"``.
-        n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
-        compliance: stiffness and damping to start with; the default if None.
-        limits: how fast the equilibrium may move; the default if None.
 
     Raises:
         ConfigError: the arm does not take torques.
@@ -60,16 +57,7 @@ class ImpedanceController(Controller):
 
     width = WIDTH
 
-    def __init__(
-        self,
-        arm: Arm,
-        n: int,
-        control_hz: int,
-        frame_ticks: int,
-        *,
-        compliance: Compliance | None = None,
-        limits: EquilibriumLimits | None = None,
-    ) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
         if arm.actuation != "torque":
             raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
         self.arm, self.n = arm, n
@@ -79,7 +67,7 @@ class ImpedanceController(Controller):
         self.contact = ContactObserver(n, dof, control_hz, OBSERVER_GAIN)
         self.contact_wrench = self.contact.wrench
         opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
-        self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
+        self.equilibrium = Equilibrium(n, control_hz, frame_ticks, opening_limits)
         self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))
         self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         self.wrench: Array = np.zeros((n, 6))
@@ -97,8 +85,8 @@ class ImpedanceController(Controller):
         self._capture = np.ones(n, np.bool_)  # the equilibrium is to be put where the tool is
         self._held = np.zeros(n, np.bool_)  # stopped hard
         self._still = np.ones(n, np.bool_)
-        self._limits: NDArray[np.int64] = np.zeros(n, np.int64)
-        self.set_compliance(Compliance() if compliance is None else compliance)
+        self.limits = self.equilibrium.limits  # the same array
+        self.set_compliance(Compliance())
         self.restart(np.arange(n))
 
     # --- what a brain may set beside commands ------------------------------------------------------------------------
@@ -146,7 +134,7 @@ class ImpedanceController(Controller):
         bad = mask & ~(np.isfinite(values).all(axis=1) & (norms > _NORM_RANGE[0]) & (norms < _NORM_RANGE[1]))
         if bad.any():
             # Commands are checked when they are sent; a queue in shared memory is written by another process.
-            self._limits[bad] |= int(Limit.NON_FINITE)
+            self.limits[bad] |= int(Limit.NON_FINITE)
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
         if not mask.any():
@@ -154,7 +142,7 @@ class ImpedanceController(Controller):
         setpoint = np.where(mask[:, None], values, self.command)
         places = setpoint[:, [0, 1, 2, 7]]
         clipped = np.minimum(np.maximum(places, self._lower), self._upper)
-        self._limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
+        self.limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
         self.equilibrium.set_setpoint(clipped[:, :3], rotation_matrices(setpoint[:, 3:7]), clipped[:, 3:], mask)
         self._held &= ~mask
 
@@ -189,7 +177,7 @@ class ImpedanceController(Controller):
         before = self.actuators[:, :dof]
         given = np.minimum(np.maximum(torque, before - self._effort_step), before + self._effort_step)
         given = np.minimum(np.maximum(given, -self._effort), self._effort)
-        self._limits[(given != torque).any(axis=1)] |= int(Limit.EFFORT)
+        self.limits[(given != torque).any(axis=1)] |= int(Limit.EFFORT)
         self.actuators[:, :dof] = given
         self.actuators[:, dof:] = self.equilibrium.opening
         self._still[:] = (np.abs(velocity) < _STILL).all(axis=1)
@@ -220,19 +208,10 @@ class ImpedanceController(Controller):
         self.contact.restart(ids)
         self.wrench[ids] = self._wanted_wrench[ids] = 0.0
         self._capture[ids] = True
-        self._held[ids], self._still[ids], self._limits[ids] = False, True, 0
+        self._held[ids], self._still[ids], self.limits[ids] = False, True, 0
         self._publish_command()
 
     # --- reports -----------------------------------------------------------------------------------------------------
-
-    def take_limits(self) -> NDArray[np.int64]:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        limits, equilibrium = self._limits.copy(), self.equilibrium
-        limits |= equilibrium.limited_velocity * int(Limit.VELOCITY)
-        limits |= equilibrium.limited_acceleration * int(Limit.ACCELERATION)
-        self._limits[:] = 0
-        equilibrium.limited_velocity[:] = equilibrium.limited_acceleration[:] = False
-        return limits
 
     def efforts(self, reading: PlantReading) -> Array:
         """Return the torques of the motors, weight included [N m], and the commanded force of the gripper [N]."""
@@ -257,7 +236,7 @@ class ImpedanceController(Controller):
         push = product(self._stiffness, error) + self.wrench
         for number, part in enumerate((push[:, :3], push[:, 3:])):
             size, largest = np.linalg.norm(part, axis=1), self._largest[:, number]
-            self._limits[size > largest] |= int(Limit.EFFORT)
+            self.limits[size > largest] |= int(Limit.EFFORT)
             np.multiply(part, (largest / np.maximum(size, largest))[:, None], out=part)
         damping = self._fixed_damping.copy()
         if not self._is_fixed.all():

@@ -9,10 +9,7 @@ Array = NDArray[np.float64]
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return axis times angle [rad], shape (n, 3), of rotation matrices, shape (n, 3, 3)."""
-    vectors = np.empty((len(rotations), 3))
-    for row, rotation in enumerate(rotations):
-        vectors[row] = pinocchio.log3(rotation)
-    return vectors
+    return np.array([pinocchio.log3(rotation) for rotation in rotations]).reshape(-1, 3)
 
 
 def turned(rotations: Array, vectors: Array) -> Array:
@@ -20,15 +17,14 @@ def turned(rotations: Array, vectors: Array) -> Array:
 
     They are orthonormal: rounding does not add up when this is done again and again.
     """
-    results = np.empty_like(rotations)
-    for row, vector in enumerate(vectors):
-        results[row] = pinocchio.Quaternion(pinocchio.exp3(vector) @ rotations[row]).normalized().matrix()
-    return results
+    results = [
+        pinocchio.Quaternion(pinocchio.exp3(vector) @ rotation).normalized().matrix()
+        for rotation, vector in zip(rotations, vectors, strict=True)
+    ]
+    return np.array(results).reshape(-1, 3, 3)
 
 
 def rotation_matrices(quaternions: Array) -> Array:
     """Return rotation matrices, shape (n, 3, 3), of quaternions w, x, y, z of any length but 0, shape (n, 4)."""
-    results = np.empty((len(quaternions), 3, 3))
-    for row, quaternion in enumerate(quaternions):
-        results[row] = pinocchio.Quaternion(*quaternion.tolist()).normalized().matrix()
-    return results
+    results = [pinocchio.Quaternion(*quaternion.tolist()).normalized().matrix() for quaternion in quaternions]
+    return np.array(results).reshape(-1, 3, 3)

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.kernels import largest_change
+from bhd_lerobot.control.messages import Limit
 
 # [1/s] How eagerly a remaining error is closed. With the jerk limit of a UR5 the first follows random setpoints best:
 # less lags, more overshoots. Without a jerk limit it may be twice as much.
@@ -27,6 +28,7 @@ class SetpointFilter:
 
     Attributes:
         clearance: what slows an arm down before it comes too near to something; nothing does if None.
+        limits: the `Limit` flags raised since they were last cleared, shape (n,).
 
     Args:
         control_hz: ticks a second [Hz].
@@ -71,11 +73,7 @@ class SetpointFilter:
         self._all_active = False
         self.clearance = clearance
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_position: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited_clearance: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limited = False  # whether any of them may be set
+        self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
 
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
         """Head for new setpoints.
@@ -89,8 +87,7 @@ class SetpointFilter:
         where = mask[:, None]
         outside = (clipped != values) & where
         if np.count_nonzero(outside):
-            self.limited = True
-            self.limited_position |= outside.any(axis=1)
+            self.limits[outside.any(axis=1)] |= int(Limit.POSITION)
         starting = mask > self.active
         if np.count_nonzero(starting):
             np.copyto(self._target, position, where=starting[:, None])
@@ -143,14 +140,14 @@ class SetpointFilter:
         self._slow_near_ends(position)
         speed = np.maximum(wanted, self._slowest, out=size)
         np.minimum(speed, self._speed, out=speed)
-        self._note(self.limited_velocity, speed, wanted)
+        self._note(Limit.VELOCITY, speed, wanted)
         if self.clearance is not None:
             self._keep_clear(self.clearance, position, velocity, speed)
         np.subtract(speed, velocity, out=change)
         np.multiply(change, self._hz, out=change)
         allowed = np.maximum(change, self._hardest, out=error)
         np.minimum(allowed, self._acceleration, out=allowed)
-        self._note(self.limited_acceleration, allowed, change)
+        self._note(Limit.ACCELERATION, allowed, change)
         if self._is_gradual:
             self._change_gradually(allowed, change, acceleration)
         if self._all_active:
@@ -182,8 +179,7 @@ class SetpointFilter:
         clearance.run(self._runs, position, velocity, speed, self.active)
         if clearance.slows:
             speed[:, : clearance.dof] *= clearance.share[:, None]
-            self.limited = True
-            self.limited_clearance |= clearance.share < 1.0
+            self.limits[clearance.share < 1.0] |= int(Limit.CLEARANCE)
 
     def _arrive(self) -> None:
         arrived = self._arrival == self._runs
@@ -203,11 +199,10 @@ class SetpointFilter:
         if self._any_downward and np.count_nonzero(np.logical_and(self._downward, wanted < 0, out=flags)):
             np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)), out=wanted)
 
-    def _note(self, limited: NDArray[np.bool_], got: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
+    def _note(self, limit: Limit, got: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
         """Flag the robots that did not get what was wanted."""
         if np.count_nonzero(np.not_equal(got, wanted, out=self._flags)):
-            self.limited = True
-            limited |= self.active & self._flags.any(axis=1)
+            self.limits[self.active & self._flags.any(axis=1)] |= int(limit)
 
     def _stoppable(self, room: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest speed of the next tick that leaves enough room to stop in.
@@ -238,10 +233,4 @@ class SetpointFilter:
         self._next_arrival = int(self._arrival.min())
         if self.clearance is not None:
             self.clearance.restart(ids)
-        for flags in (
-            self.limited_position,
-            self.limited_velocity,
-            self.limited_acceleration,
-            self.limited_clearance,
-        ):
-            flags[ids] = False
+        self.limits[ids] = 0

@@ -134,7 +134,7 @@ class BaseController(Controller):
             )
         self._target, self._before, self._rate = np.zeros((3, n, width))
         self._hard = np.zeros(n, np.bool_)  # brakes as hard as it can
-        self._limits = np.zeros(n, np.int64)
+        self.limits = np.zeros(n, np.int64)
         # Of the wheels since the last look at their progress: how far they were to turn, where they were, and how far
         # the gyroscope states that the bases turned; and looks that found otherwise.
         self._asked, self._start = np.zeros((2, n, self.joints))
@@ -148,9 +148,9 @@ class BaseController(Controller):
         change = np.array([limits.acceleration, limits.stop_deceleration]) / control_hz
         jerk = np.asarray(limits.jerk) / control_hz**2
         largest = np.asarray(limits.velocity, float), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
-        state = self._target, self.command, self._before, self._rate, self._hard, self._limits
+        state = self._target, self.command, self._before, self._rate, self._hard, self.limits
         self._limit = limit_command.bind(*state, *largest)
-        looks = self._start, self._asked, self._turned, self._looks, self._look_at, self._limits, self.protective_stop
+        looks = self._start, self._asked, self._turned, self._looks, self._look_at, self.limits, self.protective_stop
         numbers = np.array([*wheels[:2], turn, error, control_hz]), self._period, -1 if gyro is None else gyro
         self._drive_wheels = drive_wheels.bind(self.command, self._wheel_speeds, *looks, *numbers)
 
@@ -181,7 +181,7 @@ class BaseController(Controller):
             self._watch(reading, self._monitor)
             near = self._monitor.limit(self.command, self._before, self.drive.odometry)
             if near is not None:
-                self._limits[near.any(axis=1)] |= Limit.CLEARANCE
+                self.limits[near.any(axis=1)] |= Limit.CLEARANCE
                 self._rate[near] = 0.0  # the next change starts anew: such a large one could not end in time
         self._ticks += 1
         self._drive_wheels(reading.position, reading.velocity, reading.sensors, self._ticks)
@@ -212,16 +212,10 @@ class BaseController(Controller):
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self._wheel_speeds, self._rate, self._hard, self._limits):
+        for array in (self.command, self._target, self._wheel_speeds, self._rate, self._hard, self.limits):
             array[ids] = 0
         if self._monitor is not None:
             self._monitor.forget(ids)
-
-    def take_limits(self) -> Counts:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        limits = self._limits.copy()
-        self._limits[:] = 0
-        return limits
 
     def efforts(self, reading: PlantReading) -> Array:
         """Return the torques of the servos [N m], shape (n, joints)."""

@@ -61,17 +61,15 @@ class DynamicsTerms:
 class ArmDynamics:
     """The rigid-body model of an arm, from the same MJCF that is simulated, with its declared load.
 
-    Args:
-        arm: the arm.
-        opening: opening of the gripper that its inertia is computed for [m]; the arm's at home if None. The centre of
-            mass does not depend on it, because the fingers move as one.
+    The gripper's inertia is that of the opening at home. Its centre of mass does not depend on it, because the fingers
+    move as one.
 
     Raises:
         ConfigError: the MJCF has other joints than the arm's chain and gripper, no tool, or the opening is impossible.
     """
 
-    def __init__(self, arm: Arm, opening: float | None = None) -> None:
-        opening = arm.home[-1] if opening is None else opening
+    def __init__(self, arm: Arm) -> None:
+        opening = arm.home[-1]
         if not 0.0 <= opening <= arm.gripper.max_opening:
             raise ConfigError(
                 f"The gripper's opening is {opening} m; it must be between 0 and {arm.gripper.max_opening} m."
@@ -90,13 +88,12 @@ class ArmDynamics:
         self.model = pinocchio.buildReducedModel(whole, locked, posture)
         self.dof = self.model.nv
         self.model.armature = whole.armature[: self.dof]  # version 3 of Pinocchio drops it; the fingers are the last
-        self._data = self.model.createData()
         self._tool = self.model.getFrameId(TOOL_SITE)
         if arm.load:
             last = self.model.frames[self._tool].parentJoint
             lever = self.model.frames[self._tool].placement.translation
             self.model.inertias[last] += pinocchio.Inertia(arm.load, lever, np.zeros((3, 3)))
-            self._data = self.model.createData()
+        self._data = self.model.createData()
 
     def terms(self, position: Array, velocity: Array) -> DynamicsTerms:
         """Return the dynamics in a state of n arms.

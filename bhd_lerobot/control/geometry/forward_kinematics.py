@@ -23,9 +23,6 @@ class ForwardKinematics:
 
     Postures are joint positions [rad], shape (..., 6); every frame is given in the base frame.
 
-    Args:
-        chain: the geometry.
-
     Raises:
         ConfigError: the chain has another structure than the closed forms.
     """

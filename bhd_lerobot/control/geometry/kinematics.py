@@ -46,7 +46,6 @@ class ArmKinematics(ForwardKinematics):
     Poses are tool frames in the base frame, shape (..., 4, 4).
 
     Args:
-        chain: the geometry.
         limits: limits of its commands; the first six are the joints'.
 
     Raises:
@@ -62,16 +61,7 @@ class ArmKinematics(ForwardKinematics):
         self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
 
     def solutions(self, pose: Array, last: Array | float = 0.0) -> Array:
-        """Return every posture that reaches a pose, in closed form, whether it may be taken or not.
-
-        Args:
-            pose: shape (..., 4, 4).
-            last: position of the last joint where the pose leaves it free [rad], shape (...).
-
-        Returns:
-            Joint positions in [-pi, pi] [rad], shape (..., 8, 6), one for each branch of
-            `inverse_kinematics.solutions`; NaN where it does not reach the pose.
-        """
+        """Return every posture that reaches a pose, permitted or not, see `inverse_kinematics.solutions`."""
         return inverse_kinematics.solutions(self.chain, pose, last)
 
     def check(self, q: Array) -> Codes:

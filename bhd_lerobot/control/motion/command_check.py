@@ -1,7 +1,6 @@
 """What is wrong with a goal before anything is planned: its form, its numbers, and the arm's ranges. Pure."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,7 @@ NORM_ERROR = 1e-3  # a quaternion's norm may differ from 1 by this
 
 
 def check(command: BrainCommand, arm: Arm) -> PlanFailure | None:
-    """Return the first thing that is wrong with a goal, or None.
-
-    Args:
-        command: the goal.
-        arm: what it is for.
-    """
+    """Return the first thing that is wrong with a goal for an arm, or None."""
     return (
         _check_form(command, len(arm.chain.joints))
         or _check_pose(command)
@@ -50,11 +44,11 @@ def _check_form(command: BrainCommand, dof: int) -> PlanFailure | None:
         message = "The goal has no target; give target_pose, joint_target or gripper."
     elif joints is not None and command.motion == "line":
         message = "A line needs target_pose; with joint_target the motion must be 'joint'."
-    elif joints is not None and not _is_list(joints, dof):
+    elif joints is not None and not are_numbers(joints, dof):
         message = f"joint_target is {joints!r}; it needs {dof} numbers [rad]."
-    elif pose is not None and not (_is_list(pose.position, 3) and _is_list(pose.quaternion, 4)):
+    elif pose is not None and not (are_numbers(pose.position, 3) and are_numbers(pose.quaternion, 4)):
         message = f"target_pose is {pose!r}; it needs a position of 3 numbers [m] and a quaternion of 4."
-    elif command.gripper is not None and not _is_list((command.gripper,), 1):
+    elif command.gripper is not None and not are_numbers((command.gripper,), 1):
         message = f"gripper is {command.gripper!r}; it must be a number [m]."
     return None if message is None else PlanFailure(ResultCode.BAD_TARGET, message)
 
@@ -108,11 +102,11 @@ def _check_speed(command: BrainCommand, arm: Arm) -> PlanFailure | None:
         ("max_velocity", command.max_velocity, speed, f"{unit}/s", ResultCode.BAD_VELOCITY),
         ("max_acceleration", command.max_acceleration, change, f"{unit}/s^2", ResultCode.BAD_ACCELERATION),
     ):
-        if value is not None and not (_is_list((value,), 1) and 0.0 < value <= largest):
+        if value is not None and not (are_numbers((value,), 1) and 0.0 < value <= largest):
             return PlanFailure(
                 code, f"{name} is {value!r}; for this motion it must be above 0 and at most {largest:.6g} {unit_of}."
             )
-    if not (_is_list((command.timeout_s,), 1) and 0.0 < command.timeout_s <= MAX_TIMEOUT_S):
+    if not (are_numbers((command.timeout_s,), 1) and 0.0 < command.timeout_s <= MAX_TIMEOUT_S):
         return PlanFailure(
             ResultCode.BAD_TIMEOUT,
             f"timeout_s is {command.timeout_s!r}; it must be above 0 and at most {MAX_TIMEOUT_S:g} s.",
@@ -120,10 +114,10 @@ def _check_speed(command: BrainCommand, arm: Arm) -> PlanFailure | None:
     return None
 
 
-def _is_list(values: Sequence[float], length: int) -> bool:
-    """Tell whether these are so many numbers; messages from outside may hold anything."""
+def are_numbers(values: Any, length: int) -> bool:
+    """Tell whether these are so many numbers that a float can hold; messages from outside may hold anything."""
     try:
         array = np.asarray(values)
-    except ValueError:  # lists of different lengths
+    except (ValueError, OverflowError):  # lists of different lengths
         return False
     return array.shape == (length,) and array.dtype.kind in "fiu"

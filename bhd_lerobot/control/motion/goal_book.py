@@ -17,6 +17,8 @@ REASONS = {
 NO_FAILURE = (ResultCode.SUCCEEDED, ResultCode.CANCELLED, ResultCode.PREEMPTED, ResultCode.REPLACED_BY_SETPOINT)
 """How a goal may end without anything being wrong."""
 
+_CAPACITY = 8  # goals that may wait
+
 
 class GoalBook:
     """Ensures that every goal of one episode ends in exactly one result.
@@ -26,11 +28,10 @@ class GoalBook:
         cancelled: whether the goal that is followed is to end as soon as the arm is at rest.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self) -> None:
         self.waiting: deque[BrainCommand] = deque()
         self.followed: BrainCommand | None = None
         self.cancelled = False
-        self._capacity = capacity
         self._used: set[str] = set()
         self._results: list[CommandResult] = []
 
@@ -54,9 +55,9 @@ class GoalBook:
             return self.report(name, ResultCode.DUPLICATE_ID, message)
         self._used.add(key)
         failure = check(command) if blocked is None else PlanFailure(blocked, REASONS.get(blocked, blocked.name))
-        if failure is None and not command.preempt and len(self.waiting) >= self._capacity:
+        if failure is None and not command.preempt and len(self.waiting) >= _CAPACITY:
             failure = PlanFailure(
-                ResultCode.QUEUE_FULL, f"{self._capacity} goals wait already; send it later, or with preempt."
+                ResultCode.QUEUE_FULL, f"{_CAPACITY} goals wait already; send it later, or with preempt."
             )
         if failure is not None:
             return self.report(name, failure.code, failure.message)

@@ -13,6 +13,7 @@ from bhd_lerobot.control.commands import (
     Pose,
     ResultCode,
 )
+from bhd_lerobot.control.motion.command_check import are_numbers
 from bhd_lerobot.control.motion.trajectory import PlanFailure
 from bhd_lerobot.errors import ActionError, unknown_name
 
@@ -75,10 +76,6 @@ def check_encodable(command: BrainCommand, dof: int) -> PlanFailure | None:
     """Return why a goal does not fit into a record, or None.
 
     What fits is not yet a goal that an arm can follow; that is found out where the goal is taken.
-
-    Args:
-        command: the goal.
-        dof: number of joints.
     """
     untyped: Any = command  # messages from outside may hold anything
     name, pose, joints = untyped.task_id, untyped.target_pose, untyped.joint_target
@@ -92,12 +89,12 @@ def check_encodable(command: BrainCommand, dof: int) -> PlanFailure | None:
     elif not isinstance(untyped.preempt, bool):
         message = f"preempt is {untyped.preempt!r}; it must be True or False."
     elif pose is not None and not (
-        isinstance(pose, Pose) and _are_numbers(pose.position, 3) and _are_numbers(pose.quaternion, 4)
+        isinstance(pose, Pose) and are_numbers(pose.position, 3) and are_numbers(pose.quaternion, 4)
     ):
         message = f"target_pose is {pose!r}; it needs a position of 3 numbers [m] and a quaternion of 4."
-    elif joints is not None and not _are_numbers(joints, dof):
+    elif joints is not None and not are_numbers(joints, dof):
         message = f"joint_target is {joints!r}; it needs {dof} numbers [rad]."
-    elif not _are_numbers((untyped.timeout_s,), 1):
+    elif not are_numbers((untyped.timeout_s,), 1):
         code, message = ResultCode.BAD_TIMEOUT, f"timeout_s is {untyped.timeout_s!r}; it must be a number [s]."
     elif field := next((name for name in _OPTIONAL if not _is_number_or_none(getattr(untyped, name))), ""):
         code, message = _OPTIONAL[field], f"{field} is {getattr(untyped, field)!r}; it must be a number, or left out."
@@ -105,14 +102,7 @@ def check_encodable(command: BrainCommand, dof: int) -> PlanFailure | None:
 
 
 def encode_goal(command: BrainCommand, dof: int) -> np.void:
-    """Return a goal as a record of `goal_dtype(dof)`.
-
-    Raises:
-        ActionError: it does not fit, see `check_encodable`.
-    """
-    failure = check_encodable(command, dof)
-    if failure is not None:
-        raise ActionError(failure.message)
+    """Return a goal that fits, see `check_encodable`, as a record of `goal_dtype(dof)`."""
     record = np.zeros(1, goal_dtype(dof))[0]
     _write_name(record, command.task_id)
     write_goal(record, command)
@@ -120,12 +110,7 @@ def encode_goal(command: BrainCommand, dof: int) -> np.void:
 
 
 def write_goal(record: Any, command: BrainCommand) -> None:
-    """Write all of a goal but its name into a record; the goal must fit.
-
-    Args:
-        record: of `goal_dtype(dof)`.
-        command: the goal.
-    """
+    """Write all of a goal but its name into a record of `goal_dtype(dof)`; the goal must fit."""
     pose, joints = command.target_pose, command.joint_target
     record["has_pose"], record["has_joints"] = pose is not None, joints is not None
     if pose is not None:
@@ -210,23 +195,17 @@ def decode_message(record: Any) -> str:
     return _decode(record["message"], int(record["message_size"]))
 
 
-def encode_feedback(feedback: Feedback | None, record: Any = None) -> Any:
-    """Return feedback, or that there is none, as a record of `FEEDBACK_DTYPE`.
-
-    Args:
-        feedback: the feedback.
-        record: where it is written to; a new record if None.
+def write_feedback(record: Any, feedback: Feedback | None) -> None:
+    """Write feedback, or that there is none, into a record of `FEEDBACK_DTYPE`.
 
     Raises:
         ActionError: the task_id is too long.
     """
-    record = np.zeros(1, FEEDBACK_DTYPE)[0] if record is None else record
     record["present"] = feedback is not None
     if feedback is not None:
         _write_name(record, feedback.task_id)
         record["phase"], record["progress"] = feedback.phase, feedback.progress
         record["remaining_s"], record["position_error"] = feedback.remaining_s, feedback.position_error
-    return record
 
 
 def decode_feedback(record: Any) -> Feedback | None:
@@ -256,13 +235,4 @@ def _decode(data: bytes, size: int) -> str:
 
 
 def _is_number_or_none(value: Any) -> bool:
-    return value is None or _are_numbers((value,), 1)
-
-
-def _are_numbers(values: Any, length: int) -> bool:
-    """Tell whether these are so many numbers that a float can hold."""
-    try:
-        array = np.asarray(values)
-    except (ValueError, OverflowError):  # lists of different lengths
-        return False
-    return array.shape == (length,) and array.dtype.kind in "fiu"
+    return value is None or are_numbers((value,), 1)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
@@ -17,7 +16,7 @@ from bhd_lerobot.control.motion.trajectory import PlanFailure, State, to_target
 
 Array = NDArray[np.float64]
 Reference = tuple[Array, Array, Array]
-"""Position, velocity and acceleration, each of shape (n, dof + 1)."""
+"""Position [rad, and m for the gripper], velocity and acceleration, each of shape (n, dof + 1)."""
 
 
 class _Motion(IntEnum):
@@ -41,25 +40,12 @@ class GoalManager:
         limit: how far joints may be from their references.
 
     Args:
-        arm: the arm.
-        n: number of arms.
         control_hz: ticks a second [Hz].
-        kinematics: the arm's; made from its chain if None.
-        queue: how many goals may wait.
         planning: who plans; planned in the tick that a goal starts in if None.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        n: int,
-        control_hz: int,
-        kinematics: ArmKinematics | None = None,
-        queue: int = 8,
-        *,
-        planning: Planning | None = None,
-    ) -> None:
-        self.planner = GoalPlanner(arm, control_hz, kinematics)
+    def __init__(self, arm: Arm, n: int, control_hz: int, planning: Planning | None = None) -> None:
+        self.planner = GoalPlanner(arm, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
@@ -68,8 +54,7 @@ class GoalManager:
         self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
         self._supervisor = Supervisor(arm, n, control_hz)
         self.limit = self._supervisor.limit
-        self._capacity = queue
-        self._books = [GoalBook(queue) for _ in range(n)]
+        self._books = [GoalBook() for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is
         self._held: list[Capsule | None] = [None] * n
         self._planned = np.ones(n, np.int64)  # ticks of the trajectory of the goal that is followed
@@ -83,18 +68,10 @@ class GoalManager:
     # --- requests of a brain -----------------------------------------------------------------------------------------
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
-        """Take a goal; it starts as soon as it is planned.
+        """Take a goal, see `Controller.submit`; it starts as soon as it is planned.
 
         A refusal is also among the results, except for a goal that has the name of one that is followed or waits: that
         one still gets its own. A name counts as used even if its goal was refused.
-
-        Args:
-            sim: the arm.
-            command: the goal.
-            blocked: why the arm takes no goals now; None if it does.
-
-        Returns:
-            None if it was accepted, otherwise the refusal.
         """
         book = self._books[sim]
         refusal = book.admit(command, blocked, self.planner.check)
@@ -105,11 +82,7 @@ class GoalManager:
         return refusal
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
-        """Cancel a goal: one that waits ends at once, one that is followed when the arm has come to rest.
-
-        Returns:
-            SUCCEEDED, or UNKNOWN_ID if no such goal is followed or waits.
-        """
+        """Cancel a goal: one that waits ends at once, one that is followed when the arm has come to rest."""
         book = self._books[sim]
         code = book.cancel(task_id)
         if book.followed is None and not book.waiting and self.phase[sim] == GoalPhase.CONVERTING:
@@ -137,59 +110,37 @@ class GoalManager:
         """Plan with something in an arm's gripper from now on; with nothing if None."""
         self._held[sim] = held
 
-    def stop(  # noqa: PLR0917  the reference is three arrays
-        self,
-        mask: NDArray[np.bool_],
-        code: ResultCode,
-        hard: bool,
-        position: Array,
-        velocity: Array,
-        acceleration: Array,
-    ) -> None:
+    def stop(self, mask: NDArray[np.bool_], code: ResultCode, hard: bool, reference: Reference) -> None:
         """End all goals of some arms at once, and brake from the next tick on.
 
         Args:
             mask: the arms, shape (n,).
             code: how their goals end.
             hard: whether to brake with the limits of a stop; a stop that has begun hard stays so.
-            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
-            velocity: shape (n, dof + 1).
-            acceleration: shape (n, dof + 1).
+            reference: where they are.
         """
         for sim in np.flatnonzero(mask).tolist():
             self._end_all(sim, code, REASONS.get(code, "The arm was stopped."))
             wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
             if self._motion[sim] < wanted:
-                self._brake(sim, (position, velocity, acceleration), wanted)
+                self._brake(sim, reference, wanted)
             self._changed(sim)
 
-    def drop_for_setpoint(self, mask: NDArray[np.bool_]) -> None:
-        """End all goals of some arms, and let the owner have the reference. `mask` has shape (n,)."""
-        for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, ResultCode.REPLACED_BY_SETPOINT, "A setpoint came, and the newer command counts.")
-            self._rest(sim)
-            self._changed(sim)
-
-    def end_all(self, mask: NDArray[np.bool_], message: str) -> None:
-        """End all goals of arms that something is in the way of, with PATH_TOLERANCE; their reference stays as it is.
+    def end_all(self, mask: NDArray[np.bool_], code: ResultCode, message: str) -> None:
+        """End all goals of some arms, and let the owner have the reference, which stays as it is.
 
         Args:
             mask: the arms, shape (n,).
+            code: how their goals end.
             message: why.
         """
         for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, ResultCode.PATH_TOLERANCE, message)
+            self._end_all(sim, code, message)
             self._rest(sim)
             self._changed(sim)
 
     def retreat(self, mask: NDArray[np.bool_], reference: Reference, target: Array) -> None:
-        """Bring the reference of arms that follow nothing somewhere else.
-
-        Args:
-            mask: the arms, shape (n,).
-            reference: position, velocity and acceleration, each of shape (n, dof + 1).
-            target: within the limits, shape (n, dof + 1).
-        """
+        """Bring the reference of arms that follow nothing to a target within the limits, shape (n, dof + 1)."""
         for sim in np.flatnonzero(mask).tolist():
             state = State.of(*(array[sim] for array in reference))
             way = to_target(state, target[sim], self.planner.stop_limits, self._hz)
@@ -210,30 +161,23 @@ class GoalManager:
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else, results included."""
         for sim in np.asarray(ids).tolist():
-            self._books[sim] = GoalBook(self._capacity)
+            self._books[sim] = GoalBook()
             self._held[sim] = None
             self._rest(sim)
             self.phase[sim] = GoalPhase.IDLE
             self._changed(sim)
 
-    def tick(
-        self, position: Array, velocity: Array, acceleration: Array, measured_position: Array, measured_velocity: Array
-    ) -> None:
+    def tick(self, reference: Reference, measured: tuple[Array, Array]) -> None:
         """Judge what is followed, start what is next, and advance the reference by one tick, in place.
 
         Args:
-            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
-            velocity: shape (n, dof + 1).
-            acceleration: shape (n, dof + 1).
-            measured_position: what the reference before this tick led to, shape (n, dof + 1).
-            measured_velocity: shape (n, dof + 1).
+            reference: where the arms are commanded to be.
+            measured: what the reference before this tick led to: positions and velocities, each of shape (n, dof + 1).
         """
         if self._idle:
             return
         self._orders.tick += 1
-        reference = (position, velocity, acceleration)
         if len(self._judged):
-            measured = (measured_position, measured_velocity)
             for verdict in self._supervisor.judge(self._judged, self._player.active, reference[:2], measured):
                 self._end(verdict.sim, verdict.code, verdict.message)
                 self._brake(verdict.sim, reference, _Motion.BRAKE)
@@ -248,7 +192,7 @@ class GoalManager:
             for sim in sorted(self._waiting):
                 if self._serve(sim, reference):
                     self._changed(sim)
-        self._player.tick(position, velocity, acceleration)
+        self._player.tick(*reference)
 
     # --- the state machine -------------------------------------------------------------------------------------------
 

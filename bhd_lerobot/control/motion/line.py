@@ -129,8 +129,9 @@ def _timed(
     joints do, it is as slow everywhere as they are where they are slowest; then the law follows what they permit.
     """
     even = _evenly(spline, length, limits, hz)
+    even_ticks = even.ticks if isinstance(even, Trajectory) else np.inf
     joints, tool = limits
-    if isinstance(even, Trajectory) and even.ticks <= _GOOD * tool.least_s(length) * hz:
+    if even_ticks <= _GOOD * tool.least_s(length) * hz:
         return even
     # The tool is one joint more, which moves evenly.
     path = CubicSpline(spline.x, np.column_stack((spline(spline.x), spline.x * length)))
@@ -141,15 +142,11 @@ def _timed(
     )
     timer = PathTimer(path, own)
     bound = timer.bound()
-    if bound is None or bound > MAX_DURATION_S or (isinstance(even, Trajectory) and even.ticks <= _GOOD * bound * hz):
+    if bound is None or bound > MAX_DURATION_S or even_ticks <= _GOOD * bound * hz:
         return even
     timing = timer.find()
     quick = None if timing is None else _sampled(path, timing, own, hz)
-    if (
-        quick is None
-        or quick.ticks > MAX_DURATION_S * hz
-        or (isinstance(even, Trajectory) and even.ticks <= quick.ticks)
-    ):
+    if quick is None or quick.ticks > MAX_DURATION_S * hz or even_ticks <= quick.ticks:
         return even
     return quick
 

@@ -27,13 +27,7 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class PathLimits:
-    """What may not be exceeded on a path, for each of its joints; a row without a limit has infinity.
-
-    Attributes:
-        velocity: shape (joints,).
-        acceleration: shape (joints,).
-        jerk: shape (joints,).
-    """
+    """What may not be exceeded on a path, each of shape (joints,); a joint without a limit has infinity."""
 
     velocity: Array
     acceleration: Array

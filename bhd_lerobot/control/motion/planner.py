@@ -56,16 +56,15 @@ class GoalPlanner:
     Args:
         arm: limits and geometry.
         control_hz: ticks a second [Hz].
-        kinematics: the arm's; made from its chain if None.
 
     Raises:
         VersionError: Ruckig is not installed.
     """
 
-    def __init__(self, arm: Arm, control_hz: int, kinematics: ArmKinematics | None = None) -> None:
+    def __init__(self, arm: Arm, control_hz: int) -> None:
         load_ruckig()  # not in the tick that plans the first goal
         self.arm, self.hz = arm, control_hz
-        self.kinematics = ArmKinematics(arm.chain, arm.limits) if kinematics is None else kinematics
+        self.kinematics = ArmKinematics(arm.chain, arm.limits)
         self.dof = dof = len(arm.chain.joints)
         self.limits = MotionLimits.of(arm.limits)
         self.stop_limits = MotionLimits.of(arm.limits, stop=True)
@@ -92,7 +91,6 @@ class GoalPlanner:
         """Return how a goal is reached from a commanded state.
 
         Args:
-            command: the goal.
             position: the state [rad, and m for the gripper], shape (dof + 1,).
             velocity: shape (dof + 1,).
             acceleration: shape (dof + 1,).

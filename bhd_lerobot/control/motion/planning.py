@@ -44,8 +44,6 @@ class Planning(Protocol):
         """Request a plan; an earlier request is dropped.
 
         Args:
-            sim: the arm.
-            command: the goal.
             state: where the plan is to start [rad, and m for the gripper], each of shape (dof + 1,).
             opening: where the gripper is commanded to [m], for goals that leave it as it is; None: where it is.
             start_tick: the tick that the plan is to start at.
@@ -167,9 +165,15 @@ class PlanOrders:
             command: the goal; the same one as long as the arm waits for its plan.
             opening: where the gripper is commanded to [m]; None: where it is.
         """
+
+        def order_for(lead: int) -> _Order:
+            self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
+            self._planning.request(sim, command, order.state, opening, self.tick + lead, held)
+            return order
+
         order = self._orders[sim]
         if order is None:
-            order = self._order(sim, command, self._planning.lead, ahead, opening, held)
+            order = order_for(self._planning.lead)
         if order.answer is None:
             order.answer = self._planning.poll(sim)
             order.arrived_tick = self.tick
@@ -188,21 +192,8 @@ class PlanOrders:
             return answer
         if order.lead >= MOST_LEADS * self._planning.lead:
             return self._give_up(sim, self._slowness(order))
-        self._order(sim, command, 2 * order.lead, ahead, opening, held)
+        order_for(2 * order.lead)
         return None
-
-    def _order(  # noqa: PLR0917
-        self,
-        sim: int,
-        command: BrainCommand,
-        lead: int,
-        ahead: Callable[[int], State],
-        opening: float | None,
-        held: Capsule | None,
-    ) -> _Order:
-        self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
-        self._planning.request(sim, command, order.state, opening, self.tick + lead, held)
-        return order
 
     def _give_up(self, sim: int, message: str) -> PlanFailure:
         self.drop(sim)

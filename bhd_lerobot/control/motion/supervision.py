@@ -107,9 +107,7 @@ class Supervisor:
         self._begun, self._deadline = np.zeros(n, np.int64), np.zeros(n, np.int64)  # ticks
         self._next_deadline = 0  # no goal that is followed has an earlier one
         self._since_end, self._still = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        # How far each joint is from its reference [rad; m]: the gripper's column is not used.
-        self._away = np.zeros((n, self._dof + 1))
-        self._arm_away = self._away[:, : self._dof]
+        self._away = np.zeros((n, self._dof))  # how far each joint is from its reference [rad]
         self._off = np.zeros((n, self._dof), np.bool_)
         self._follow = follow_references.bind(self._away, self._most_off, self._off, self._still)
 
@@ -126,7 +124,7 @@ class Supervisor:
 
     def error(self, sim: int) -> float:
         """Return the largest distance of a joint from its reference at the last tick [rad]."""
-        return float(self._arm_away[sim].max())
+        return float(self._away[sim].max())
 
     def judge(
         self,
@@ -156,7 +154,7 @@ class Supervisor:
     def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]
         if self._off[sim].any():
-            away, most = self._arm_away[sim], self._most_off[sim]
+            away, most = self._away[sim], self._most_off[sim]
             joint = int((away - most).argmax())
             return Verdict(
                 sim,

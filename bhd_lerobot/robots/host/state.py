@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.cerebellum import MOVING
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, encode_feedback
+from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, write_feedback
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.robots.host.host import Host
 
@@ -147,7 +147,7 @@ class StatePublisher:
         if frame < self._next_frame:
             return
         self._next_frame = frame + 1
-        encode_feedback(self._cerebellum.controller.feedback(0), self._feedback)
+        write_feedback(self._feedback, self._cerebellum.controller.feedback(0))
         limits, watchdog = self._cerebellum.take_flags()
         raised = int(limits[0])
         if raised:

@@ -24,7 +24,7 @@ from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
 from bhd_lerobot.control.keys import KeySource, KeyTerminal
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-from bhd_lerobot.control.motion.goal_codec import encode_feedback
+from bhd_lerobot.control.motion.goal_codec import write_feedback
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.options.parse import parse
@@ -249,7 +249,7 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
 
 
 def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot) -> None:
-    encode_feedback(Feedback("2-down", GoalPhase.EXECUTING, 0.25, 1.5, 0.01), robot.state["feedback"])
+    write_feedback(robot.state["feedback"], Feedback("2-down", GoalPhase.EXECUTING, 0.25, 1.5, 0.01))
     robot.tick(1, mode=Mode.TRACKING, setpoints=7)
     sampler, block = robot.sampler()
     shown = sampler.sample()

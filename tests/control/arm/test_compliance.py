@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
-from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.arm.equilibrium import ACCELERATION, SPEED, TURN_ACCELERATION, TURN_SPEED, Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import ContactObserver
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
@@ -71,11 +71,8 @@ def test_a_compliance_cannot_be_changed_behind_its_checks() -> None:
         np.asarray(compliance.stiffness)[0, 0] = -1.0
 
 
-LIMITS = EquilibriumLimits()
-
-
 def equilibrium(n: int = 1) -> Equilibrium:
-    return Equilibrium(n, HZ, 20, LIMITS, (0.15, 2.0))
+    return Equilibrium(n, HZ, 20, (0.15, 2.0))
 
 
 def run(one: Equilibrium, ticks: int) -> dict[str, Array]:
@@ -97,10 +94,10 @@ def test_it_arrives_within_its_limits_along_a_straight_line() -> None:
     one.set_setpoint(position, rotation, opening, np.ones(n, np.bool_))
     log = run(one, 2200)
     speed, change = log["speed"], np.diff(log["speed"], axis=0) * HZ
-    assert np.linalg.norm(speed[:, :, :3], axis=2).max() <= LIMITS.speed + 1e-9
-    assert np.linalg.norm(speed[:, :, 3:], axis=2).max() <= LIMITS.turn_speed + 1e-9
-    assert np.linalg.norm(change[:, :, :3], axis=2).max() <= LIMITS.acceleration + 1e-9
-    assert np.linalg.norm(change[:, :, 3:], axis=2).max() <= LIMITS.turn_acceleration + 1e-9
+    assert np.linalg.norm(speed[:, :, :3], axis=2).max() <= SPEED + 1e-9
+    assert np.linalg.norm(speed[:, :, 3:], axis=2).max() <= TURN_SPEED + 1e-9
+    assert np.linalg.norm(change[:, :, :3], axis=2).max() <= ACCELERATION + 1e-9
+    assert np.linalg.norm(change[:, :, 3:], axis=2).max() <= TURN_ACCELERATION + 1e-9
     np.testing.assert_allclose(log["position"][-1], position, atol=1e-6)
     np.testing.assert_allclose(log["opening"][-1], opening, atol=1e-6)
     assert np.abs(rotation_vectors(log["rotation"][-1] @ rotation.swapaxes(1, 2))).max() < 1e-5
@@ -118,12 +115,6 @@ def test_a_steady_stream_is_followed_without_a_lag() -> None:
         log = run(one, 20)
     assert log["speed"][-1][0, 0] == pytest.approx(0.1, abs=1e-3)
     assert one.position[0, 0] == pytest.approx(target[0, 0], abs=3e-4)  # a tick's way
-
-
-@pytest.mark.parametrize("name", ["speed", "acceleration", "turn_speed", "turn_acceleration"])
-def test_impossible_limits_are_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match=name):
-        EquilibriumLimits(**{name: 0.0})
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0, 501.0, float("nan")])

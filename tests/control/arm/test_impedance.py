@@ -242,6 +242,17 @@ def test_a_restart_forgets_the_episode_before() -> None:
     assert not rig.controller.wrench.any()
 
 
+def test_a_restart_forgets_which_limits_were_met() -> None:
+    rig = StuckRig()
+    met = Limit.VELOCITY | Limit.ACCELERATION
+    rig.target[0, 2] += 10.0
+    rig.send()
+    assert Limit(int(rig.cerebellum.take_flags()[0][0])) & met == met
+    rig.send()
+    rig.cerebellum.restart(np.array([0]))
+    assert rig.cerebellum.take_flags()[0].tolist() == [Limit.NONE]
+
+
 def test_a_position_servo_is_refused() -> None:
     with pytest.raises(ConfigError, match="actuation"):
         ImpedanceController(ur5(), 1, HZ, 20)

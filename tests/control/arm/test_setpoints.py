@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
+from bhd_lerobot.control.messages import Limit
 
 LIMITS = ur5().limits
 LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
@@ -148,9 +149,9 @@ def test_after_a_moving_stream_the_last_setpoint_is_reached_exactly_too() -> Non
 def test_a_range_s_ends_are_inside() -> None:
     stream = Stream(2)
     stream.set_setpoint(np.stack([LOWER, UPPER]))
-    assert not stream.filter.limited_position.any()
+    assert stream.filter.limits.tolist() == [Limit.NONE, Limit.NONE]
     stream.set_setpoint(np.stack([np.nextafter(LOWER, -10), HOME]))
-    assert stream.filter.limited_position.tolist() == [True, False]
+    assert stream.filter.limits.tolist() == [Limit.POSITION, Limit.NONE]
 
 
 def test_an_arm_without_setpoints_is_left_alone() -> None:

@@ -10,6 +10,7 @@ import pinocchio
 import pytest
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -31,10 +32,14 @@ def engine_at(q: NDArray[np.float64], v: NDArray[np.float64], opening: float) ->
     return data
 
 
+def at_home_open(opening: float) -> Arm:
+    return replace(ARM, home=(*ARM.home[:-1], opening))
+
+
 @pytest.mark.parametrize("opening", [0.0, 0.03, MAX_OPENING])
 def test_it_agrees_with_the_engine(opening: float) -> None:
-    terms = ArmDynamics(ARM, opening).terms(POSTURES, SPEEDS)
-    still = ArmDynamics(ARM, opening).terms(POSTURES, 0 * SPEEDS)
+    dynamics = ArmDynamics(at_home_open(opening))
+    terms, still = dynamics.terms(POSTURES, SPEEDS), dynamics.terms(POSTURES, 0 * SPEEDS)
     for k in range(len(POSTURES)):
         data = engine_at(POSTURES[k], SPEEDS[k], opening)
         mass = np.zeros((8, 8))
@@ -88,7 +93,7 @@ def test_the_damped_mobility_has_an_inverse_in_a_singular_posture() -> None:
 @pytest.mark.parametrize("opening", [-0.01, 0.1, float("nan")])
 def test_an_impossible_opening_is_refused(opening: float) -> None:
     with pytest.raises(ConfigError, match="opening"):
-        ArmDynamics(ARM, opening)
+        ArmDynamics(at_home_open(opening))
 
 
 def test_a_body_that_does_not_fit_its_chain_is_refused() -> None:

@@ -17,11 +17,11 @@ from bhd_lerobot.control.motion.goal_codec import (
     decode_goal,
     decode_name,
     decode_result,
-    encode_feedback,
     encode_goal,
     encode_name,
     encode_result,
     goal_dtype,
+    write_feedback,
 )
 from bhd_lerobot.errors import ActionError
 from tests.cases import each_case
@@ -85,11 +85,11 @@ def test_feedback_comes_out_as_it_went_in(
     name: str, phase: GoalPhase, progress: float, left: float, off: float
 ) -> None:
     feedback = Feedback(name, phase, progress, left, off)
-    assert decode_feedback(in_memory(encode_feedback(feedback), FEEDBACK_DTYPE)) == feedback
     block = np.zeros(3, FEEDBACK_DTYPE)
-    encode_feedback(feedback, block[1])
+    write_feedback(block[1], feedback)
+    assert decode_feedback(in_memory(block[1], FEEDBACK_DTYPE)) == feedback
     assert [decode_feedback(record) for record in block] == [None, feedback, None]
-    encode_feedback(None, block[1])
+    write_feedback(block[1], None)
     assert decode_feedback(block[1]) is None
 
 
@@ -128,8 +128,6 @@ def test_goals_that_do_not_fit_a_record_are_refused(fields: dict[str, Any], code
     assert failure is not None
     assert failure.code == code
     assert words in failure.message
-    with pytest.raises(ActionError, match="(?s)" + failure.message[:10].replace("(", ".").replace("[", ".")):
-        encode_goal(command, DOF)
     if isinstance(command.task_id, str) and len(command.task_id) > 30:
         assert check(command, ARM) is None  # the length of a name matters between processes only
     else:

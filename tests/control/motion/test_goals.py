@@ -225,14 +225,14 @@ def test_no_two_goals_of_an_episode_have_the_same_name() -> None:
 
 
 def test_the_queue_is_finite() -> None:
-    rig = Rig(queue=2)
-    assert [rig.go(name, joint_target=NEAR) is None for name in "abc"] == [True, True, False]
-    assert rig.results() == [("c", ResultCode.QUEUE_FULL)]
+    rig = Rig()
+    assert [rig.go(name, joint_target=NEAR) is None for name in "abcdefghi"] == [True] * 8 + [False]
+    assert rig.results() == [("i", ResultCode.QUEUE_FULL)]
     rig.tick()
-    assert rig.go("d", joint_target=NEAR) is None  # "a" is followed and waits no longer
-    assert rig.go("e", joint_target=NEAR, preempt=True) is None
+    assert rig.go("j", joint_target=NEAR) is None  # "a" is followed and waits no longer
+    assert rig.go("k", joint_target=NEAR, preempt=True) is None
     rig.run()
-    assert len(rig.results()) == 4
+    assert len(rig.results()) == 10
 
 
 def test_a_goal_that_cannot_be_planned_fails_and_the_next_one_is_taken() -> None:

@@ -13,7 +13,7 @@ from bhd_lerobot.control.motion.trajectory import State
 from tests.cases import each_case
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
 
-PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
+PLANNER = GoalPlanner(ARM, HZ)
 NAN, INF = float("nan"), float("inf")
 DOWN = (0.0, 0.7071067811865476, 0.7071067811865476, 0.0)
 
@@ -203,7 +203,8 @@ class Choosy(ArmKinematics):
 
 def test_the_first_posture_with_an_admissible_way_wins_and_at_most_eight_are_tried() -> None:
     kinematics = Choosy(ARM.chain, ARM.limits)
-    planner = GoalPlanner(ARM, HZ, kinematics)
+    planner = GoalPlanner(ARM, HZ)
+    planner.kinematics = kinematics
     command = BrainCommand("a", target_pose=moved())
     into_itself, into_the_table = joints(0.0, 0.0, 1.5), joints(0.0, 1.2)
     kinematics.offered = np.array([into_itself, into_the_table, joints(0.3), joints(0.6)])

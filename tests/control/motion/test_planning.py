@@ -18,13 +18,13 @@ from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
-from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, broken_limit, joints, moved
+from tests.control.goal_rig import ARM, HOME, HZ, Rig, broken_limit, joints, moved
 from tests.control.motion.test_goal_properties import actions, follow
 
 LEAD = 12
 TIMEOUT = 300
 NEVER = 10**9
-PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
+PLANNER = GoalPlanner(ARM, HZ)
 FAR, NEAR, BACK = joints(2.0), joints(0.2), joints(-1.0)
 
 
@@ -69,7 +69,7 @@ def rig_of(*latencies: int, ticks: int = 0) -> tuple[Rig, LatePlanning]:
     """Return a rig; if ticks are given, so many of the motion of a goal "a" have passed, and latencies are what
     follows."""
     planning = LatePlanning(latencies if not ticks else (1, *latencies))
-    rig = Rig(planning=planning)  # type: ignore[arg-type]
+    rig = Rig(planning=planning)
     if ticks:
         rig.go("a", joint_target=FAR)
         rig.tick(LEAD + ticks)
@@ -97,7 +97,7 @@ def test_a_plan_for_an_arm_at_rest_starts_exactly_at_its_tick_or_when_it_comes(l
 @pytest.mark.parametrize("latency", [1, LEAD + 1])
 def test_a_preempting_goal_starts_from_the_predicted_state(latency: int) -> None:
     rig, planning = rig_of(latency, ticks=100)
-    undisturbed = Rig(planning=LatePlanning([]))  # type: ignore[arg-type]
+    undisturbed = Rig(planning=LatePlanning([]))
     undisturbed.go("a", joint_target=FAR)
     undisturbed.tick(LEAD + 100 + LEAD)
     rig.go("b", joint_target=BACK, preempt=True)
@@ -145,7 +145,7 @@ def test_a_planner_that_is_late_again_and_again_is_in_time_when_the_old_motion_h
 def test_a_planner_that_is_always_too_late_is_named_and_the_arm_brakes() -> None:
     lead = MIN_LEAD
     planning = LatePlanning([1, *(lead * 2**k + 2 for k in range(9))], lead)
-    rig = Rig(planning=planning)  # type: ignore[arg-type]
+    rig = Rig(planning=planning)
     rig.go("a", joint_target=joints(3.0), max_velocity=0.3)  # 10 s
     rig.tick(500)
     rig.go("b", joint_target=BACK, preempt=True)
@@ -208,13 +208,13 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig.stop(ResultCode.ESTOP, hard=True)
         due = [("b", ResultCode.ESTOP)]
     elif way == "setpoint":
-        rig.manager.drop_for_setpoint(mask)
+        rig.manager.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, "a setpoint")
         due = [("b", ResultCode.REPLACED_BY_SETPOINT)]
         assert not rig.manager.following.any()
         rig.velocity[:] = rig.acceleration[:] = 0.0  # what follows setpoints brings it to rest
         rig._rows, rig._stopped = [np.stack(rig.reference)], []
     elif way == "retreat":
-        rig.manager.end_all(mask, "in the way")
+        rig.manager.end_all(mask, ResultCode.PATH_TOLERANCE, "in the way")
         rig.hard[:] = True
         rig.manager.retreat(mask, rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
         due = [("b", ResultCode.PATH_TOLERANCE)]
@@ -269,7 +269,7 @@ def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     script: list, latencies: list[int], lead: int
 ) -> None:
     planning = LatePlanning(latencies, lead)
-    rig = Rig(planning=planning)  # type: ignore[arg-type]
+    rig = Rig(planning=planning)
     due = follow(rig, 0, script)
     rig.run()  # checks position, speed, acceleration and jerk at every tick
     results = rig.taken + rig.manager.take_results(0)
@@ -296,7 +296,7 @@ def test_arms_are_planned_for_independently_of_each_other(script: list, other: l
 @settings(max_examples=40)
 @given(st.lists(actions, min_size=1, max_size=5))
 def test_inline_planning_is_the_default(script: list) -> None:
-    plain, inline = Rig(), Rig(planning=InlinePlanning(PLANNER))  # type: ignore[arg-type]
+    plain, inline = Rig(), Rig(planning=InlinePlanning(PLANNER))
     assert follow(plain, 0, script) == follow(inline, 0, script)
     assert np.array_equal(plain.history, inline.history)
     assert plain.taken + plain.manager.take_results(0) == inline.taken + inline.manager.take_results(0)

@@ -70,7 +70,7 @@ def tool(posture: Any) -> np.ndarray:
 
 
 def plan(command: BrainCommand) -> Trajectory:
-    made = GoalPlanner(ARM, HZ, KINEMATICS).plan(command, HOME, 0 * HOME, 0 * HOME)
+    made = GoalPlanner(ARM, HZ).plan(command, HOME, 0 * HOME, 0 * HOME)
     assert isinstance(made, Plan)
     return made.trajectory
 
