@@ -1,7 +1,7 @@
 """Loops over simulations in plain scalar Python, and the machine code that numba makes of them once it is worth it.
 
-To load numba and its code takes as long as some 20,000 passes through all loops of a tick in Python: what is short runs
-as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
+To load numba and its code takes as long as some 20,000 ticks of a base, or 6,000 of an arm, in Python: what is short
+runs as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-_passes: float = 20_000  # through a loop in Python, until it is compiled
+_values: float = 40_000  # that a loop handles in Python, until it is compiled
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
 _CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
 
@@ -60,11 +60,11 @@ class Kernel[**P, R]:
             config.CACHE_DIR = before
 
     def bind(self, *bound: Any) -> Callable[..., R]:
-        """Return it with its first arguments: Python at first, machine code after `_passes` passes."""
+        """Return it with its first arguments: Python at first, machine code after `_values` values."""
         self._check(0, bound)
-        if not _passes or "compiled" in vars(self):  # by another one
+        if not _values or "compiled" in vars(self):  # by another one
             return partial(self.compiled, *bound)
-        left, is_checked = _passes, False
+        left, is_checked = _values, False
         python: Callable[..., R] = self.function
         machine: Callable[..., R] | None = None
 
@@ -72,7 +72,7 @@ class Kernel[**P, R]:
             nonlocal left, is_checked, machine
             if machine is not None:
                 return machine(*arguments)
-            left -= len(bound[0] if bound else arguments[0])
+            left -= (bound[0] if bound else arguments[0]).size
             if left < 0:
                 machine = partial(self.compiled, *bound)
                 return machine(*arguments)
@@ -109,19 +109,19 @@ class Kernel[**P, R]:
 
 def compile_at_once() -> None:
     """Compile kernels from now on when they are bound, not in the middle of a run: for a loop on the wall clock."""
-    global _passes  # noqa: PLW0603
-    _passes = 0
+    global _values  # noqa: PLW0603
+    _values = 0
 
 
 @contextmanager
 def never_compiled() -> Iterator[None]:
     """Bind kernels that stay Python: where a loop on the wall clock is running already."""
-    global _passes  # noqa: PLW0603
-    before, _passes = _passes, math.inf
+    global _values  # noqa: PLW0603
+    before, _values = _values, math.inf
     try:
         yield
     finally:
-        _passes = before
+        _values = before
 
 
 def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:

@@ -64,7 +64,7 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile kernels when they are bound."""
-    monkeypatch.setattr(kernels, "_passes", 1)
+    monkeypatch.setattr(kernels, "_values", 1)
     kernels.compile_at_once()
 
 
@@ -105,7 +105,7 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(Kernel, "compiled", property(compiled))
     for one in KERNELS.values():
         monkeypatch.delitem(vars(one), "compiled", raising=False)
-    monkeypatch.setattr(kernels, "_passes", 30)
+    monkeypatch.setattr(kernels, "_values", 60)
     return names
 
 

@@ -353,7 +353,7 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        still: NDArray[np.bool_] = (np.abs(self.velocity) < _REST).all(axis=1)
+        still: NDArray[np.bool_] = np.all(np.abs(self.velocity) < _REST, axis=1)
         return still & ~self.busy & ~self._yields & (self._gives_way == 0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
