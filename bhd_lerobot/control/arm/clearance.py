@@ -1,5 +1,6 @@
 """Setpoints that would bring an arm too near to itself or to the table: it slows down, and stops before contact."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,19 +8,101 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Capsule
 from bhd_lerobot.control.geometry.collision import CollisionModel
+from bhd_lerobot.control.kernels import clamp, kernel
 
 Array = NDArray[np.float64]
 
 _LOOKS = 2  # a frame: between two, an arm continues at the speed that the first permitted
-_SAMPLES = 4
-_TIMES = (np.arange(1, _SAMPLES + 1) / _SAMPLES)[:, None, None]  # of a stop at which distances are checked
+_SAMPLES = 4  # of a stop at which distances are checked
 # An arm that approaches has to stay so much further away than the least distance, for each metre that it needs to stop:
 # directions change between two checks, and two samples of a fast stop are far apart.
 _WIDER = 0.015
 _ROUNDING = 1e-9  # [m] a distance that shrinks by less does not shrink
 _TRIED = np.array([1.0, 0.5, 0.25])[:, None]  # of the speed from which there should be room enough to stop
 _TINY = 1e-12
-_FIRST = np.zeros(1, np.intp)
+_ONE = np.ones(1, np.bool_)
+_NEVER = np.iinfo(np.int64).max
+
+
+@kernel("void(f8[::1], f8[::1], f8[::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1])")
+def stopping_ways(  # noqa: PLR0917
+    acceleration: Array,
+    ramp: Array,
+    reach: Array,
+    period: float,
+    velocity: Array,
+    speed: Array,
+    reached: Array,
+    ways: Array,
+    length: Array,
+) -> None:
+    """Write how far joints turn that continue until the next check, and then stop.
+
+    Args:
+        period: until the next check [s].
+        velocity: of the joints [rad/s], shape (k, dof or more).
+        speed: what is wanted [rad/s], shape (k, dof or more).
+        reached: the speed at the next check [rad/s], shape (k, dof).
+        ways: how far joints have turned at the next check and at times after it [rad], shape (samples, k, dof).
+        length: how far that takes any point of the arm at the most [m], shape (samples, k).
+    """
+    for arm in range(len(reached)):
+        longest = 0.0  # of the joints' stops: every joint brakes by itself, as hard as it may
+        for k in range(len(acceleration)):
+            change = acceleration[k] * period
+            reached[arm, k] = clamp(speed[arm, k], velocity[arm, k] - change, velocity[arm, k] + change)
+            longest = max(longest, ramp[k] + abs(reached[arm, k]) / acceleration[k])
+        for sample in range(len(ways)):
+            time = sample / (len(ways) - 1) * longest
+            length[sample, arm] = 0.0
+            for k in range(len(acceleration)):
+                fast = abs(reached[arm, k])
+                braking = min(max(time - ramp[k], 0.0), fast / acceleration[k])
+                way = fast * (min(time, ramp[k]) + braking) - acceleration[k] * braking * braking / 2
+                ways[sample, arm, k] = reached[arm, k] * period + math.copysign(way, reached[arm, k])
+                length[sample, arm] += abs(ways[sample, arm, k]) * reach[k]
+
+
+@kernel(
+    "i8(f8[:,::1], f8[:,::1], f8[:,::1], f8, i8, i8[::1], f8[::1], b1[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], "
+    "b1[::1], i8)"
+)
+def find_near(  # noqa: PLR0917
+    known: Array,
+    distances: Array,
+    slopes: Array,
+    least: float,
+    ticks: int,
+    due: NDArray[np.int64],
+    share: Array,
+    near: NDArray[np.bool_],
+    ways: Array,
+    length: Array,
+    position: Array,
+    active: NDArray[np.bool_],
+    tick: int,
+) -> int:
+    """Find out of the arms whose turn it is which may be near to something on the ways on which they would stop.
+
+    Returns:
+        The tick in which it is an arm's turn again.
+    """
+    soonest = _NEVER
+    for arm in range(len(known)):
+        near[arm] = False
+        if active[arm] and due[arm] <= tick:
+            due[arm] = tick + ticks
+            share[arm] = 1.0
+            for k in range(len(slopes)):
+                # What lies between here and where distances are known must not have used them up.
+                used = 0.0
+                for joint in range(slopes.shape[1]):
+                    far = abs(position[arm, joint] - known[arm, joint]) + abs(ways[-1, arm, joint])
+                    used += slopes[k, joint] * far
+                near[arm] |= distances[arm, k] - (used + _WIDER * length[-1, arm]) < least
+        if active[arm]:
+            soonest = min(soonest, due[arm])
+    return soonest
 
 
 class SetpointClearance:
@@ -63,6 +146,12 @@ class SetpointClearance:
         self._next = 0
         # Where distances were computed last, and these; below 0 where none is known.
         self._known, self._distances = np.zeros((n, dof)), np.full((n, len(self._slopes)), -1.0)
+        self._near = np.zeros(n, np.bool_)
+        self._ways = self._new_ways(n)
+        self._stopping_ways = stopping_ways.bind(self._acceleration, self._ramp, self._reach, self._period)
+        known = self._known, self._distances, self._slopes, self._least
+        turns = self._ticks, self._due, self.share, self._near
+        self._find_near = find_near.bind(*known, *turns, *self._ways[1:])
 
     def hold(self, sim: int, held: Capsule | None) -> None:
         """Keep what an arm holds away from things as well; nothing any more if None."""
@@ -93,35 +182,30 @@ class SetpointClearance:
         """
         if tick < self._next:
             return
-        ids = np.flatnonzero(active & (self._due <= tick))
-        self._due[ids] = tick + self._ticks
-        self._next = int(np.min(self._due, where=active, initial=np.iinfo(np.int64).max))
-        if len(ids):
-            dof = self.dof
-            self.share[ids] = self._shares(ids, position[ids, :dof], velocity[ids, :dof], speed[ids, :dof])
-            for sim, check in self._holding.items():
-                if sim in ids:
-                    rows = (array[sim : sim + 1, :dof] for array in (position, velocity, speed))
-                    self.share[sim] = check._shares(_FIRST, *rows)[0]
-            self.slows = bool((self.share < 1.0).any())
+        self._stopping_ways(velocity, speed, *self._ways)
+        self._next = self._find_near(position, active, tick)
+        near = np.flatnonzero(self._near)
+        if len(near):
+            joints = (array[near, : self.dof] for array in (position, velocity, speed))
+            self.share[near] = self._shares(near, *joints)
+        for sim, check in self._holding.items():
+            if active[sim] and self._due[sim] == tick + self._ticks:
+                one = slice(sim, sim + 1)
+                check.check_soon(_ONE)
+                check.run(tick, position[one], velocity[one], speed[one], _ONE)
+                self.share[sim] = check.share[0]
+        self.slows = bool((self.share < 1.0).any())
 
     def _shares(self, ids: NDArray[np.intp], q: Array, velocity: Array, speed: Array) -> Array:
-        """Return the permitted shares of some arms; `q`, `velocity` and `speed` have shape (k, dof)."""
+        """Return the permitted shares of arms that may be near to something, of which each array has a row."""
         shares = np.ones(len(ids))
-        reached, ways, length = self._ways(velocity, speed)
-        # What lies between here and where distances are known must not have used them up.
-        far = np.abs(q - self._known[ids]) + np.abs(ways[-1])
-        used = (self._slopes * far[:, None]).sum(axis=2) + _WIDER * length[-1][:, None]
-        near = np.flatnonzero((self._distances[ids] - used < self._least).any(axis=1))
-        if not len(near):
-            return shares
-        q, velocity, speed, reached = q[near], velocity[near], speed[near], reached[near]
-        every = self._model.each(np.concatenate((q, (q + ways[:, near]).reshape(-1, self.dof))))
-        self._known[ids[near]], self._distances[ids[near]] = q, every[:, : len(near)].T
+        reached, ways, length = self._ways[0][ids], self._ways[1][:, ids], self._ways[2][:, ids]
+        every = self._model.each(np.concatenate((q, (q + ways).reshape(-1, self.dof))))
+        self._known[ids], self._distances[ids] = q, every[:, : len(ids)].T
         kinds = every[: self._pairs], every[self._pairs :]  # from itself, and from the table
-        least = np.stack([kind.min(axis=0, initial=np.inf) for kind in kinds]).reshape(2, 1 + len(ways), len(near))
+        least = np.stack([kind.min(axis=0, initial=np.inf) for kind in kinds]).reshape(2, 1 + len(ways), len(ids))
         here = least[:, 0]
-        free = self._free(here, least[:, 1:] - _WIDER * length[:, near])
+        free = self._free(here, least[:, 1:] - _WIDER * length)
         slow = np.flatnonzero(free < 1.0)
         if not len(slow):
             return shares
@@ -135,40 +219,16 @@ class SetpointClearance:
         # the arm stops: it can, because that is how the way ended that was found free before.
         tried = _TRIED * share
         again = np.tile(slow, len(_TRIED))
-        _, ways, length = self._ways(velocity[again], (tried[:, :, None] * speed[slow]).reshape(-1, self.dof))
+        _, ways, length = made = self._new_ways(len(again))
+        self._stopping_ways(velocity[again], (tried[:, :, None] * speed[slow]).reshape(-1, self.dof), *made)
         slower = np.stack(self._model.distances(q[again] + ways)) - _WIDER * length
         good = self._free(here[:, again], slower).reshape(tried.shape) >= 1.0
-        shares[near[slow]] = np.where(good.any(axis=0), tried[good.argmax(axis=0), np.arange(len(slow))], 0.0)
+        shares[slow] = np.where(good.any(axis=0), tried[good.argmax(axis=0), np.arange(len(slow))], 0.0)
         return shares
 
-    def _ways(self, velocity: Array, speed: Array) -> tuple[Array, Array, Array]:
-        """Return how far joints turn that continue until the next check, and then stop.
-
-        Args:
-            velocity: of the joints [rad/s], shape (k, dof).
-            speed: what is wanted [rad/s], shape (k, dof).
-
-        Returns:
-            The speed at the next check [rad/s], shape (k, dof); the way so far at sampled times [rad], shape (samples,
-            k, dof), and how far that takes any point of the arm at the most [m], shape (samples, k).
-        """
-        change = self._acceleration * self._period
-        reached = np.minimum(np.maximum(speed, velocity - change), velocity + change)
-        on = reached * self._period
-        ways = np.concatenate((on[None], on + self._stop(reached)))
-        return reached, ways, (np.abs(ways) * self._reach).sum(axis=2)
-
-    def _stop(self, speed: Array) -> Array:
-        """Return how far joints have turned at times on their way to rest [rad], shape (samples, k, dof).
-
-        Every joint brakes by itself, as hard as it may: those that were slower are at rest earlier.
-        """
-        fast = np.abs(speed)
-        duration = fast / self._acceleration
-        time = _TIMES * (self._ramp + duration).max(axis=1)[:, None]
-        braking = np.minimum(np.maximum(time - self._ramp, 0.0), duration)
-        way = fast * (np.minimum(time, self._ramp) + braking) - self._acceleration * braking * braking / 2
-        return np.copysign(way, speed)
+    def _new_ways(self, k: int) -> tuple[Array, Array, Array]:
+        """Return room for what `stopping_ways` writes about k arms."""
+        return np.zeros((k, self.dof)), np.zeros((1 + _SAMPLES, k, self.dof)), np.zeros((1 + _SAMPLES, k))
 
     def _free(self, here: Array, distances: Array) -> Array:
         """Return which shares of ways are free, shape (k,).
