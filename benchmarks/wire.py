@@ -28,6 +28,7 @@ from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_simulation import BaseSimulation
@@ -436,6 +437,7 @@ def main(arguments: list[str] | None = None) -> int:
             unsafe += one.unsafe + (one.moved > NEEDED[space][lie])
             lies.add_row(space, lie, f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}", f"{one.moved:.3f} rad")
     console.print(lies)
+    compile_at_once()
     shares = Table(title="The share of the checks in a tick, physics and sensors included")
     for column in ("robot", "n", "check", "tick", "share"):
         shares.add_column(column, justify="left" if column == "robot" else "right")

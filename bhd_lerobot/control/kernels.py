@@ -60,7 +60,7 @@ class Kernel[**P, R]:
             config.CACHE_DIR = before
 
     def bind(self, *bound: Any) -> Callable[..., R]:
-        """Return it with its first arguments: Python at first, machine code after `_values` values."""
+        """Return it with its first arguments: Python until it has handled `_values` values of the first, then not."""
         self._check(0, bound)
         if not _values or "compiled" in vars(self):  # by another one
             return partial(self.compiled, *bound)

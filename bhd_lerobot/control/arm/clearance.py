@@ -24,27 +24,27 @@ _ONE = np.ones(1, np.bool_)
 _NEVER = np.iinfo(np.int64).max
 
 
-@kernel("void(f8[::1], f8[::1], f8[::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1])")
+@kernel("void(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8)")
 def stopping_ways(  # noqa: PLR0917
+    ways: Array,
+    length: Array,
+    reached: Array,
+    velocity: Array,
+    speed: Array,
     acceleration: Array,
     ramp: Array,
     reach: Array,
     period: float,
-    velocity: Array,
-    speed: Array,
-    reached: Array,
-    ways: Array,
-    length: Array,
 ) -> None:
     """Write how far joints turn that continue until the next check, and then stop.
 
     Args:
-        period: until the next check [s].
-        velocity: of the joints [rad/s], shape (k, dof or more).
-        speed: what is wanted [rad/s], shape (k, dof or more).
-        reached: the speed at the next check [rad/s], shape (k, dof).
         ways: how far joints have turned at the next check and at times after it [rad], shape (samples, k, dof).
         length: how far that takes any point of the arm at the most [m], shape (samples, k).
+        reached: the speed at the next check [rad/s], shape (k, dof).
+        velocity: of the joints [rad/s], shape (k, dof or more).
+        speed: what is wanted [rad/s], shape (k, dof or more).
+        period: until the next check [s].
     """
     for arm in range(len(reached)):
         longest = 0.0  # of the joints' stops: every joint brakes by itself, as hard as it may
@@ -68,8 +68,8 @@ def stopping_ways(  # noqa: PLR0917
     "b1[::1], i8)"
 )
 def find_near(  # noqa: PLR0917
-    known: Array,
     distances: Array,
+    known: Array,
     slopes: Array,
     least: float,
     ticks: int,
@@ -93,12 +93,14 @@ def find_near(  # noqa: PLR0917
         if active[arm] and due[arm] <= tick:
             due[arm] = tick + ticks
             share[arm] = 1.0
+            # What lies between here and where distances are known must not have used them up.
+            far = np.zeros(slopes.shape[1])
+            for joint in range(len(far)):
+                far[joint] = abs(position[arm, joint] - known[arm, joint]) + abs(ways[-1, arm, joint])
             for k in range(len(slopes)):
-                # What lies between here and where distances are known must not have used them up.
                 used = 0.0
-                for joint in range(slopes.shape[1]):
-                    far = abs(position[arm, joint] - known[arm, joint]) + abs(ways[-1, arm, joint])
-                    used += slopes[k, joint] * far
+                for joint in range(len(far)):
+                    used += slopes[k, joint] * far[joint]
                 near[arm] |= distances[arm, k] - (used + _WIDER * length[-1, arm]) < least
         if active[arm]:
             soonest = min(soonest, due[arm])
@@ -148,10 +150,11 @@ class SetpointClearance:
         self._known, self._distances = np.zeros((n, dof)), np.full((n, len(self._slopes)), -1.0)
         self._near = np.zeros(n, np.bool_)
         self._ways = self._new_ways(n)
-        self._stopping_ways = stopping_ways.bind(self._acceleration, self._ramp, self._reach, self._period)
-        known = self._known, self._distances, self._slopes, self._least
+        self._brake = self._acceleration, self._ramp, self._reach, self._period
+        self._stopping_ways = stopping_ways.bind()
+        known = self._distances, self._known, self._slopes, self._least
         turns = self._ticks, self._due, self.share, self._near
-        self._find_near = find_near.bind(*known, *turns, *self._ways[1:])
+        self._find_near = find_near.bind(*known, *turns, *self._ways[:2])
 
     def hold(self, sim: int, held: Capsule | None) -> None:
         """Keep what an arm holds away from things as well; nothing any more if None."""
@@ -182,7 +185,7 @@ class SetpointClearance:
         """
         if tick < self._next:
             return
-        self._stopping_ways(velocity, speed, *self._ways)
+        self._stopping_ways(*self._ways, velocity, speed, *self._brake)
         self._next = self._find_near(position, active, tick)
         near = np.flatnonzero(self._near)
         if len(near):
@@ -199,7 +202,7 @@ class SetpointClearance:
     def _shares(self, ids: NDArray[np.intp], q: Array, velocity: Array, speed: Array) -> Array:
         """Return the permitted shares of arms that may be near to something, of which each array has a row."""
         shares = np.ones(len(ids))
-        reached, ways, length = self._ways[0][ids], self._ways[1][:, ids], self._ways[2][:, ids]
+        ways, length, reached = self._ways[0][:, ids], self._ways[1][:, ids], self._ways[2][ids]
         every = self._model.each(np.concatenate((q, (q + ways).reshape(-1, self.dof))))
         self._known[ids], self._distances[ids] = q, every[:, : len(ids)].T
         kinds = every[: self._pairs], every[self._pairs :]  # from itself, and from the table
@@ -219,8 +222,9 @@ class SetpointClearance:
         # the arm stops: it can, because that is how the way ended that was found free before.
         tried = _TRIED * share
         again = np.tile(slow, len(_TRIED))
-        _, ways, length = made = self._new_ways(len(again))
-        self._stopping_ways(velocity[again], (tried[:, :, None] * speed[slow]).reshape(-1, self.dof), *made)
+        ways, length, _ = made = self._new_ways(len(again))
+        slowly = (tried[:, :, None] * speed[slow]).reshape(-1, self.dof)
+        self._stopping_ways(*made, velocity[again], slowly, *self._brake)
         slower = np.stack(self._model.distances(q[again] + ways)) - _WIDER * length
         good = self._free(here[:, again], slower).reshape(tried.shape) >= 1.0
         shares[slow] = np.where(good.any(axis=0), tried[good.argmax(axis=0), np.arange(len(slow))], 0.0)
@@ -228,7 +232,7 @@ class SetpointClearance:
 
     def _new_ways(self, k: int) -> tuple[Array, Array, Array]:
         """Return room for what `stopping_ways` writes about k arms."""
-        return np.zeros((k, self.dof)), np.zeros((1 + _SAMPLES, k, self.dof)), np.zeros((1 + _SAMPLES, k))
+        return np.zeros((1 + _SAMPLES, k, self.dof)), np.zeros((1 + _SAMPLES, k)), np.zeros((k, self.dof))
 
     def _free(self, here: Array, distances: Array) -> Array:
         """Return which shares of ways are free, shape (k,).

@@ -85,11 +85,11 @@ def want_speeds(  # noqa: PLR0917
             arrival[sim] = _NEVER
 
 
-@kernel("void(b1[::1], i8[::1], f8[:,::1], f8[::1], i8, f8[::1], f8[::1], b1, f8, f8[:,::1], f8[:,::1], f8[:,::1])")
+@kernel("void(f8[:,::1], b1[::1], i8[::1], f8[::1], i8, f8[::1], f8[::1], b1, f8, f8[:,::1], f8[:,::1], f8[:,::1])")
 def follow_speeds(  # noqa: PLR0917
+    speed: Array,
     active: Mask,
     limits: Counts,
-    speed: Array,
     share: Array,
     dof: int,
     hardest: Array,
@@ -170,7 +170,7 @@ class SetpointFilter:
         gain = _GAIN if is_gradual else _GAIN_AT_ONCE
         self._want = want_speeds.bind(*targets, self._speed, *ends, speed, acceleration, ramp, gain, float(control_hz))
         share, dof = (np.ones(n), 0) if clearance is None else (clearance.share, clearance.dof)
-        state = self.active, self.limits, self._speed, share, dof
+        state = self._speed, self.active, self.limits, share, dof
         self._follow = follow_speeds.bind(*state, acceleration, jerk, is_gradual, float(control_hz))
 
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
