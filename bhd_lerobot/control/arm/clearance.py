@@ -82,7 +82,9 @@ def find_near(  # noqa: PLR0917
     active: NDArray[np.bool_],
     tick: int,
 ) -> int:
-    """Find out of the arms whose turn it is which may be near to something on the ways on which they would stop.
+    """Find which of the arms whose turn it is may come near to something on the ways on which they would stop.
+
+    Of those `share` becomes 1, `due` the tick of their next turn, and `near` whether they may; of others it is False.
 
     Returns:
         The tick in which it is an arm's turn again.
