@@ -60,7 +60,10 @@ class Kernel[**P, R]:
             config.CACHE_DIR = before
 
     def bind(self, *bound: Any) -> Callable[..., R]:
-        """Return it with its first arguments: Python until it has handled `_values` values of the first, then not."""
+        """Return this kernel with its first arguments, to be called with the others.
+
+        It is compiled once it has handled `_values` values of its very first argument.
+        """
         self._check(0, bound)
         if not _values or "compiled" in vars(self):  # by another one
             return partial(self.compiled, *bound)

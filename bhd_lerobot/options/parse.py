@@ -154,14 +154,15 @@ def read_file(path: Path) -> dict[str, Any]:
     return values
 
 
-def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:
+def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others: str) -> None:
+    """Raise unless all options exist; `others` are valid, too, and none of the class's own."""
     fields = {name: (kind, default) for name, kind, default in options_of(config_class)}
     for old, new in getattr(config_class, "renamed", {}).items():
         if old in values and new not in values:
             values[new] = values.pop(old)
     for key, value in values.items():
         if key not in fields:
-            valid = [f"{prefix}{name}" for name in fields] + ([] if prefix else [CONFIG_PATH])
+            valid = [f"{prefix}{name}" for name in (*others, *fields)] + ([] if prefix else [CONFIG_PATH])
             raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
         kind, default = fields[key]
         of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
@@ -198,7 +199,7 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
                 f"--{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}
-        _check_keys(choices[chosen], fields, f"{key}.")
+        _check_keys(choices[chosen], fields, f"{key}.", "type")
         return {"type": chosen, **fields}
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         _check_keys(typing.cast(type, kind), value, f"{key}.")
