@@ -360,14 +360,15 @@ class Cerebellum:
 
         `RESET` of a latched emergency stop also acknowledges the presses that a tick has seen; the next tick latches
         those that came later. `ACTIVATE` drops what still waits in the queue: no command from before it can start
-        motion.
+        motion. Neither is accepted while a robot presses on something (`Controller.pressed`).
         """
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
         if request == Request.CONFIGURE:
             self._read_anew(wanted)
         sources, result = _TRANSITIONS[request]
-        allowed = wanted & np.isin(self.mode, [int(source) for source in sources])
+        applies = wanted & np.isin(self.mode, [int(source) for source in sources])
+        allowed = applies.copy()
         reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
         reasons[wanted & ~allowed & ((self.mode == Mode.ESTOP) | self.estop.pressed)] = Reason.ESTOP
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
@@ -376,6 +377,11 @@ class Cerebellum:
             moving = allowed & ~self.controller.at_rest()
             reasons[moving] = Reason.NOT_AT_REST
             allowed &= ~moving
+        if request in (Request.RESET, Request.ACTIVATE):
+            # Whatever is in its way would be pressed further, and nobody would know why.
+            pressed = applies & (self.controller.pressed() > 0.0)
+            reasons[pressed] = Reason.PRESSED
+            allowed &= ~pressed
         if request == Request.CONFIGURE:
             self._configure(allowed)
         if request == Request.ACTIVATE:
@@ -472,6 +478,7 @@ class Cerebellum:
             joint_velocities=velocity,
             joint_efforts=self.efforts(),
             contact_wrench=self.controller.contact_wrench.copy(),
+            pressed=self.controller.pressed(),
             command=self.command.copy(),
             odometry=self.controller.odometry(),
             measured=self.controller.measured(self.reading),

@@ -93,6 +93,13 @@ class Controller(ABC):
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about robots that were put somewhere else."""
 
+    def pressed(self) -> NDArray[np.float64]:
+        """Return the force with which each robot and something press on each other [N], shape (n,).
+
+        0 where it is small enough to reset and to activate the robot, and where it is not known.
+        """
+        return np.zeros(len(self.busy))
+
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
         limits = self.limits.copy()

@@ -58,6 +58,7 @@ class Reason(IntEnum):
     NOT_AT_REST = 10
     NO_POSTURE = 11
     BEYOND_HORIZON = 12
+    PRESSED = 13
 
     @property
     def explanation(self) -> str:
@@ -82,6 +83,7 @@ _EXPLANATIONS = {
     Reason.BEYOND_HORIZON: f"the command is due more than {HORIZON_NS // NANOSECONDS} s from now; send shorter action "
     "chunks, more often",
     Reason.NOT_AT_REST: "the robot is still stopping; ask again when it is at rest",
+    Reason.PRESSED: "the robot presses on something, or something presses on it; remove it, then ask again",
 }
 
 
@@ -191,6 +193,7 @@ class CerebellumState:
         joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
         joint_efforts: torques of the joints [N m], force of a gripper [N], shape (n, joints); measured if possible.
         contact_wrench: what the surroundings put on the tools, see `Controller.contact_wrench`.
+        pressed: the force that forbids to activate each robot [N], see `Controller.pressed`, shape (n,).
         command: the command applied, after all limits, shape (n, width).
         measured: where the robot really is in the space of the commands, shape (n, width).
         odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a
@@ -205,6 +208,7 @@ class CerebellumState:
     joint_velocities: NDArray[np.float64]
     joint_efforts: NDArray[np.float64]
     contact_wrench: NDArray[np.float64]
+    pressed: NDArray[np.float64]
     command: NDArray[np.float64]
     measured: NDArray[np.float64]
     odometry: NDArray[np.float64]

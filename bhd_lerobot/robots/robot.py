@@ -307,7 +307,7 @@ class BhdRobot(Robot):
         """Clear an emergency stop, a fault or a deactivation. The robot moves again only after `activate`.
 
         Raises:
-            CommandRefusedError: there is nothing to clear.
+            CommandRefusedError: there is nothing to clear, or the robot is not at rest, or presses on something.
         """
         self._request(self.host.bridge.reset().reasons[0])
 
@@ -315,11 +315,12 @@ class BhdRobot(Robot):
         """Accept actions again after `reset`.
 
         Raises:
-            CommandRefusedError: the robot is active already, or a stop is still latched.
+            CommandRefusedError: the robot is active already, a stop is still latched, or it presses on something.
         """
         self._request(self.host.bridge.activate().reasons[0])
 
     def _request(self, reason: int) -> None:
         if reason != Reason.ACCEPTED:
-            mode = Mode(int(self.host.modes[0])).name
-            raise CommandRefusedError(f"{Reason(int(reason)).explanation} (mode {mode})")
+            mode, why = Mode(int(self.host.modes[0])).name, Reason(int(reason)).explanation
+            force = f"{self.host.bridge.state().pressed[0]:.0f} N, " if reason == Reason.PRESSED else ""
+            raise CommandRefusedError(f"{why} ({force}mode {mode})")

@@ -350,6 +350,25 @@ def test_a_reset_waits_until_the_stop_is_over() -> None:
     assert rig.request(Request.RESET).accepted.all()
 
 
+@pytest.mark.parametrize("request_", [Request.RESET, Request.ACTIVATE])
+def test_a_robot_that_presses_is_neither_reset_nor_activated_and_the_force_is_published(request_: Request) -> None:
+    rig = Rig(2)
+    rig.cerebellum.estop.press()
+    rig.tick(100)
+    if request_ == Request.ACTIVATE:
+        assert rig.request(Request.RESET).accepted.all()
+    before, force = rig.mode, np.array([80.0, 0.0])
+    rig.cerebellum.controller.pressed = lambda: force  # type: ignore[method-assign]
+    assert rig.request(request_).reasons.tolist() == [Reason.PRESSED, Reason.ACCEPTED]
+    assert rig.mode == before
+    assert rig.cerebellum.estop.pressed[0] or request_ == Request.ACTIVATE  # nothing was acknowledged
+    assert rig.cerebellum.state(rig.now).pressed.tolist() == [80.0, 0.0]
+    force[0] = 0.0
+    assert rig.request(request_, np.array([0])).accepted.all()
+    force[0] = 80.0
+    assert rig.request(Request.CONFIGURE).reasons[0] == Reason.WRONG_MODE  # asked for what does not apply
+
+
 def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
     rig = Rig(active=False)
     rig.plant.position[:] = 12.5

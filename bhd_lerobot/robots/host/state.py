@@ -105,7 +105,7 @@ class StatePublisher:
         controller, reading = cerebellum.controller, cerebellum.reading
         field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
         field["joint_efforts"][:] = cerebellum.efforts()
-        field["contact_wrench"][:] = controller.contact_wrench
+        field["contact_wrench"][:], field["pressed"][:] = controller.contact_wrench, controller.pressed()
         field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
         field["odometry"][:] = controller.odometry()
         field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
