@@ -355,12 +355,13 @@ class Cerebellum:
         self._count_refusals(reasons)
         return SendResult(reasons)
 
-    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None, press: int | None = None) -> SendResult:
         """Ask for a change of mode; it happens before the next tick or is refused with a reason.
 
-        `RESET` of a latched emergency stop also acknowledges the presses that a tick has seen; the next tick latches
-        those that came later. `ACTIVATE` drops what still waits in the queue: no command from before it can start
-        motion. Neither is accepted while a robot presses on something (`Controller.pressed`).
+        `RESET` of a latched emergency stop also acknowledges the presses that a tick has seen, or, of another process,
+        the one `press` that it has seen latched; the next tick latches those that came later. `ACTIVATE` drops what
+        still waits in the queue: no command from before it can start motion. Neither is accepted while a robot presses
+        on something (`Controller.pressed`).
         """
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
@@ -390,7 +391,7 @@ class Cerebellum:
             self._sent_due[active] = np.iinfo(np.int64).min
         if request == Request.RESET:
             # A press after another latch has not been seen yet: the next tick will.
-            self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP))
+            self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP), press)
             if np.count_nonzero(allowed):
                 self._recover(allowed)
         self._set_mode(allowed, result)
@@ -422,12 +423,14 @@ class Cerebellum:
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about simulations that were put somewhere else: they are unconfigured again.
 
-        All but an emergency stop that no tick has seen yet: the next one will.
+        All but an emergency stop that no tick has seen yet, or that another process may have pressed: the next tick
+        latches it.
         """
         self.fifo.drop(ids)
         chosen = np.zeros(self.n, np.bool_)
         chosen[ids] = True
-        self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
+        if not self.estop.is_shared:
+            self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         self.mode[ids] = Mode.UNCONFIGURED
         self._mode_is_new = True
         self.controller.restart(ids)

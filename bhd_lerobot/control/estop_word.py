@@ -13,15 +13,19 @@ class EstopWord:
     A press is one store of the present time, which no two presses share. An acknowledgement is a store of the press
     that it is for, in another place: a press that comes while the cerebellum acknowledges an earlier one is not lost.
 
+    Attributes:
+        is_shared: whether other processes may press: then only a request of one that saw the press acknowledges it.
+        latched: the last presses that the cerebellum has seen, shape (n,).
+
     Args:
         n: number of robots.
-        memory: 2 n 64-bit integers, the presses and what is acknowledged; new memory if None.
+        memory: 3 n 64-bit integers, the presses, what is acknowledged, and what was seen; new memory if None.
     """
 
     def __init__(self, n: int, memory: Any = None) -> None:
-        words = np.zeros(2 * n, np.int64) if memory is None else np.frombuffer(memory, np.int64, 2 * n)
-        self._pressed, self._acknowledged = words[:n], words[n:]
-        self._seen = self._pressed.copy()
+        self.is_shared = memory is not None
+        words = np.zeros(3 * n, np.int64) if memory is None else np.frombuffer(memory, np.int64, 3 * n)
+        self._pressed, self._acknowledged, self.latched = words.reshape(3, n)
         self._flags = np.zeros(n, np.bool_)
 
     def press(self, ids: NDArray[np.intp] | None = None) -> None:
@@ -37,13 +41,14 @@ class EstopWord:
         """Return `pressed`, and take note of those presses: `acknowledge` is about them. For the cerebellum."""
         pressed = np.not_equal(self._pressed, self._acknowledged, out=self._flags)
         if np.count_nonzero(pressed):
-            np.copyto(self._seen, self._pressed)
+            np.copyto(self.latched, self._pressed)
         return pressed
 
-    def acknowledge(self, mask: NDArray[np.bool_]) -> None:
+    def acknowledge(self, mask: NDArray[np.bool_], press: int | None = None) -> None:
         """Acknowledge the presses of some robots that were seen, and no later ones. For the cerebellum.
 
         Args:
             mask: the robots, shape (n,).
+            press: the one press that may be; the last that was seen if None.
         """
-        np.copyto(self._acknowledged, self._seen, where=mask)
+        np.copyto(self._acknowledged, self.latched, where=mask if press is None else mask & (self.latched == press))

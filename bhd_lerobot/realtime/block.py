@@ -36,6 +36,8 @@ class Word(IntEnum):
     """The last press of the emergency stop, monotonic [ns]: see `EstopWord`. Any process may write it."""
     ESTOP_ACKNOWLEDGED = 6
     """The press that a reset acknowledged; if it is not the last one: emergency stop. Written by the cerebellum."""
+    ESTOP_LATCHED = 7
+    """The last press that a tick has seen: what a reset may acknowledge. Written by the cerebellum."""
     BRAIN_ALIVE = 8
     """When the brain's process last showed that it lives, monotonic [ns]; 0: it is not watched."""
     CEREBELLUM_ALIVE = 9
@@ -128,7 +130,7 @@ class LiveBlock:
         self.name, self.about = block.name, block.about
         self.words: NDArray[np.int64] = np.frombuffer(block.section("words"), np.int64)
         self.state_dtype = npy.descr_to_dtype(_tuples(layout["state"]))
-        self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_ACKNOWLEDGED + 1])
+        self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_LATCHED + 1])
         self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))
         self.ring = StateRing(self.state_dtype, layout["ring_capacity"], block.section("ring"))
 

@@ -185,7 +185,7 @@ class LiveBridge(Bridge):
         Raises:
             RealtimeError: the cerebellum does not answer.
         """
-        reason = self._client.request(request)
+        reason = self._client.request(request, int(self._block.estop.latched[0]))
         if request == Request.ACTIVATE and reason == Reason.ACCEPTED:
             self._last_due = _NEVER_NS  # what still waited was dropped
         # What was published before the request was carried out would still refuse what comes next.

@@ -58,6 +58,7 @@ def request_dtype(dof: int) -> np.dtype:
             ("expires_ns", np.int64),
             ("kind", np.int8),
             ("mode", np.int8),
+            ("press", np.int64),
             ("goal", goal_dtype(dof)),
         ],
         align=True,
@@ -125,7 +126,7 @@ class RequestServer:
         event = np.zeros(1, EVENT_DTYPE)[0]
         event["number"], event["kind"] = request["number"], EventKind.REPLY
         if kind == RequestKind.MODE:
-            event["code"] = cerebellum.request(mode).reasons[0]
+            event["code"] = cerebellum.request(mode, press=int(request["press"])).reasons[0]
         elif kind == RequestKind.GOAL:
             refusal = cerebellum.submit(0, goal)
             if refusal is not None:
@@ -171,9 +172,9 @@ class RequestClient:
         self._live: set[str] = set()  # goals that were accepted and whose result has not come yet
         self._results: list[CommandResult] = []
 
-    def request(self, request: Request) -> Reason:
-        """Ask for a change of mode, and return the outcome of it."""
-        return Reason(int(self._ask(RequestKind.MODE, mode=request)["code"]))
+    def request(self, request: Request, press: int = 0) -> Reason:
+        """Ask for a change of mode, and return the outcome of it; a reset acknowledges this press of the stop only."""
+        return Reason(int(self._ask(RequestKind.MODE, mode=request, press=press)["code"]))
 
     def submit(self, command: BrainCommand) -> CommandResult | None:
         """Send a goal.
@@ -206,12 +207,15 @@ class RequestClient:
         results, self._results = self._results, []
         return results
 
-    def _ask(self, kind: RequestKind, mode: Request = Request.CONFIGURE, goal: Any = None, name: str = "") -> Any:
+    def _ask(
+        self, kind: RequestKind, mode: Request = Request.CONFIGURE, goal: Any = None, name: str = "", press: int = 0
+    ) -> Any:
         self._number += 1
         self._reply = None
         end_ns = self._clock_ns() + self._timeout_ns
         record = np.zeros(1, self._requests.dtype)[0]
         record["number"], record["expires_ns"], record["kind"], record["mode"] = self._number, end_ns, kind, mode
+        record["press"] = press
         if goal is not None:
             record["goal"] = goal
         posted = False

@@ -405,9 +405,9 @@ def test_a_press_in_the_middle_of_a_reset_is_not_lost() -> None:
     word = rig.cerebellum.estop
     acknowledge = word.acknowledge
 
-    def meanwhile(mask: np.ndarray) -> None:
+    def meanwhile(mask: np.ndarray, press: int | None) -> None:
         word.press()  # before the store of the acknowledgement
-        acknowledge(mask)
+        acknowledge(mask, press)
 
     word.acknowledge = meanwhile  # type: ignore[method-assign]
     assert rig.request(Request.RESET).accepted.all()
@@ -419,7 +419,7 @@ def test_a_press_in_the_middle_of_a_reset_is_not_lost() -> None:
 
 def test_another_process_can_stop_one_of_two_robots(tmp_path: Path) -> None:
     path = tmp_path / "word"
-    rig = Rig(2, estop=EstopWord(2, support.shared_block(path, 32)))
+    rig = Rig(2, estop=EstopWord(2, support.shared_block(path, 48)))
     rig.send(0.2)
     rig.tick(20)
     assert (rig.cerebellum.mode == Mode.TRACKING).all()

@@ -10,7 +10,7 @@ import pytest
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.control.messages import Mode, Reason, Request
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Word
 from bhd_lerobot.realtime.bridge import LiveBridge
@@ -221,3 +221,22 @@ def test_a_late_brain_neither_jumps_nor_makes_the_robot_hurry(rig: Rig) -> None:
 def test_there_is_one_robot(rig: Rig) -> None:
     with pytest.raises(ConfigError, match="number 0"):
         rig.bridge.take_results(1)
+
+
+def test_a_reset_acknowledges_only_a_press_that_its_caller_saw_latched(rig):
+    rig.bridge.estop()
+    rig.tick()
+    assert rig.cerebellum.mode == Mode.ESTOP
+    server = rig.server.serve
+
+    def meanwhile(now_ns: int) -> None:  # the request is on its way when another process presses, and a tick sees it
+        rig.server.serve = server
+        rig.other.estop.press()
+        rig.cerebellum.estop.see()
+        server(now_ns)
+
+    rig.server.serve = meanwhile
+    assert rig.bridge.request(Request.RESET).accepted.all()
+    assert rig.cerebellum.mode == Mode.ESTOP
+    assert rig.bridge.request(Request.RESET).accepted.all()
+    assert rig.cerebellum.mode == Mode.INACTIVE

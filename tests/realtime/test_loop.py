@@ -35,7 +35,7 @@ class VirtualLoop:
         self.now = self.begin = 10**15
         self.rig = Rig()
         self.words = np.zeros(WORDS, np.int64)
-        self.rig.cerebellum.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_ACKNOWLEDGED + 1])
+        self.rig.cerebellum.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_LATCHED + 1])
         self.delays, self.work, self.alive = delays, work, set(alive)
         self.script: dict[int, Callable[[], object]] = {}
         self.until = 0  # executed ticks after which the loop is to pause

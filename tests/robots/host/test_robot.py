@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -11,7 +12,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from bhd_lerobot.control.estop import EstopInputs
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import CommandRefusedError, RealtimeError
-from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.shared_memory import names
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
@@ -120,6 +121,31 @@ def test_estop_from_another_process(driving):
     block.estop.press()
     block.close()
     expect_stop(driving)
+
+
+@pytest.mark.parametrize("until_phase", [Phase.STARTING, Phase.STANDING, Phase.RUNNING], ids=lambda phase: phase.name)
+def test_a_press_of_another_process_while_it_connects_stays_until_a_person_resets_it(until_phase):
+    name = unique("starting")
+
+    def press() -> None:
+        until(lambda: name in names(), "the robot starts")
+        block = LiveBlock.attach(name)
+        until(lambda: block.words[Word.PHASE] >= until_phase, "it has got so far")
+        block.estop.press()
+        block.close()
+
+    presser = threading.Thread(target=press)
+    presser.start()
+    robot = turtlebot(name)
+    try:
+        robot.connect()
+        presser.join()
+        expect_stop(robot)
+        robot.restart()  # of the scene, not of the emergency stop
+        expect_stop(robot)
+        recover(robot)
+    finally:
+        robot.disconnect()
 
 
 def test_deactivation_ends_in_safe_off(driving):
