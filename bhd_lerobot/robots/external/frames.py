@@ -16,6 +16,7 @@ from bhd_lerobot.robots.external.device import Device, Reading
 from bhd_lerobot.robots.external.gate import Gate
 
 Vector = NDArray[np.float64]
+_POLL_S = 0.05  # between two looks for an emergency stop while no episode runs
 
 
 @dataclass
@@ -83,6 +84,8 @@ class FrameThread:
         self._takes = False  # whether the present frame still sends what comes
         self._active = self._ended = self._idle = False
         self._came_ns = 0  # when the brain's last action came
+        self._is_stopped = False  # whether the action of the emergency stop was sent: it is the last
+        self._holds = False  # whether what holds a robot without a brain was sent, since the last action
         self._call = ("", 0)  # the call of the robot that is under way, and since when
         self._has_faulted = False
         self.origin_ns = 0
@@ -188,14 +191,17 @@ class FrameThread:
             with self._changed:
                 self._idle = True
                 self._changed.notify_all()
-                while not (self._active or self._ended):
-                    self._changed.wait()
+                while not (self._active or self._ended or self._is_to_stop):
+                    self._changed.wait(_POLL_S)
                 if self._ended:
                     return
                 self._idle = False
             try:
-                self._episode()
-                if self._gate.has_speeds:  # which would go on: positions stay by themselves
+                if self._active:
+                    self._episode()
+                if self._is_to_stop:  # it may still be on its way to the last position
+                    self._hold(self._called("get_observation", self._device.observe))
+                elif self._gate.has_speeds:  # which would go on: positions stay by themselves
                     self._hold()
             except Exception as error:  # of another package's code
                 words = as_text(error)
@@ -220,8 +226,9 @@ class FrameThread:
                 self._gate.begin(self._device.measured(reading.state))
                 holding = self._gate.holding()
                 last = DeviceFrame(-1, due, started, reading, holding, holding)
-            mode = Mode.HOLD if last.mode == Mode.ESTOP else last.mode
-            frame = DeviceFrame(number, due, started, reading, last.requested, last.applied, mode=mode, skipped=skipped)
+            frame = DeviceFrame(
+                number, due, started, reading, last.requested, last.applied, mode=last.mode, skipped=skipped
+            )
             with self._changed:
                 if self._is_over():
                     return
@@ -241,6 +248,11 @@ class FrameThread:
     def _is_over(self) -> bool:
         return not self._active
 
+    @property
+    def _is_to_stop(self) -> bool:
+        """Whether the emergency stop is pressed and its action was not sent yet, to a robot that was driven."""
+        return self.is_estopped and not self._is_stopped and bool(self.origin_ns)
+
     def _next(self, frame: DeviceFrame, end_ns: int) -> Vector | None:
         """Wait for what is to be sent next in a frame, shape (actions,); None when the frame is over."""
         config = self._config
@@ -249,13 +261,12 @@ class FrameThread:
                 now = time.monotonic_ns()
                 silent = (now - self._came_ns) / NANOSECONDS
                 if self.is_estopped:
-                    self._command = None
-                    if frame.mode != Mode.ESTOP:
-                        frame.mode = Mode.ESTOP
-                        return self._where_it_is(frame)
+                    self._command, frame.mode = None, Mode.ESTOP
+                    if not self._is_stopped:
+                        return self._stop(frame.reading)
                 elif self._command is not None and self._active:  # after a fault nothing more is sent
                     (requested, self._came_ns), self._command = self._command, None
-                    frame.mode = Mode.TRACKING
+                    frame.mode, self._holds = Mode.TRACKING, False
                     passed = self._gate.passed(requested)
                     frame.limits |= passed.limits
                     # What is not finite cannot be learned from: it is flagged, and what was sent is recorded instead.
@@ -266,7 +277,9 @@ class FrameThread:
                 elif silent > config.brain_timeout_s and not frame.watchdog & Watchdog.COMMAND_AGE:
                     frame.mode = Mode.HOLD
                     frame.watchdog |= Watchdog.COMMAND_AGE
-                    return self._gate.hold()
+                    if not self._holds:  # once: a robot that goes a bounded step to what it is sent would go on
+                        self._holds = True
+                        return self._gate.hold()
                 if now >= end_ns or not self._active:
                     self._takes = False
                     return None
@@ -274,19 +287,22 @@ class FrameThread:
                 left = (end_ns - now) / NANOSECONDS
                 self._changed.wait(min(left, until_silent) if until_silent > 0 else left)
 
-    def _where_it_is(self, frame: DeviceFrame) -> Vector:
-        """Return the action that stops the robot, which it holds from then on: the measured positions, no speed."""
-        measured, holding = self._device.measured(frame.reading.state), self._gate.holding()
-        self._gate.begin(np.where(np.isfinite(measured), measured, holding))
-        return self._gate.holding()
-
     def _send(self, frame: DeviceFrame, action: Vector) -> None:
         if not np.isfinite(action).all():
             return  # it is not known where the robot is, so it gets nothing
         frame.applied = self._called("send_action", lambda: self._device.send(action))
 
-    def _hold(self) -> None:
-        action = self._gate.holding()
+    def _stop(self, reading: Reading) -> Vector:
+        """Return the action of the emergency stop, which is the last that the robot gets."""
+        self._is_stopped = True
+        return self._gate.stop(self._device.measured(reading.state))
+
+    def _hold(self, reading: Reading | None = None) -> None:
+        """Send what the robot is left with: after an emergency stop where it was measured, and once."""
+        if self._is_stopped:
+            return
+        self._is_stopped = self.is_estopped
+        action = self._gate.holding() if reading is None else self._stop(reading)
         if np.isfinite(action).all():
             self._called("send_action", lambda: self._device.send(action))
 

@@ -16,6 +16,8 @@ Vector = NDArray[np.float64]
 
 # Speeds as LeRobot's robots and plug-ins name them: x.vel, linear_velocity, mobile_base.vx, mobile_base.vtheta.
 _SPEED = re.compile(r"(^|[._])(vel|velocity|speed|v[xyz]|vtheta|[xyz]_?vel)$")
+# What closes on things: gripper.pos, left_gripper, panda_finger_joint1, index_flexor.
+_GRIPS = re.compile(r"(^|[._])(grip|jaw|claw|finger|thumb|index|middle|ring|pinky|suction|vacuum)(per)?s?\d*([._]|$)")
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Gate:
         ranges = [given.get(name) or known.get(name) or (-np.inf, np.inf) for name in self.names]
         self.lower, self.upper = np.array(ranges, np.float64).reshape(-1, 2).T
         self._is_speed = np.array([bool(_SPEED.search(name)) for name in self.names], np.bool_)
+        self._grips = np.array([bool(_GRIPS.search(name)) for name in self.names], np.bool_)
         every = np.inf if is_by_name or config.max_change is None else float(config.max_change)
         change = np.where(self._is_speed, np.inf, every)
         for name, value in by_name.items():
@@ -80,6 +83,16 @@ class Gate:
         """Return the action that holds the robot: the last positions, no speed; NaN where nothing is known yet."""
         last = np.full(len(self.names), np.nan) if self._last is None else self._last
         return np.where(self._is_speed, 0.0, last)
+
+    def stop(self, measured: Vector) -> Vector:
+        """Return the action of an emergency stop, and remember it as the last one.
+
+        Positions are those measured, or the last where none is; what grips keeps its last position, and with it what is
+        gripped; there is no speed.
+        """
+        last = self.holding()
+        self._last = np.where(self._is_speed | self._grips | ~np.isfinite(measured), last, measured)
+        return self._last
 
     def hold(self) -> Vector:
         """Return the action that holds the robot, as `holding`, and remember it as the last one."""

@@ -103,3 +103,14 @@ def test_after_a_hold_a_speed_rises_from_zero() -> None:
 
 def test_no_change_by_name_is_no_limit() -> None:
     assert np.isinf(Gate(NAMES, GateConfig(max_change={}), {}).max_change).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["gripper.pos", "left_gripper", "panda_finger_joint1.pos", "jaw.pos", "index_flexor.pos"]
+)
+def test_what_grips_keeps_its_position_in_an_emergency_stop(name: str) -> None:
+    gate = Gate(("wrist.pos", name, "x.vel"), GateConfig(), {})
+    gate.begin(np.zeros(3))
+    gate.passed(np.array([8.0, 1.0, 0.5]))
+    assert gate.stop(np.array([5.0, 4.0, 0.3])).tolist() == [5.0, 1.0, 0.0]
+    assert gate.stop(np.array([np.nan, 4.0, 0.3])).tolist() == [5.0, 1.0, 0.0]

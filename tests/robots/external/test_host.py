@@ -328,9 +328,66 @@ def test_after_an_emergency_stop_nothing_moves_the_robot_again(tmp_path: Path) -
             if host.step(np.array([[0.2, 50.0]])).mode[0] == Mode.FAULT:
                 break
         host.stop(ONLY)
-    after = robot.rows[stopped:]
-    assert after
-    assert set(after) == {(0.0, 7.0)}
+    assert robot.rows[stopped:] == [(0.0, 7.0)]
+
+
+class SaggingArm(MockArm):
+    """Hangs below its commands, and grips something thick."""
+
+    def get_observation(self) -> dict[str, Any]:
+        seen = super().get_observation()
+        return {**seen, "shoulder.pos": seen["shoulder.pos"] - 3.0, "gripper.pos": 40.0}
+
+
+@pytest.mark.parametrize("moment", ["the brain thinks", "the brain is silent", "between episodes", "at the end"])
+def test_an_emergency_stop_is_one_action_and_what_is_gripped_stays_gripped(tmp_path: Path, moment: str) -> None:
+    robot = SaggingArm(MockArmConfig(id="sag", calibration_dir=tmp_path, log=str(tmp_path / "sent")))
+    host = LeRobotHost(robot, FPS, GateConfig(brain_timeout_s=0.1))
+    robot.connect()
+    with closing(host):
+        start(host)
+        host.observe()
+        host.step(np.array([[20.0, 20.0, 10.0]]))
+        if moment == "the brain is silent":
+            until(lambda: len(sent(tmp_path)) == 2, "it holds")
+        if moment == "between episodes":
+            host.stop(ONLY)
+        before = len(sent(tmp_path))
+        host.estop()
+        until(lambda: len(sent(tmp_path)) > before, "it stops")
+        if moment == "at the end":
+            host.stop(ONLY)
+            start(host)  # an episode that begins all the same
+        if moment != "between episodes":
+            frames_pass(host, 20)
+            assert host.step(action(50.0)).mode[0] == Mode.ESTOP
+    assert sent(tmp_path)[before:] == [[17.0, 20.0, 10.0]]
+
+
+def test_an_emergency_stop_after_a_fault_asks_a_dead_bus_once(tmp_path: Path) -> None:
+    host, robot = base(tmp_path)
+    with closing(host):
+        start(host)
+        host.step(np.array([[0.2, 50.0]]))
+        robot.config.fault, robot.config.fault_at = "bus", 0
+        until(lambda: host.observe() and host.step(np.array([[0.2, 50.0]])).mode[0] == Mode.FAULT, "the bus is dead")
+        before = robot.observed
+        host.estop()
+        until(lambda: robot.observed > before, "it was asked")
+        time.sleep(0.2)
+    assert robot.observed == before + 1
+    assert robot.rows[-1] == (0.0, 50.0)
+
+
+def test_a_silent_brain_is_one_action_too(tmp_path: Path) -> None:
+    """A robot that goes a bounded step towards each action that it is sent would go on."""
+    with closing(make(tmp_path, GateConfig(brain_timeout_s=0.05))) as host:
+        start(host)
+        for value in (5.0, 7.0):
+            host.observe()
+            host.step(action(value))
+            frames_pass(host, 20)
+    assert [row[0] for row in sent(tmp_path)] in ([5.0, 5.0, 7.0, 7.0], [5.0, 5.0, 7.0])
 
 
 def test_a_robot_that_cannot_be_disconnected_is_reported_and_hides_nothing(
