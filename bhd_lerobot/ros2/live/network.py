@@ -8,6 +8,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
 
 _DOMAINS = 233  # the ports of further ones lie beyond 65535
+_MOST_KEPT = 10_000
 _ADDRESS = re.compile(r"[\w.:%-]+")
 DISTROS = ("humble", "jazzy")
 
@@ -118,7 +119,7 @@ class Qos:
     """How messages are kept and delivered, in ROS 2's words.
 
     Attributes:
-        depth: messages that are kept.
+        depth: messages that are kept; 0: all until they are taken. Beyond 10,000 a reliable publisher waits.
         reliable: whether what is lost is sent again.
         transient_local: whether those that come later receive what was sent before.
     """
@@ -140,7 +141,8 @@ class Qos:
         return DdsQos(
             reliability.Reliable(100_000_000) if self.reliable else reliability.BestEffort,
             Policy.Durability.TransientLocal if self.transient_local else Policy.Durability.Volatile,
-            Policy.History.KeepLast(self.depth),
+            Policy.History.KeepLast(self.depth) if self.depth else Policy.History.KeepAll,
+            *(() if self.depth else (Policy.ResourceLimits(_MOST_KEPT, -1, _MOST_KEPT),)),
             *[Policy.Userdata(data) for data in user_data],
         )
 
@@ -157,6 +159,8 @@ class Qos:
 SENSOR_DATA = Qos(5, reliable=False)
 """ROS 2's SensorDataQoS. Streams are received by it, also from reliable publishers: a reliable subscription of Cyclone
 DDS 11.0.1 that joins late gets the first message of a Fast DDS publisher 3 s later."""
+EVERY = Qos(0)
+"""What must not be lost, whatever comes after it: an emergency stop, a goal."""
 LATCHED = Qos(1, transient_local=True)
 """What is sent once and holds, such as ``/tf_static``."""
 

@@ -12,7 +12,7 @@ from bhd_lerobot.ros2.live.topic_types import raw, topic_type
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.types import type_store
 
-_MOST = 1000  # messages that are taken at once
+MOST_TAKEN = 1000  # messages that are taken at once
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Subscription:
     def __init__(self, reader: Any, topic: str, msgtype: str) -> None:
         self.reader, self.topic, self.msgtype = reader, topic, msgtype
 
-    def take(self) -> list[Received]:
-        """Return what has arrived since the last call, oldest first; at most as many as the depth of its QoS."""
-        samples = self.reader.take(_MOST)
+    def take(self, most: int = MOST_TAKEN) -> list[Received]:
+        """Return what has arrived since the last call, oldest first; what is beyond `most` stays for the next call."""
+        samples = self.reader.take(most)
         now = time.monotonic_ns()
         return [
             Received(self.msgtype, sample.data, info.source_timestamp, now, sender=info.publication_handle)

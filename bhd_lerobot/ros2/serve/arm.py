@@ -1,7 +1,6 @@
 """The topics of a UR5, as `ur_robot_driver` and `robot_state_publisher` have them.
 
-Different from the real ones: the gripper has a topic here, both command topics work without switching controllers, and
-the joints' efforts are torques [N m], where the driver publishes the motors' currents [A].
+What differs from the real ones is in docs/how_to/ros2.md, "Differences".
 """
 
 import time
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, mode_reason
 from bhd_lerobot.errors import ActionError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
@@ -26,6 +25,8 @@ from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 JOINT_STATES_HZ = 125  # of a UR5 (CB3); a UR5e has 500
 _TRANSFORMS_HZ = 50
 _SPEED_SCALING_HZ = 100
+_REACHED = 1e-3  # [rad], and of the gripper [m]
+_STUCK_NS = NANOSECONDS  # without coming nearer
 
 
 class ArmTopics:
@@ -49,7 +50,8 @@ class ArmTopics:
         self._names = [f"{joint}_joint" for joint in body.chain.joints]
         self._count = len(self._names)
         self._command: NDArray[np.float64] = host.bridge.latest["command"].copy()  # joints, then the gripper
-        self._trajectory: tuple[JointTrajectory, int] | None = None
+        self._motion: _Motion | None = None  # what is followed
+        self._next: tuple[Any, int] | None = None  # the trajectory that takes its place, and when [ns]
         self._period_ns = NANOSECONDS // host.rates.fps
         self._sent_ns = 0
         self._joint_states = node.publisher("/joint_states", views.JOINT_STATE)
@@ -79,7 +81,11 @@ class ArmTopics:
 
     def trajectory(self) -> JointTrajectory | None:
         """Return the joint trajectory that is followed, or None."""
-        return self._trajectory[0] if self._trajectory is not None else None
+        return self._motion.trajectory if self._motion is not None else None
+
+    def interrupt(self) -> None:
+        """End what is followed: a goal was taken, and the newer command counts."""
+        self._motion = self._next = None
 
     def _publish(self, state: State) -> None:
         record, count = state.record, self._count
@@ -101,45 +107,114 @@ class ArmTopics:
 
     # --- commands ----------------------------------------------------------------------------------------------------
 
-    def _follow(self, message: Any) -> None:
-        start = self._host.bridge.latest["command"][0, : self._count]
+    def _follow(self, message: Any) -> bool:
+        """Take a trajectory. Its stamp is its start, 0 is at once; until then what is followed goes on."""
+        now = time.monotonic_ns()
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        start_ns = now + (stamp - time.time_ns() if stamp else 0)
         try:
-            self._trajectory = JointTrajectory(message, self._names, start), time.monotonic_ns()
+            trajectory = self._trajectory(message, now - start_ns)
         except ActionError as error:
-            self._counts.add(f"{ur.TRAJECTORY_TOPIC}: {error}")
+            return self._refuse(ur.TRAJECTORY_TOPIC, str(error))
+        if start_ns > now:
+            self._next = message, start_ns
+            waits_s = (start_ns - now) / NANOSECONDS
+            self._counts.note(
+                "waiting", f"{ur.TRAJECTORY_TOPIC}: by its stamp the trajectory starts in {waits_s:.3g} s"
+            )
+        else:
+            self._motion, self._next = _Motion(ur.TRAJECTORY_TOPIC, trajectory, start_ns), None
+        return True
 
-    def _move(self, message: Any) -> None:
+    def _refuse(self, topic: str, reason: str) -> bool:
+        self._counts.add(f"{topic}: {reason}")
+        return False
+
+    def _trajectory(self, message: Any, passed_ns: int) -> JointTrajectory:
+        start = self._host.bridge.latest["command"][0, : self._count]
+        return JointTrajectory(message, self._names, start, max(0, passed_ns) / NANOSECONDS)
+
+    def _move(self, message: Any) -> bool:
         if len(message.data) != self._count:
-            self._counts.add(f"{ur.POSITION_TOPIC}: {len(message.data)} positions; there are {self._count} joints")
-            return
-        self._trajectory = None
-        self._send(ur.POSITION_TOPIC, np.asarray(message.data, np.float64))
+            reason = f"{len(message.data)} positions; there are {self._count} joints"
+            return self._refuse(ur.POSITION_TOPIC, reason)
+        if is_taken := self._send(ur.POSITION_TOPIC, np.asarray(message.data, np.float64)):
+            self._motion, self._next = _Motion(ur.POSITION_TOPIC), None
+        return is_taken
 
-    def _grip(self, message: Any) -> None:
+    def _grip(self, message: Any) -> bool:
         if len(message.data) != 1:
-            self._counts.add(f"{ur.GRIPPER_TOPIC}: {len(message.data)} values; it takes the opening [m] alone")
-            return
-        before = self._command[0, self._count]
-        self._command[0, self._count] = message.data[0]
-        if not self._send(ur.GRIPPER_TOPIC, self._host.bridge.latest["command"][0, : self._count]):
-            self._command[0, self._count] = before
+            return self._refuse(ur.GRIPPER_TOPIC, f"{len(message.data)} values; it takes the opening [m] alone")
+        command = self._command if self._motion else self._host.bridge.latest["command"]
+        if is_taken := self._send(ur.GRIPPER_TOPIC, command[0, : self._count], message.data[0]):
+            self._motion = self._motion or _Motion(ur.GRIPPER_TOPIC)
+        return is_taken
 
-    def _send(self, topic: str, joints: NDArray[np.float64]) -> bool:
-        self._command[0, : self._count] = joints
-        sent = self._host.bridge.send(self._command)
+    def _send(self, topic: str, joints: NDArray[np.float64], opening: float | None = None) -> bool:
+        command = self._command.copy()
+        command[0, : self._count] = joints
+        if opening is not None:
+            command[0, self._count] = opening
+        sent = self._host.bridge.send(command)
         self._counts.add_result(topic, sent)
+        if not sent.reasons[0]:
+            self._command = command
         return not sent.reasons[0]
 
     def poll(self, now_ns: int) -> int:
-        """Send the present setpoint of a trajectory; return when the next one is due [ns]."""
-        if self._trajectory is None:
-            return NEVER_NS
-        if now_ns < self._sent_ns + self._period_ns:
-            return self._sent_ns + self._period_ns
-        trajectory, start_ns = self._trajectory
-        time_s = (now_ns - start_ns) / NANOSECONDS
-        self._sent_ns = now_ns
-        if not self._send(ur.TRAJECTORY_TOPIC, trajectory.at(time_s)) or time_s >= trajectory.duration_s:
-            self._trajectory = None
-            return NEVER_NS
-        return now_ns + self._period_ns
+        """Send the present setpoint of what is followed; return when the next one is due [ns]."""
+        record = self._host.bridge.latest
+        if self._next is not None:
+            message, start_ns = self._next
+            if mode_reason(Mode(int(record["mode"][0]))) != Reason.ACCEPTED:
+                self._next = None
+                self._counts.add(f"{ur.TRAJECTORY_TOPIC}: the arm was stopped before the trajectory's start")
+            elif now_ns >= start_ns:
+                self._motion, self._next = _Motion(ur.TRAJECTORY_TOPIC, self._trajectory(message, 0), start_ns), None
+        following_ns = NEVER_NS if self._next is None else self._next[1]
+        motion = self._motion
+        if motion is None:
+            return following_ns
+        if now_ns >= self._sent_ns + self._period_ns:
+            self._sent_ns = now_ns
+            joints = (
+                motion.trajectory.at(motion.time_s(now_ns)) if motion.trajectory else self._command[0, : self._count]
+            )
+            if not self._send(motion.topic, joints):
+                self._motion = None
+                return following_ns
+            off = np.abs(record["command"] - self._command)[0]
+            if motion.is_over(now_ns, off):
+                self._motion = None
+                if off[: self._count].max() > _REACHED:
+                    name = self._names[int(off[: self._count].argmax())]
+                    self._counts.note("cut", f"{motion.topic}: the arm holds short of the last position of {name}")
+                return following_ns
+        return min(following_ns, self._sent_ns + self._period_ns)
+
+
+class _Motion:
+    """What an arm is brought to: sent again until the arm is there, as a controller of ROS 2 holds its last command.
+
+    Args:
+        topic: that it came by.
+        trajectory: the joints' way; None for one posture.
+        start_ns: when the trajectory starts, monotonic [ns].
+    """
+
+    def __init__(self, topic: str, trajectory: JointTrajectory | None = None, start_ns: int = 0) -> None:
+        self.topic, self.trajectory, self._start_ns = topic, trajectory, start_ns
+        self._nearest: Any = np.inf
+        self._nearest_ns = 0
+
+    def time_s(self, now_ns: int) -> float:
+        """Return the time since the trajectory's start [s]."""
+        return (now_ns - self._start_ns) / NANOSECONDS
+
+    def is_over(self, now_ns: int, off: NDArray[np.float64]) -> bool:
+        """Return whether the reference is at the end, or has come no nearer for a while; `off` is how far it is."""
+        if self.trajectory and self.time_s(now_ns) < self.trajectory.duration_s:
+            return False
+        if off.sum() < self._nearest - _REACHED / 10:
+            self._nearest, self._nearest_ns = off.sum(), now_ns
+        return bool(off.max() <= _REACHED) or now_ns - self._nearest_ns > _STUCK_NS

@@ -45,7 +45,7 @@ class BaseTopics:
         node: the node.
         counts: what is refused.
         view: what is known of the robot.
-        interrupt: called when a command has come.
+        interrupt: called when a command was taken.
     """
 
     def __init__(
@@ -86,11 +86,14 @@ class BaseTopics:
         """Return what commands the robot."""
         return [Input(self._command, self._drive_by)]
 
-    def _drive_by(self, message: Any) -> None:
-        self._interrupt()
+    def _drive_by(self, message: Any) -> bool:
         twist = getattr(message, "twist", message)
-        values = np.array([[twist.linear.x, twist.angular.z]])
-        self._counts.add_result(self._command.topic, self._host.bridge.send(values))
+        sent = self._host.bridge.send(np.array([[twist.linear.x, twist.angular.z]]))
+        self._counts.add_result(self._command.topic, sent)
+        if sent.reasons[0]:
+            return False
+        self._interrupt()
+        return True
 
     def _publish(self, state: State) -> None:
         record, stamps = state.record, state.stamps

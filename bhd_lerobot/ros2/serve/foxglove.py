@@ -11,14 +11,13 @@ from typing import Any, override
 
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos
-from bhd_lerobot.ros2.live.node import Node, Publisher, Received, Subscription
+from bhd_lerobot.ros2.live.node import MOST_TAKEN, Node, Publisher, Received, Subscription
 from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
 from bhd_lerobot.ros2.messages.types import type_store
 
 HOST = "127.0.0.1"
 _ENCODING = "cdr"
 _ALSO = {TwistPart.msgtype: BareTwistPart.msgtype}  # the panel Teleop has no stamped twist
-_DEPTH = 10  # messages of clients that wait on a topic, as with the QoS of a subscription
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,9 @@ class FoxgloveServer:
         """Send a client that subscribes to a topic later the last message that was published on it."""
         self._latched[topic] = publisher
 
-    def inbox(self, topic: str, msgtype: str) -> deque[Received]:
-        """Return where the messages that clients publish on a topic are put."""
-        return self._inboxes.setdefault(topic, (msgtype, deque(maxlen=_DEPTH)))[1]
+    def inbox(self, topic: str, msgtype: str, depth: int) -> deque[Received]:
+        """Return where the messages that clients publish on a topic are put; a depth of 0 keeps all."""
+        return self._inboxes.setdefault(topic, (msgtype, deque(maxlen=depth or None)))[1]
 
     def close(self) -> None:
         """Disconnect the clients. May be called twice."""
@@ -198,10 +197,10 @@ class MirroredSubscription(Subscription):
         self._inbox = inbox
 
     @override
-    def take(self) -> list[Received]:
+    def take(self, most: int = MOST_TAKEN) -> list[Received]:
         """Return what has arrived since the last call: clients' messages, then those of the network."""
-        clients = [self._inbox.popleft() for _ in range(len(self._inbox))]
-        return clients + super().take()
+        clients = [self._inbox.popleft() for _ in range(min(len(self._inbox), most))]
+        return clients + (super().take(most - len(clients)) if len(clients) < most else [])
 
 
 class MirroredNode(Node):
@@ -230,5 +229,6 @@ class MirroredNode(Node):
         self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt", *, wakes: bool = True
     ) -> Subscription:
         name = self.full_name(topic)
-        reader = self._reader(f"{prefix}{name}", msgtype, qos or Qos(), wakes=wakes)
-        return MirroredSubscription(reader, topic, msgtype, self._server.inbox(name, msgtype))
+        qos = qos or Qos()
+        reader = self._reader(f"{prefix}{name}", msgtype, qos, wakes=wakes)
+        return MirroredSubscription(reader, topic, msgtype, self._server.inbox(name, msgtype, qos.depth))

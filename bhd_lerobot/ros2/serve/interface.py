@@ -1,10 +1,14 @@
 """What a brain in another process exchanges with the robot: commands, results, the state, the emergency stop."""
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
+from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.robots.host.state import LIMITS
+from bhd_lerobot.ros2.live.network import EVERY, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -15,7 +19,10 @@ from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
 COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
 ESTOP_TOPIC, RESET_TOPIC = "/emergency_stop", "/emergency_stop/reset"
-_RESULTS_HZ = 50
+DIAGNOSTICS_TOPIC, DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
+_RESULTS_HZ, _DIAGNOSTICS_HZ = 50, 1
+_CUTS = Limit.NON_FINITE | Limit.VELOCITY | Limit.POSITION | Limit.POSTURE | Limit.CLEARANCE  # others are of every day
+_RESULTS_AT_ONCE = 5  # half of what a ROS 2 subscription keeps by default
 
 
 class InterfaceTopics:
@@ -27,22 +34,40 @@ class InterfaceTopics:
         counts: what is refused.
         state_hz: how often the state is published [Hz].
         goals: follows the commands.
+        taken: called when a goal was taken.
     """
 
-    def __init__(self, host: LiveHost, node: Node, counts: Counts, state_hz: float, goals: Goals) -> None:
-        self._host, self._counts, self._state_hz, self._goals = host, counts, state_hz, goals
+    def __init__(
+        self,
+        host: LiveHost,
+        node: Node,
+        counts: Counts,
+        state_hz: float,
+        goals: Goals,
+        *,
+        taken: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._host, self._counts, self._state_hz, self._goals, self._taken = host, counts, state_hz, goals, taken
         self._frame = goals.frames[0]
-        self._result = node.publisher(RESULT_TOPIC, RESULT)
+        self._result = node.publisher(RESULT_TOPIC, RESULT, Qos(1000))
         self._state = node.publisher(STATE_TOPIC, STATE)
+        self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
+        self._limits, self._reported = host.bridge.latest["limits"].copy(), counts.all()
+        self._results: deque[CommandResult] = deque()
+        # The stop comes after the reset: of two that arrive together the arm stays stopped.
         self._inputs = [
-            Input(node.subscription(ESTOP_TOPIC, "std_msgs/msg/Bool"), self._stop, every=True),
             Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
-            Input(node.subscription(COMMAND_TOPIC, COMMAND), self._submit, every=True),
+            Input(node.subscription(ESTOP_TOPIC, "std_msgs/msg/Bool", EVERY), self._stop, "different"),
+            Input(node.subscription(COMMAND_TOPIC, COMMAND, EVERY), self._submit, "each"),
         ]
 
     def outputs(self) -> Iterable[Output]:
         """Return what is published."""
-        return [Output(self._state_hz, self._publish), Output(_RESULTS_HZ, self._publish_results)]
+        return [
+            Output(self._state_hz, self._publish),
+            Output(_RESULTS_HZ, self._publish_results),
+            Output(_DIAGNOSTICS_HZ, self._publish_diagnostics),
+        ]
 
     def inputs(self) -> Iterable[Input]:
         """Return what commands the robot."""
@@ -64,7 +89,7 @@ class InterfaceTopics:
         frame = message.header.frame_id or self._frame
         if frame not in self._goals.frames:
             text = f"The frame is {frame!r}; a target pose is in {' or '.join(map(repr, self._goals.frames))}."
-            self._send(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
+            self._results.append(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
             return
         position, turn = message.target_pose.position, message.target_pose.orientation
         pose = Pose((position.x, position.y, position.z), (turn.w, turn.x, turn.y, turn.z))
@@ -76,12 +101,36 @@ class InterfaceTopics:
             timeout_s=self._goals.timeout_s,
         )
         refusal = self._goals.submit(command, frame)
-        if refusal is not None:
-            self._send(refusal)
+        if refusal is None:
+            self._taken()
+        else:
+            self._results.append(refusal)
+
+    def _publish_diagnostics(self, state: State) -> None:
+        """Publish what was refused and what the robot's limits have changed; a warning where it happened just now."""
+        more, self._limits = state.record["limits"] - self._limits, state.record["limits"].copy()
+        for limit, count in zip(LIMITS, more.tolist(), strict=True):
+            if count > 0 and limit in _CUTS:
+                self._counts.note("cut", f"by the robot's limit of {str(limit.name).lower()}", count)
+        found = self._counts.all()
+        news = [
+            f"{what}: {reason}"
+            for (what, reason), count in found.items()
+            if count != self._reported.get((what, reason))
+        ]
+        self._reported = found
+        status = {
+            "level": 1 if news else 0,
+            "name": f"{self._host.config.type}: commands",
+            "message": "; ".join(news) or "carried out",
+            "values": [{"key": ": ".join(key), "value": str(count)} for key, count in found.items()],
+        }
+        self._diagnostics.send(encode(DIAGNOSTICS, {"header": header(state.stamps), "status": [status]}, 1)[0])
 
     def _publish_results(self, state: State) -> None:
-        for result in self._goals.take_results():
-            self._send(result)
+        self._results.extend(self._goals.take_results())
+        for _ in range(min(len(self._results), _RESULTS_AT_ONCE)):
+            self._send(self._results.popleft())
 
     def _send(self, result: CommandResult) -> None:
         fields = {

@@ -127,12 +127,14 @@ def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> l
     view = robot_view(config.robot.type)
     is_arm = isinstance(host.body, Arm)
     goals: Goals = ArmGoals(host) if is_arm else BaseGoals(host)
-    parts: list[Topics] = [InterfaceTopics(host, node, counts, config.state_hz, goals)]
+    parts: list[Topics]
     if is_arm:
         arm = ArmTopics(host, node, counts, view, config.joint_states_hz)
-        parts += [arm, PlannedPath(host, node, arm.trajectory)]
+        interface = InterfaceTopics(host, node, counts, config.state_hz, goals, taken=arm.interrupt)
+        parts = [interface, arm, PlannedPath(host, node, arm.trajectory)]
     else:
-        parts += [BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
+        interface = InterfaceTopics(host, node, counts, config.state_hz, goals)
+        parts = [interface, BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
     if host.camera_shapes:
         parts.append(CameraTopics(host, node, view))
     if config.clock:

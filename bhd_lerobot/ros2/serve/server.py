@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,35 +69,48 @@ class Input:
 
     Attributes:
         subscription: where messages come from.
-        take: takes a message, deserialised.
-        every: take all messages in their order, not the newest alone.
+        take: takes a message, deserialised; returns False if it is refused.
+        which: of the messages that have arrived: the newest that is not refused; each, the oldest first, one in a turn
+            of the loop, which goes on meanwhile; or those that differ, once each, for what is to be found among any number.
     """
 
     subscription: Subscription
-    take: Callable[[Any], None]
-    every: bool = False
+    take: Callable[[Any], bool | None]
+    which: Literal["newest", "each", "different"] = "newest"
 
     def run(self, count: "Counts") -> None:
         """Take what has arrived."""
-        received = self.subscription.take()
-        for one in received if self.every else received[-1:]:
+        received = self.subscription.take(*((1,) if self.which == "each" else ()))
+        if self.which == "different":
+            received = list({one.data: one for one in received}.values())
+        for one in reversed(received):
             try:
                 message = one.message()
             except DatasetError as error:
                 count.add(f"{self.subscription.topic}: {error}")
                 continue
-            self.take(message)
+            if self.take(message) is not False and self.which == "newest":
+                return
 
 
 @dataclass
 class Counts:
-    """What was refused, and why."""
+    """How often what was asked for was refused, and what else became of it (such as ``cut``), by the reason."""
 
     refused: dict[str, int] = field(default_factory=dict)
+    others: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def add(self, reason: str) -> None:
-        """Count one."""
+        """Count one that was refused."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
+
+    def note(self, what: str, reason: str, count: int = 1) -> None:
+        """Count what was not refused, but not done as it was asked for either."""
+        self.others[what, reason] = self.others.get((what, reason), 0) + count
+
+    def all(self) -> dict[tuple[str, str], int]:
+        """Return how often what happened, and why."""
+        return {("refused", reason): count for reason, count in self.refused.items()} | self.others
 
     def add_result(self, topic: str, sent: SendResult) -> None:
         """Count a command that the cerebellum refused."""
@@ -150,7 +163,7 @@ class Server:
         start = time.monotonic_ns()
         for output in self._outputs:
             output.due_ns = start
-        reported, told_ns = dict(self.counts.refused), start
+        reported, told_ns = self.counts.all(), start
         mismatches: set[str] = set()
         while not stop():
             now = time.monotonic_ns()
@@ -162,14 +175,15 @@ class Server:
             if now - told_ns > NANOSECONDS:
                 told_ns = now
                 self._host.link.check()
-                for reason, count in self.counts.refused.items():
-                    if count != reported.get(reason, 0):
-                        report(f"refused {count - reported.get(reason, 0)}: {reason}")
-                reported = dict(self.counts.refused)
-                found = set(self._node.graph.all_mismatches())
-                for text in sorted(found - mismatches):
+                found = self.counts.all()
+                for (what, reason), count in found.items():
+                    if more := count - reported.get((what, reason), 0):
+                        report(f"{what} {more}: {reason}")
+                reported = found
+                apart = set(self._node.graph.all_mismatches())
+                for text in sorted(apart - mismatches):
                     report(text)
-                mismatches |= found
+                mismatches |= apart
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))

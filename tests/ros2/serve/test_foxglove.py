@@ -161,7 +161,7 @@ def test_what_a_client_publishes_is_taken_by_the_topics_input_or_refused_and_cou
     entry = Input(
         node.subscription("/cmd_vel", STAMPED),
         lambda message: taken.append(getattr(message, "twist", message).linear.x),
-        every=True,
+        "each",
     )
     foxglove.start()
 

@@ -128,8 +128,9 @@ def test_the_path_is_the_tools_from_here_to_the_goal_while_the_goal_is_followed(
 
 
 def test_a_joint_trajectory_of_the_topic_has_a_path_too() -> None:
+    at_end = SimpleNamespace(sec=2, nanosec=0)
     point = SimpleNamespace(
-        positions=list(joints(0.3)), velocities=[], time_from_start=SimpleNamespace(sec=2, nanosec=0)
+        positions=list(joints(0.3)), velocities=[], accelerations=[], effort=[], time_from_start=at_end
     )
     followed: list[JointTrajectory | None] = [
         JointTrajectory(SimpleNamespace(joint_names=NAMES, points=[point]), NAMES, HOME[:6])
