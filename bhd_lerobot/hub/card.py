@@ -124,7 +124,7 @@ def _success(summary: DatasetSummary) -> str:
 
 def _meaning(key: str, feature: dict[str, Any]) -> str:
     text = keys.meaning_of(key, feature)
-    names = [str(name) for name in feature.get("names") or []] if isinstance(feature.get("names"), list) else []
+    names = keys.names_of(feature)
     units = [f"`{suffix}` in {unit}" for suffix, unit in _UNITS if any(name.endswith(suffix) for name in names)]
     return text + (f" ({', '.join(units)})" if units else "")
 

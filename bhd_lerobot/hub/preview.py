@@ -93,8 +93,7 @@ def _curves(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] |
     figure = Figure(figsize=(9, 2.6 * len(shown)), layout="constrained")
     for axes, key in zip(np.atleast_1d(figure.subplots(len(shown), 1, sharex=True)), shown, strict=True):
         values: NDArray[Any] = np.asarray(columns[key], np.float64).reshape(len(columns[key]), -1)
-        names = summary.features[key].get("names")
-        named = names if isinstance(names, list) and len(names) == values.shape[1] else range(values.shape[1])
+        named = keys.numbered_names_of(summary.features[key])
         for column, name in list(zip(values.T, named, strict=True))[:LINES]:
             axes.plot(np.arange(len(column)) / summary.fps, column, linewidth=1.0, label=str(name))
         axes.set_ylabel(key)

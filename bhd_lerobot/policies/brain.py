@@ -88,6 +88,7 @@ class RobotFeatures:
         body: the robot's hardware; None if it is not known.
         cameras: image shapes (height, width, channels) [px] by camera name; None if they are not known.
         robot_type: the robot's type; nothing if it is not known.
+        robot: the robot's options; empty if they are not known.
     """
 
     observation_names: Sequence[str]
@@ -97,6 +98,7 @@ class RobotFeatures:
     body: Body | None = None
     cameras: Mapping[str, tuple[int, int, int]] | None = None
     robot_type: str = ""
+    robot: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Brain(Protocol):

@@ -10,6 +10,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
@@ -121,8 +122,7 @@ class TrainedConfig(PreTrainedConfig):
 
 def names_of(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:
     """Return the names of a feature's columns in a dataset's metadata; none if they are not known."""
-    known = (features.get(key) or {}).get("names")
-    return list(known) if isinstance(known, list | tuple) else []
+    return list(keys.names_of(features.get(key) or {}))
 
 
 def _matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]:

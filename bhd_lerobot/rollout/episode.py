@@ -16,6 +16,7 @@ from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_fra
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import BrainStoppedError, RealtimeError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
+from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
@@ -86,6 +87,7 @@ class EpisodeLoop:
                 robots.body,
                 robots.camera_shapes,
                 robots.config.type,
+                describe(robots.config),
             )
         )
 

@@ -13,10 +13,13 @@ from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.identity import other_units
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError
 from bhd_lerobot.registry import is_ours, make_robot
 from bhd_lerobot.robots.external.config import GateConfig
+from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.rollout.progress import print_notes
 from bhd_lerobot.rollout.signals import stop_on_signals
 
@@ -32,11 +35,12 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
         console: where differences are printed.
 
     Returns:
-        The largest difference of an observed value from the recorded one, in its own unit.
+        The largest difference of an observed value from the recorded one of that name, in its own unit; 0 without any.
 
     Raises:
-        DatasetError: the dataset's actions are not those of the robot.
-        ConfigError: the gate lets the robot jump to where the episode began.
+        DatasetError: the dataset's actions are not those of the robot, by their names.
+        ConfigError: the gate lets the robot jump to where the episode began, or an option of the robot says that its
+            numbers mean something else than in the recording.
         RealtimeError: the robot was stopped, also by Ctrl-C, SIGTERM or SIGHUP.
     """
     if not is_ours(robot.type) and gate.max_change is None:
@@ -47,15 +51,29 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
     if is_ours(robot.type) and robot.clock != "realtime":
         raise ConfigError("robot is given, and robot.clock is 'lockstep'; leave robot out to replay in simulation.")
     summary, columns = dataset_info(root), read_episode(root, episode)
-    actions = np.asarray(columns[keys.ACTION], np.float64)
-    recorded = np.asarray(columns[keys.OBSERVATION_STATE], np.float64)
+    for name, then, now in other_units(summary.recording.get("robot", {}), describe(robot)):
+        raise ConfigError(
+            f"{root} was recorded with robot.{name} = {then}, and it is {now}: its numbers mean something else to this "
+            f"robot. Set --robot.{name}={then}."
+        )
+    names = keys.names_of(summary.features[keys.ACTION])
+    if not names:
+        raise DatasetError(
+            f"The actions of {root} are not named one by one, so it is not known which of the robot's they are for. "
+            f"Add the names to {layout.INFO}: features, action, names."
+        )
+    recorded = dict(zip(names, np.asarray(columns[keys.ACTION], np.float64).T, strict=True))
+    observed: Any = {}
+    if keys.OBSERVATION_STATE in columns:
+        values = np.asarray(columns[keys.OBSERVATION_STATE], np.float64)
+        observed = dict(zip(keys.names_of(summary.features[keys.OBSERVATION_STATE]), values.T, strict=False))
     robots: Any = make_robot(robot, fps=summary.fps, gate=gate)
-    names = tuple(summary.features[keys.ACTION]["names"])
     pressed = EstopInputs(robots.estop)
     with stop_on_signals() as stop, closing(robots), pressed:
-        if names != robots.action_names:
+        if set(names) != set(robots.action_names):
             own = ", ".join(robots.action_names)
             raise DatasetError(f"The actions of {root} are {', '.join(names)}; those of {robot.type} are {own}.")
+        actions = np.stack([recorded[name] for name in robots.action_names], axis=1)
         if not is_ours(robot.type) and (free := robots.gate.free_to_jump()):
             raise ConfigError(
                 f"gate.max_change does not limit {', '.join(free)}: there the robot would jump from where it is to "
@@ -76,15 +94,20 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
                 why = robots.problem or ", ".join(pressed.causes) or stop.name or mode.name
                 raise RealtimeError(f"The robot was stopped after {len(seen)} of {len(actions)} frames: {why}.")
         robots.stop(only)
-    return _print_differences(np.array(seen), recorded, robots.observation_names, console)
+    seen_by_name = dict(zip(robots.observation_names, np.array(seen).T, strict=True))
+    both = {name: (seen_by_name[name], values) for name, values in observed.items() if name in seen_by_name}
+    return _print_differences(both, console)
 
 
-def _print_differences(seen: Any, recorded: Any, names: tuple[str, ...], console: Console) -> float:
+def _print_differences(pairs: dict[str, Any], console: Console) -> float:
+    if not pairs:
+        console.print("The recording has no observation of a name that the robot observes: nothing is compared.")
+        return 0.0
     table = Table(title="Difference from the recording", title_justify="left")
     for heading in ("observed", "mean", "largest", "at the end"):
         table.add_column(heading, justify="left" if heading == "observed" else "right")
-    difference = np.abs(seen - recorded)
-    for name, column in zip(names, difference.T, strict=True):
+    difference = {name: np.abs(seen - recorded) for name, (seen, recorded) in pairs.items()}
+    for name, column in difference.items():
         table.add_row(name, *(f"{value:.4g}" for value in (column.mean(), column.max(), column[-1])))
     console.print(table)
-    return float(difference.max())
+    return float(max(column.max() for column in difference.values()))

@@ -112,6 +112,7 @@ def check_contract(path: str, meta: LeRobotDatasetMetadata) -> None:
             here.environment_names,
             here.robot_type,
             cameras=cameras or None,
+            robot=here.robot,
             who="The checkpoint",
         )
     except ConfigError as error:

@@ -54,13 +54,8 @@ def scan_of(names: Sequence[str]) -> tuple[int, int] | None:
 
 
 def names_of(feature: Mapping[str, Any], width: int) -> list[str]:
-    """Return the names of a feature's numbers, flat; what has none is numbered."""
-    names = feature.get("names")
-    if isinstance(names, Mapping):  # older LeRobot: {"motors": [...]}
-        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
-    if isinstance(names, list) and len(names) == width:
-        return [str(name) for name in names]
-    return [str(number) for number in range(width)]
+    """Return the names of a feature's numbers, of which there are `width`, flat; what has none is numbered."""
+    return list(keys.names_of({**feature, "shape": (width,)})) or [str(number) for number in range(width)]
 
 
 def unit_of(name: str, robot: str | None) -> str:

@@ -5,6 +5,7 @@ Everything else is carried along and neither learned from nor predicted, which i
 applied is called `control.applied_action`.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -135,14 +136,32 @@ def _vector(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
 
 
+def names_of(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of a feature's numbers, one for each; empty where it does not name them one by one.
+
+    LeRobot's datasets have them as a list, as lists in an object (``{"motors": [...]}``), or as an object of places.
+    """
+    names = feature.get("names")
+    if isinstance(names, Mapping) and all(isinstance(place, int) for place in names.values()):
+        names = sorted(names, key=names.__getitem__)
+    elif isinstance(names, Mapping):
+        names = [name for part in names.values() for name in (part if isinstance(part, list | tuple) else [part])]
+    count = math.prod(feature.get("shape") or ())
+    return tuple(map(str, names)) if isinstance(names, list | tuple) and len(names) == count else ()
+
+
+def numbered_names_of(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of a feature's numbers; where it does not name them one by one, their places from 0 on."""
+    return names_of(feature) or tuple(map(str, range(math.prod(feature["shape"]))))
+
+
 def meaning_of(key: str, feature: dict[str, Any]) -> str:
     """Return what a column holds, as text; the names of a vector where there is nothing better."""
     if key in SCALARS:
         return SCALARS[key][1]
     if key in _LEROBOT_COLUMNS:
         return _LEROBOT_COLUMNS[key]
-    names = feature.get("names") or []
-    told = [str(name) for name in names] if isinstance(names, list) else []
+    told = names_of(feature)
     text = f"{', '.join(told[:3])}, … {told[-1]}" if len(told) > 6 else ", ".join(told)
     return f"privileged, from the simulator's true state: {text}" if key == ENVIRONMENT_STATE else text
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from bhd_lerobot.datasets.format.features import names_of
 from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, quoted
 
@@ -63,8 +64,8 @@ def _columns(dataset: Any, keys: Collection[str]) -> Iterator[tuple[str, torch.T
 
 
 def _which(meta: Any, key: str, element: int) -> str:
-    names = meta.features[key].get("names")
-    return f" ({names[element]})" if isinstance(names, list) and len(names) > 1 and element < len(names) else ""
+    names = names_of(meta.features[key])
+    return f" ({names[element]})" if len(names) > 1 else ""
 
 
 def _check_deviation(meta: Any, key: str, values: torch.Tensor) -> None:

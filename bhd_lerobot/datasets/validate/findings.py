@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+from bhd_lerobot.datasets.format.features import names_of
+
 FIX = "bhd-data check --fix"
 """Of remedies: what the command corrects by itself."""
 
@@ -73,12 +75,6 @@ def few(values: Iterable[Any], shown: int = 6) -> str:
     texts = [str(value) for value in values]
     more = len(texts) - shown
     return ", ".join(texts[:shown]) + (f" and {more} more" if more > 0 else "")
-
-
-def names_of(feature: Mapping[str, Any]) -> list[str]:
-    """Return the names of a feature's numbers; none if it does not name them one by one."""
-    names = feature.get("names")
-    return [str(name) for name in names] if isinstance(names, list) else []
 
 
 def name_of(feature: Mapping[str, Any], element: int) -> str:

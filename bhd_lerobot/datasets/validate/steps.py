@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.validate.findings import Findings, name_of, names_of
+from bhd_lerobot.datasets.validate.findings import Findings, name_of
 
 _JUMP_OF_RANGE, _JUMP_OF_USUAL = 0.5, 5.0  # a jump: more than that of the range, and of what is usual
 
@@ -49,7 +49,7 @@ class StepCheck:
             return
         step = np.diff(values.astype(np.float64), axis=0)
         step[starts[1:] - 1] = 0.0  # from one episode to the next
-        for first in quaternion_columns(names_of(self._features[key])):
+        for first in quaternion_columns(keys.names_of(self._features[key])):
             part = slice(first, first + 4)
             # The nearer of two signs is the other one: the orientation continues, its numbers do not.
             flips = (step[:, part] ** 2).sum(axis=1) > 2.0

@@ -203,7 +203,7 @@ class ValueCheck:
                 self._judge_limit(column, key, name, (low, high))
 
     def _judge_limit(self, column: Moments, key: str, name: str, limits: tuple[float, float]) -> None:
-        names = self._files.features[key].get("names") or []
+        names = keys.names_of(self._files.features[key])
         if name not in names:
             return
         (low, high), element = limits, names.index(name)

@@ -337,6 +337,10 @@ def _checked(
     if not isinstance(fps, int) or isinstance(fps, bool) or fps < 1:
         raise ConfigError(f"fps must be a whole number of at least 1; got {fps!r}.")
     schema, settings = Schema(features), video or VideoSettings()
+    for key, feature in schema.features.items():
+        names = feature.get("names")
+        if feature["dtype"] != "video" and isinstance(names, list | tuple) and len(names) != feature["shape"][0]:
+            raise ConfigError(f"Feature {key!r}: {len(names)} names for {feature['shape'][0]} values.")
     if schema.videos:
         settings.check()
     return schema, settings

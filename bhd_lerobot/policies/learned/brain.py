@@ -115,6 +115,7 @@ class LearnedBrain(ConfiguredBrain):
             robot.action_names,
             robot.fps,
             robot.environment_names if has_environment else None,
+            robot=robot.robot,
             who=who,
         )
         if not self.contract.is_known:

@@ -17,6 +17,8 @@ from lerobot.utils.constants import (
 )
 
 from bhd_lerobot import __version__
+from bhd_lerobot.datasets.format.features import names_of
+from bhd_lerobot.datasets.format.identity import other_units
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE, WEIGHT_FILES, find_checkpoint
@@ -115,11 +117,13 @@ class PolicyContract:
         robot_type: str | None = None,
         *,
         cameras: Mapping[str, Sequence[int]] | None = None,
+        robot: Mapping[str, Any] | None = None,
         who: str = "The policy",
     ) -> None:
         """Check that the policy fits what it is to drive. What is None, here or in the contract, is not checked.
 
-        Cameras are image shapes (height, width, channels) [px] by name; more than the policy knows are fine.
+        Cameras are image shapes (height, width, channels) [px] by name; more than the policy knows are fine. Of the
+        robot's options those are compared that say what its numbers mean.
         """
         if None not in (robot_type, self.robot_type) and robot_type != self.robot_type:
             raise ConfigError(
@@ -143,6 +147,11 @@ class PolicyContract:
                     f"{who} was trained on other {what} features: {_difference(trained, here)}. "
                     f"Use {remedy} as in {self._data()}, or train on data of this robot and task."
                 )
+        for name, then, now in other_units(self.robot or {}, robot or {}):
+            raise ConfigError(
+                f"{who} was trained on numbers of another meaning: robot.{name} was {then} there and is {now} here. "
+                f"Set --robot.{name}={then}, or train on data of this robot."
+            )
         for name, shape in (self.cameras or {}).items():
             if cameras is None:
                 break
@@ -212,11 +221,8 @@ def camera_name(key: str) -> str:
 
 
 def _names(features: Mapping[str, Any], key: str) -> tuple[str, ...] | None:
-    """Return the names of a feature's columns, which other programs also write as lists in a dictionary."""
-    names = features[key].get("names") if key in features else None
-    if isinstance(names, Mapping):
-        names = [name for part in names.values() for name in (part if isinstance(part, list | tuple) else [part])]
-    return None if not names else tuple(str(name) for name in names)
+    """Return the names of a feature's columns."""
+    return (names_of(features[key]) or None) if key in features else None
 
 
 def _channels_last(feature: Mapping[str, Any]) -> tuple[int, int, int]:

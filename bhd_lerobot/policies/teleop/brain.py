@@ -6,10 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pkgutil import resolve_name
 from typing import Any
 
+import draccus
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
+from bhd_lerobot.datasets.format.identity import other_units
 from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_text
 from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
@@ -71,7 +73,17 @@ class TeleopBrain(ConfiguredBrain):
             asked = flattened(self.config.map)
             pair = Pair(teleop_type, robot.robot_type, is_ours[0] == is_ours[1])
             self._map = ActionMap(asked, pair, features, robot.action_names)
+            if not asked:
+                self._check_units(robot)
         self._calls = self._calls or Calls(f"bhd-{teleop_type}")
+
+    def _check_units(self, robot: RobotFeatures) -> None:
+        own = draccus.encode(self.config.teleop)
+        for name, driven, leader in other_units(robot.robot, own, units_only=True):
+            raise ConfigError(
+                f"robot.{name} is {driven}, and teleop.{name} is {leader}: the teleoperator's numbers would be "
+                "taken for others. Set both alike, or translate by --map or --processor."
+            )
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start an episode: the teleoperator is given time to answer.

@@ -82,19 +82,18 @@ class Motion:
     @classmethod
     def of(cls, view: RobotView, features: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Self:
         """Return what is recorded of an episode."""
-        names = features.get(keys.OBSERVATION_STATE, {}).get("names")
-        state = _columns_of(names, columns.get(keys.OBSERVATION_STATE))
+        state = _columns_of(features.get(keys.OBSERVATION_STATE), columns.get(keys.OBSERVATION_STATE))
         angles = {f"{name.removesuffix('.pos')}_joint": values for name, values in state.items()}
-        physics = _columns_of(features.get(keys.PHYSICS_STATE, {}).get("names"), columns.get(keys.PHYSICS_STATE))
+        physics = _columns_of(features.get(keys.PHYSICS_STATE), columns.get(keys.PHYSICS_STATE))
         angles |= {joint: physics[angle] for joint, (angle, _) in view.wheels.items() if angle in physics}
         tool = np.stack([state[name] for name in TOOL], axis=1) if set(TOOL) <= state.keys() else None
         return cls({joint.joint: angles[joint.joint] for joint in view.joints if joint.joint in angles}, tool)
 
 
-def _columns_of(names: Any, values: NDArray[Any] | None) -> dict[str, Array]:
-    if values is None or not isinstance(names, list) or values.ndim != 2 or len(names) != values.shape[1]:
+def _columns_of(feature: Mapping[str, Any] | None, values: NDArray[Any] | None) -> dict[str, Array]:
+    if feature is None or values is None or values.ndim != 2:
         return {}
-    return {str(name): values[:, column].astype(np.float64) for column, name in enumerate(names)}
+    return {name: values[:, column].astype(np.float64) for column, name in enumerate(keys.names_of(feature))}
 
 
 def still_frames(view: RobotView, motion: Motion) -> list[StaticFrame]:
@@ -148,7 +147,7 @@ def wheel_states(
     view: RobotView, frames: Frames, features: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]
 ) -> list[bytes]:
     """Return messages for ``/joint_states`` of a base's wheels; none where the physics was not recorded."""
-    physics = _columns_of(features.get(keys.PHYSICS_STATE, {}).get("names"), columns.get(keys.PHYSICS_STATE))
+    physics = _columns_of(features.get(keys.PHYSICS_STATE), columns.get(keys.PHYSICS_STATE))
     if not view.wheels or not {name for pair in view.wheels.values() for name in pair} <= physics.keys():
         return []
     angles, speeds = (np.stack([physics[pair[side]] for pair in view.wheels.values()], axis=1) for side in (0, 1))

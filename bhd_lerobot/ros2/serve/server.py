@@ -71,7 +71,7 @@ class Input:
         subscription: where messages come from.
         take: takes a message, deserialised; returns False if it is refused.
         which: of the messages that have arrived: the newest that is not refused; each, the oldest first, one in a turn
-            of the loop, which goes on meanwhile; or those that differ, once each, for what is to be found among any number.
+            of the loop, which goes on meanwhile; or those that differ, once each, to find one among any number.
     """
 
     subscription: Subscription

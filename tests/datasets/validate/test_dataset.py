@@ -268,8 +268,8 @@ def no_shape(root: Path) -> None:
     edit_json(root / "meta/info.json", lambda content: content["features"]["action"].pop("shape"))
 
 
-def one_name(root: Path) -> None:
-    edit_json(root / "meta/info.json", lambda content: content["features"]["action"].update(names=["a"]))
+def names(root: Path, *given: str) -> None:
+    edit_json(root / "meta/info.json", lambda content: content["features"]["action"].update(names=list(given)))
 
 
 FILE = "data/chunk-000/file-000.parquet"
@@ -284,13 +284,19 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "stats of": (stats(lambda all_: all_.pop("action")), "stats", "meta/stats.json: action", "no min"),
     "frames": (info(total_frames=134), "counts", "info.json", "counts 134 frames; the episodes have 135"),
     "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episodes are not described, 6 first"),
-    "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
+    "names": (lambda root: names(root, *"abc"), "schema", "meta/info.json: action", "3 names for 2 numbers"),
     "shape": (no_shape, "schema", "meta/info.json: action", "it has the shape None"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
     "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
     "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
     "twice": (row("episode_index", 1), "counts", "meta/episodes", "episode 1 is described twice"),
 }
+
+
+def test_one_name_for_several_numbers_is_valid(valid: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(valid, tmp_path / "d"))
+    names(root, "actions")
+    assert check_dataset(root).is_valid
 
 
 def test_damaged_files_are_found(valid: Path, tmp_path: Path) -> None:

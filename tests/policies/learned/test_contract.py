@@ -148,6 +148,23 @@ def test_what_does_not_fit_is_refused_with_both_sides_and_the_remedy(here: Any, 
     assert [part for part in ("The policy X", *parts) if part not in str(error.value)] == []
 
 
+MOCK = {"type": "mock_arm", "use_degrees": True, "cameras": {"front": {"color_mode": "rgb"}}, "log": ""}
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_robot_whose_options_give_its_numbers_another_meaning_is_refused(nested: bool) -> None:
+    def robot(**values: Any) -> dict[str, Any]:
+        changed = {**MOCK, **values}
+        return {"type": "two_arms", "left": changed} if nested else changed
+
+    contract = replace(CONTRACT, robot=robot())
+    contract.check(robot=robot(log="elsewhere", cameras={"front": {"color_mode": "bgr"}}))
+    contract.check(robot={"type": "mock_arm"})
+    contract.check(robot={**robot(use_degrees=False), "clock": "lockstep"})  # ours: SI units
+    with pytest.raises(ConfigError, match=r"robot.(left.)?use_degrees was true there and is false here.*=true"):
+        contract.check(robot=robot(use_degrees=False), who="The policy")
+
+
 def test_other_units_are_refused() -> None:
     with pytest.raises(ConfigError, match="degrees"):
         replace(CONTRACT, units="degrees").check()

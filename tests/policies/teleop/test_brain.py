@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.errors import BrainStoppedError
+from bhd_lerobot.errors import BrainStoppedError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
@@ -24,6 +24,18 @@ def brain() -> Iterator[TeleopBrain]:
         brain.bind(RobotFeatures(JOINTS, JOINTS, 50, robot_type="mock_arm"))
         brain.reset(ONLY, [0], 1)
         yield brain
+
+
+def test_a_leader_in_other_units_than_the_robot_is_refused_unless_they_are_translated() -> None:
+    def bind(robot: dict[str, Any], **options: Any) -> None:
+        with closing(TeleopBrain(TeleopConfig(MockLeaderConfig(use_degrees=False), **options))) as brain:
+            brain.bind(RobotFeatures(JOINTS, JOINTS, 50, robot_type="mock_arm", robot={"type": "mock_arm", **robot}))
+
+    with pytest.raises(ConfigError, match=r"robot.use_degrees is true, and teleop.use_degrees is false"):
+        bind({"use_degrees": True})
+    bind({"use_degrees": False})
+    bind({})
+    bind({"use_degrees": True}, map={name: {"from": name, "scale": 1.8} for name in JOINTS})
 
 
 @pytest.mark.parametrize("raises", [False, True])

@@ -5,7 +5,9 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
@@ -215,6 +217,46 @@ def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) ->
         with pytest.raises(ConfigError, match=r"gate.max_change does not limit shoulder.pos, .*would jump"):
             replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=change), console)
     assert len(np.loadtxt(tmp_path / "log")) == len(sent)
+
+
+def rewrite(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    change(info["features"])
+    path.write_text(json.dumps(info))
+
+
+def test_a_replay_is_by_name_and_in_the_recorded_units_or_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1)
+    recorded = np.stack(read_episode(tmp_path / "d", 0)["action"])
+    log, number = tmp_path / "log", iter(range(9))
+
+    def replay(change: Callable[[dict[str, Any]], object], **overrides: object) -> str:
+        root = Path(shutil.copytree(tmp_path / "d", tmp_path / f"copy{next(number)}"))
+        rewrite(root, change)
+        robot = parse(RecordConfig, options(tmp_path / "other", robot__log=log, **overrides)).robot
+        console = Console(file=io.StringIO(), width=120)
+        replay_on_robot(root, 0, robot, GateConfig(max_change=90.0), console)
+        return console.file.getvalue()
+
+    for refused, message in (
+        (lambda features: features["action"].update(names=None), "not named one by one"),
+        (lambda features: features["action"].update(names=["actions"]), "not named one by one"),
+        (lambda features: features["action"].update(names=["a", "b", "c"]), "are a, b, c; those of mock_arm are"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            replay(refused)
+    with pytest.raises(ConfigError, match=r"robot.use_degrees = true, and it is false.*--robot.use_degrees=true"):
+        replay(lambda features: None, robot__use_degrees="false")
+    assert not log.exists()
+    dictionary = replay(lambda features: features["action"].update(names={"motors": features["action"]["names"]}))
+    np.testing.assert_array_equal(np.loadtxt(log), recorded)
+    assert "elbow.pos" in dictionary
+    log.unlink()
+    assert "nothing is compared" in replay(lambda features: features["observation.state"].update(names=None))
+    log.unlink()
+    replay(lambda features: [features[key]["names"].reverse() for key in ("action", "observation.state")])
+    np.testing.assert_array_equal(np.loadtxt(log), recorded[:, ::-1])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -96,15 +96,13 @@ class EpisodeTopics:
                 f"Feature {key!r} of {self._state.root} is of type {kind}, shape {shape}; bags are made of vectors of "
                 "float32, float64, int64 and bool, of texts and of video."
             )
-        names = feature.get("names")
-        if not isinstance(names, list) or len(names) != shape[0]:
-            names = [str(index) for index in range(shape[0])]
+        names = keys.numbered_names_of(feature)
         if kind in ("int64", "bool"):
-            return [IntegersPart(own_topic(key), tuple(map(str, names)))]
+            return [IntegersPart(own_topic(key), names)]
         if kind == "float64":
-            return [NumbersPart(own_topic(key), tuple(map(str, names)))]
+            return [NumbersPart(own_topic(key), names)]
         return parts_of(
-            key, [str(name) for name in names], self._robot,
+            key, names, self._robot,
             lidar=self._view.lidar, noise=self._view.noise, bare_twist=self._options.bare_twist,
         )  # fmt: skip
 
@@ -225,11 +223,11 @@ def _split(
         return
     table = values.reshape(len(values), -1)
     table = table.astype(np.int64 if isinstance(parts[0], IntegersPart) else np.float64)
-    names = feature.get("names")
-    if len(parts) == 1 and len(parts[0]) == table.shape[1] and (not names or parts[0].names == tuple(names)):
+    names = keys.numbered_names_of(feature)
+    if len(parts) == 1 and parts[0].names == names:
         yield parts[0], table
         return
-    place = {str(name): column for column, name in enumerate(names or ())}
+    place = {name: column for column, name in enumerate(names)}
     for part in parts:
         yield part, table[:, [place[name] for name in part.names]]
 

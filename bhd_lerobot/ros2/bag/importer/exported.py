@@ -126,11 +126,7 @@ def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:
 def names_of(episode: ExportedEpisode, key: str) -> tuple[str, ...]:
     """Return the names of a vector's numbers, in order; nothing if there is no such vector."""
     feature = episode.features.get(key)
-    if feature is None:
-        return ()
-    names, count = feature.get("names"), feature["shape"][0]
-    known = isinstance(names, list) and len(names) == count
-    return tuple(str(name) for name in (names if known else range(count)))
+    return () if feature is None else keys.numbered_names_of(feature)
 
 
 def sources_of(episode: ExportedEpisode, bag: Bag) -> list[Source]:

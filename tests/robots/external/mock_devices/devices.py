@@ -105,6 +105,7 @@ class MockArmConfig(RobotConfig):
     read_s: float = 0.002
     log: str = ""
     times: str = ""
+    use_degrees: bool = True
 
 
 class MockArm(Robot):
@@ -224,6 +225,7 @@ class MockLeaderConfig(TeleoperatorConfig):
     period_s: float = 2.0
     fault: str = ""
     fault_at: int = 10
+    use_degrees: bool = True
 
 
 class MockLeader(Teleoperator):
