@@ -7,4 +7,5 @@ __all__ = [
     "parse",
     "plugins",
     "registry",
+    "units",
 ]

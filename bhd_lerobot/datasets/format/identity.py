@@ -9,7 +9,6 @@ from typing import Any
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
-from bhd_lerobot.options.dotted import flattened
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -97,33 +96,6 @@ def differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
                 yield from differences(name, recorded[key], requested[key])
     elif recorded != requested:
         yield f"{prefix}: recorded {_short(recorded)}, requested {_short(requested)}"
-
-
-_UNITS = re.compile("degree|radian|unit|norm|scal", re.IGNORECASE)
-"""Options of another package's robots and teleoperators that say what their numbers are in."""
-
-_MEANING = re.compile(f"{_UNITS.pattern}|invert|sign|offset|zero|homing|ratio|gear|direction|mirror|mode|order", re.I)
-"""Options that say what else its numbers mean."""
-
-
-def other_units(
-    recorded: Mapping[str, Any], present: Mapping[str, Any], *, units_only: bool = False
-) -> Iterator[tuple[str, str, str]]:
-    """Yield name and both values of each option that gives the numbers of two devices another meaning.
-
-    Of robots of this package there is none: their numbers are in SI units. What only one of them has is not compared.
-
-    Args:
-        recorded, present: options of the robots, or of a robot and its leader, as `describe` returns them.
-        units_only: compare only what says the units.
-    """
-    if "clock" in recorded or "clock" in present:
-        return
-    here, pattern = flattened(as_json(present)), _UNITS if units_only else _MEANING
-    for name, value in flattened(dict(recorded)).items():
-        is_camera = "cameras" in name.split(".")
-        if name in here and value != here[name] and pattern.search(name) and not is_camera:
-            yield name, _short(value), _short(here[name])
 
 
 def _short(value: Any) -> str:

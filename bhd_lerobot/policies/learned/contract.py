@@ -18,9 +18,9 @@ from lerobot.utils.constants import (
 
 from bhd_lerobot import __version__
 from bhd_lerobot.datasets.format.features import names_of
-from bhd_lerobot.datasets.format.identity import other_units
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.units import other_units
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE, WEIGHT_FILES, find_checkpoint
 
 __all__ = ["CONFIG_FILE", "CONTRACT_FILE", "FORMAT", "WEIGHT_FILES", "PolicyContract", "camera_name", "find_checkpoint"]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
-from bhd_lerobot.datasets.format.identity import other_units
 from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_text
 from bhd_lerobot.options.dotted import flattened
+from bhd_lerobot.options.units import other_units
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.calls import Calls
