@@ -310,6 +310,8 @@ class Body:
         cameras: the cameras, by name.
         physics_hz: default physics rate [Hz].
         control_hz: default control rate [Hz].
+        least_physics_hz: physics rate below which its simulation shakes [Hz].
+        least_control_hz: control rate below which its controller takes its own motion for a fault [Hz].
     """
 
     name: str
@@ -319,6 +321,27 @@ class Body:
     cameras: dict[str, CameraSpec] = field(default_factory=dict)
     physics_hz: int = 200
     control_hz: int = 200
+    least_physics_hz: int = 1
+    least_control_hz: int = 1
+
+    def check_rates(self, rates: Rates, *, is_simulated: bool = True) -> None:
+        """Check that the robot can be simulated and controlled at some rates.
+
+        Raises:
+            ConfigError: a rate is too low; the message gives the nearest that work.
+        """
+        least = self.least_control_hz, self.least_physics_hz if is_simulated else 1
+        if rates.control_hz >= least[0] and rates.physics_hz >= least[1]:
+            return
+        most = 4 * max(least[0], rates.control_hz)
+        control = range(-(-least[0] // rates.fps) * rates.fps, most + rates.fps, rates.fps)
+        pairs = [(hz, -(-max(least[1], rates.physics_hz) // hz) * hz) for hz in control]
+        near = min(pairs, key=lambda pair: (pair[1] != rates.physics_hz, abs(pair[0] - rates.control_hz), pair[1]))
+        raise ConfigError(
+            f"control_hz is {rates.control_hz} and physics_hz is {rates.physics_hz}; the {self.name} needs at least "
+            f"{least[0]} and {least[1]} Hz, or it shakes and stops with false faults. The nearest that work at fps = "
+            f"{rates.fps}: control_hz = {near[0]}, physics_hz = {near[1]}."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

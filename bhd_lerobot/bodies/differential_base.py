@@ -139,6 +139,7 @@ def differential_base(
             stop_deceleration=(2.5, 20.0),
             command_timeout_s=command_timeout_s,
         ),
+        least_physics_hz=91,  # the servos' time constant is 11 ms, see _SERVO_GAIN; in longer steps the base rocks
         drive=WheelDrive(
             joints=("wheel_left", "wheel_right"),
             actuators=("wheel_left", "wheel_right"),

@@ -130,4 +130,10 @@ def ur5(
         cameras={name: CameraSpec(name, camera_width, camera_height) for name in ("scene", "wrist")},
         physics_hz=500,
         control_hz=500,
+        # A servo at its largest effort, which the implicit integrator does not damp, turns a joint to and fro for ever
+        # in steps longer than 4 inertia / damping. Of wrist 3: 80 / (4 * 0.15).
+        least_physics_hz=134,
+        # At less, a joint at full speed is farther from its reference than `blocked_rad` for a tick; by torques, the
+        # observer of the contact is faster than a tick.
+        least_control_hz=25 if actuation == "position" else 50,
     )

@@ -98,6 +98,14 @@ class BhdRobotConfig(RobotConfig):
         """The three rates."""
         return Rates(self.physics_hz, self.control_hz, self.fps)
 
+    def check_rates(self) -> None:
+        """Check that the robot works at its rates: a plant's physics has no rate.
+
+        Raises:
+            ConfigError: a rate is too low; the message gives the nearest that work.
+        """
+        self.body().check_rates(self.rates, is_simulated=not self.plant)
+
     @abstractmethod
     def body(self) -> Any:
         """Return the hardware that this configuration describes."""
@@ -141,6 +149,7 @@ class MobileBaseConfig(BhdRobotConfig):
             raise ConfigError(
                 f"control_hz is {self.control_hz}; it must be a multiple of the lidar's {lidar.rate_hz} Hz."
             )
+        self.check_rates()
 
     @abstractmethod
     def body(self) -> MobileBase:

@@ -79,7 +79,7 @@ class UR5Config(BhdRobotConfig):
                 f"robot.stale_after_s is {self.stale_after_s}; it must be positive and finite. "
                 "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
             )
-        self.body()
+        self.check_rates()
 
     def body(self) -> Arm:
         """Return the hardware that this configuration describes."""

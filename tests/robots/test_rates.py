@@ -7,11 +7,13 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 
 # Ticks and physics steps a second.
-RATES = ((25, 500), (100, 100), (100, 200), (100, 500), (125, 500), (250, 500), (500, 500), (500, 1000))
+RATES = ((25, 500), (25, 150), (150, 150), (100, 200), (100, 500), (125, 500), (250, 500), (500, 500), (500, 1000))
 BOX = (Shape("box", 0.25, 0.45, 0.0, 0.2, 0.1, 0.8),)
 POSTURES, LIGHT_N, MOST_FREE_N = 6, 20.0, 80.0
 
@@ -57,3 +59,53 @@ def test_at_any_rates_an_arm_that_presses_on_something_stops(control_hz: int, ph
     for _ in range(20):
         arm.step(None)
     assert np.linalg.norm(felt) < LIGHT_N
+
+
+@pytest.mark.thorough(but=3)
+@pytest.mark.parametrize("kicked", range(6))
+@pytest.mark.parametrize(("control_hz", "physics_hz"), [(25, 150), (150, 150), (25, 500)])
+def test_at_any_rates_that_are_accepted_a_kick_dies_down(control_hz: int, physics_hz: int, kicked: int) -> None:
+    arm = start(1, control_hz, physics_hz)
+    there = arm.cerebellum.command.copy()
+    arm.physics[1][0, kicked] += 1.0
+    for _ in range(3 * arm.rates.fps):
+        report = arm.step(there)
+    assert report.mode[0] == Mode.TRACKING
+    assert np.abs(arm.cerebellum.reading.velocity).max() < 1e-3
+
+
+def test_setpoints_at_the_lowest_rate_are_reached_and_stay_there() -> None:
+    arm = start(1, 25, 500)
+    there = arm.cerebellum.command.copy()
+    for way in (0.3, 0.0):
+        for _ in range(3 * arm.rates.fps):
+            arm.step(there + way * np.array([1, 1, -1, 1, 1, 1, 0]))
+    assert np.abs(arm.cerebellum.command - there)[0, :6].max() < 1e-6
+
+
+RATES_REFUSED = {
+    UR5Config: {(60, 60, 30): (60, 180), (50, 50, 50): (50, 150), (50, 50, 10): (50, 150), (10, 500, 10): (50, 500),
+                (100, 100, 25): (100, 200), (7, 7, 7): (28, 140), (20, 200, 5): (25, 200)},
+    TurtleBot3Config: {(60, 60, 30): (60, 120), (50, 50, 50): (50, 100), (5, 5, 5): (5, 95)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("config", RATES_REFUSED)
+def test_rates_at_which_it_would_shake_are_refused_with_the_nearest_that_work(config: type) -> None:
+    for (control_hz, physics_hz, fps), near in RATES_REFUSED[config].items():
+        with pytest.raises(ConfigError, match=f"control_hz = {near[0]}, physics_hz = {near[1]}") as refused:
+            config(control_hz=control_hz, physics_hz=physics_hz, fps=fps)
+        assert f"control_hz is {control_hz} and physics_hz is {physics_hz}" in str(refused.value)
+        config(control_hz=near[0], physics_hz=near[1], fps=fps)
+
+
+def test_a_plant_has_no_physics_rate() -> None:
+    UR5Config(control_hz=60, physics_hz=60, fps=30, clock="realtime", plant="package.module:Class")
+    with pytest.raises(ConfigError, match="control_hz is 10"):
+        UR5Config(control_hz=10, physics_hz=10, fps=10, clock="realtime", plant="package.module:Class")
+
+
+def test_the_least_physics_rate_follows_from_damping_and_inertia() -> None:
+    body, world = start(1, 500, 500).body, start(1, 500, 500).world
+    inertia = world.model.dof_armature[: len(body.servo_damping)]
+    assert body.least_physics_hz > max(np.array(body.servo_damping[3:6]) / (4 * inertia[3:6]))

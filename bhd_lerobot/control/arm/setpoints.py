@@ -167,7 +167,7 @@ class SetpointFilter:
         self.active: Mask = np.zeros(n, np.bool_)
         self.limits: Counts = np.zeros(n, np.int64)
         targets = self._target, self._goal, self._step, self._feed, self._arrival, self.active, self.limits
-        gain = _GAIN if is_gradual else _GAIN_AT_ONCE
+        gain = min(_GAIN if is_gradual else _GAIN_AT_ONCE, control_hz / 2)  # more would overshoot in a single tick
         self._want = want_speeds.bind(*targets, self._speed, *ends, speed, acceleration, ramp, gain, float(control_hz))
         share, dof = (np.ones(n), 0) if clearance is None else (clearance.share, clearance.dof)
         state = self._speed, self.active, self.limits, share, dof

@@ -88,7 +88,7 @@ class Rig:
         self.plant = plant or Perfect()
         self.slept = 0.0
         self.checked = CheckedPlant(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
-        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.checked)
+        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=500), self.checked)
         self.plant.time = lambda: self.host.bridge.now_ns
         self.checked.open()
 
