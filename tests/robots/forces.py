@@ -1,9 +1,12 @@
-"""What a simulated arm presses with."""
+"""What a simulated arm presses with, and what presses on it."""
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+
+Array = NDArray[np.float64]
 
 
 class Contacts:
@@ -26,3 +29,48 @@ class Contacts:
                 mujoco.mj_contactForce(self._model, self._data, number, wrench)
                 total += abs(wrench[0])
         return total
+
+
+class Wall:
+    """A wall that moves against the tools of an arm's simulations: a spring and a damper that only push.
+
+    Args:
+        simulation: the arms.
+        direction: in which it pushes, world frame, shape (3,).
+        speed: with which it comes [m/s].
+        seconds: for which it comes; then it stays where it is.
+        stiffness: of what it is made of [N/m].
+
+    Attributes:
+        force: with which it pushes each tool now [N], shape (n,).
+    """
+
+    def __init__(
+        self, simulation: UR5Simulation, direction: Array, speed: float, seconds: float, stiffness: float = 2e4
+    ) -> None:
+        world, self._hz = simulation.world, simulation.rates.control_hz
+        self._direction = np.asarray(direction) / np.linalg.norm(direction)
+        self._speed, self._seconds, self._stiffness = speed, seconds, stiffness
+        self._external, self._centre = world._batch.bind("xfrc_applied"), world.derived("xipos")
+        self._body, self._tool = world.model.body("gripper").id, world.site("tool").position
+        self._start, self._last = self._tool.copy(), self._tool.copy()
+        self._tick, self.force = 0, np.zeros(simulation.n)
+        after = simulation._after_tick
+
+        def push() -> None:
+            after()
+            self._push()
+
+        simulation._after_tick = push  # type: ignore[method-assign]
+
+    def _push(self) -> None:
+        self._tick += 1
+        time, tool = self._tick / self._hz, self._tool
+        comes = self._speed * min(time, self._seconds) - 0.003
+        depth = comes - (tool - self._start) @ self._direction
+        speed = self._speed * (time < self._seconds) - (tool - self._last) @ self._direction * self._hz
+        self._last = tool.copy()
+        self.force = np.where(depth > 0.0, np.maximum(self._stiffness * depth + 50.0 * speed, 0.0), 0.0)
+        force = self.force[:, None] * self._direction
+        self._external[:, self._body, :3] = force
+        self._external[:, self._body, 3:] = np.cross(tool - self._centre[:, self._body], force)

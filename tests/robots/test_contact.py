@@ -1,18 +1,20 @@
 """What setpoints may touch: nothing. And what happens to an arm that presses on something nevertheless."""
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import CommandRefusedError, ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from tests.robots.forces import Contacts
+from tests.robots.forces import Contacts, Wall
 
 FIRST = np.zeros(1, np.intp)
 LEAST = 0.003  # [m] in the hardest reversals an arm may come so near, of the 0.005 that goals keep
@@ -229,3 +231,97 @@ def test_setpoints_and_goals_keep_away_from_obstacles_that_are_declared() -> Non
     for wrong in ([0.1] * 6, [0.1] * 6 + [0.0], [float("nan")] + [0.1] * 6):
         with pytest.raises(ConfigError, match=r"robot.obstacles has .* as number 0; an obstacle is 7 finite numbers"):
             UR5Config(obstacles=[wrong])
+
+
+UP, DOWN, ASIDE, ASKEW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.3, 1.0, 0.0), (-0.5, 0.4, 0.6)
+
+
+def settled(arm: UR5Simulation, wall: Wall, seconds: float) -> tuple[float, float]:
+    """Let time go by; return the largest force of the wall in the last half of it, and a joint's largest speed."""
+    forces, fastest = [], 0.0
+    for frame in range(round(seconds * 25)):
+        arm.step(None)
+        forces.append(float(wall.force.max()) * (2 * frame >= seconds * 25))
+        fastest = max(fastest, float(np.abs(arm.cerebellum.reading.velocity[:, :6]).max()))
+    return max(forces), fastest
+
+
+@pytest.mark.parametrize("cause", ["fault", "emergency stop"])
+@pytest.mark.parametrize(
+    ("direction", "speed", "seconds", "stiffness", "latency_s"),
+    [
+        (DOWN, 0.02, 4.0, 2e4, 0.0),
+        (UP, 0.05, 2.0, 2e4, 0.0),
+        (ASIDE, 0.05, 3.0, 2e5, 0.0),
+        (ASKEW, 0.1, 1.5, 2e4, 0.0),
+        (ASKEW, 0.03, 2.0, 1e3, 0.0),
+        (ASIDE, 0.05, 2.0, 2e4, 0.03),
+    ],
+)
+def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
+    cause: str, direction: tuple[float, ...], speed: float, seconds: float, stiffness: float, latency_s: float
+) -> None:
+    arm = UR5Simulation(UR5Config(), 1, threads=1)
+    scene = TableScene("empty", (), arm.body.home, variation=Variation(latency_s=latency_s))  # type: ignore[union-attr]
+    arm.reset(FIRST, [scene], [0])
+    if cause == "fault":
+        arm.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)
+    else:
+        arm.cerebellum.estop.press()
+    arm.step(None)
+    wall = Wall(arm, np.array(direction), speed, seconds, stiffness)
+    pushed, fastest = settled(arm, wall, seconds)
+    assert 0.0 < pushed < 300.0
+    after, _ = settled(arm, wall, 1.0)
+    assert after < LIGHT_N
+    assert fastest < 1.5
+    where = arm.cerebellum.reading.position.copy()
+    settled(arm, wall, 1.0)
+    assert np.abs(arm.cerebellum.reading.position - where).max() < 2e-3  # it has not gone on
+    assert all(arm.cerebellum.request(one).accepted.all() for one in (Request.RESET, Request.ACTIVATE))
+
+
+def test_an_arm_in_hold_is_watched_after_reset_and_activate_before_any_command() -> None:
+    for direction in (UP, DOWN, ASIDE, ASKEW):
+        arm = UR5Simulation(UR5Config(), 1, threads=1)
+        arm.reset(FIRST, [TableScene("empty", (), arm.body.home)], [0])  # type: ignore[union-attr]
+        arm.cerebellum.estop.press()
+        for _ in range(5):
+            arm.step(None)
+        assert all(arm.cerebellum.request(one).accepted.all() for one in (Request.RESET, Request.ACTIVATE))
+        wall, forces = Wall(arm, np.array(direction), 0.1, 10.0), []
+        while arm.modes[0] == Mode.HOLD:
+            arm.bridge.advance_ticks(1)
+            forces.append(wall.force[0])
+            assert len(forces) < 1000
+        assert arm.modes[0] == Mode.FAULT
+        assert max(forces) < 350.0
+        assert int(arm.cerebellum.take_flags()[1][0]) & (Watchdog.FORCE | Watchdog.BLOCKED)
+
+
+@pytest.mark.parametrize("force", [50.0, 120.0])
+def test_an_arm_that_is_pressed_is_neither_reset_nor_activated_and_the_message_names_the_force(force: float) -> None:
+    """By a force that follows it, so that giving way does not help."""
+    robot = UR5(UR5Config(id="pressed"))
+    robot.connect()
+    try:
+        arm: Any = robot.host
+        robot.estop()
+        external = arm.world._batch.bind("xfrc_applied")
+        body = arm.world.model.body("gripper").id
+        for step in range(20):
+            external[0, body, 1] = force * min(1.0, step / 5)
+            with pytest.raises(CommandRefusedError, match="emergency stop"):
+                robot.send_action(dict(zip(robot.action_names, arm.cerebellum.command[0], strict=True)))
+        with pytest.raises(CommandRefusedError, match=r"presses on something.*\((\d+) N, mode ESTOP\)") as refusal:
+            robot.reset()
+        named = float(re.findall(r"\((\d+) N", str(refusal.value))[0])
+        assert named == pytest.approx(force, rel=0.3)
+        external[0, body] = 0.0
+        for _ in range(20):
+            with pytest.raises(CommandRefusedError, match="emergency stop"):
+                robot.send_action(dict(zip(robot.action_names, arm.cerebellum.command[0], strict=True)))
+        robot.reset()
+        robot.activate()
+    finally:
+        robot.disconnect()

@@ -8,6 +8,7 @@ __all__ = [
     "force_limit",
     "held",
     "impedance",
+    "relief",
     "rotations",
     "setpoints",
     "wrench",

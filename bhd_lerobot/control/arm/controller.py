@@ -9,10 +9,12 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.held import HeldObjects
+from bhd_lerobot.control.arm.relief import ContactRelief
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.kernels import kernel, largest_change
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
@@ -25,16 +27,14 @@ Array = NDArray[np.float64]
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
 _EFFORT = int(Limit.EFFORT)
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
-_STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
+_BACK, _BACK_TOOL = 0.5, 0.25  # [rad/s, m/s] of joints and tool that a stop brings back, unless they were faster
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
-_GIVES_WAY_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
-_MOST_GIVING = 3
-_GIVING_S = 3.0  # [s] after which an arm gives way no longer: five times what it took in `python -m benchmarks.contact`
-_BACK_RAD = 0.02  # [rad] the way that an arm first goes back after a protective stop, of the joint that turned most
-_MOST_BACK_RAD = 0.25  # [rad] and in all: 0.2 in `python -m benchmarks.contact`
-_SPRINGS_RAD = 0.05  # [rad] by which what an arm leans on may push it on when it has given way
-LIGHT_N = 20.0  # [N] an arm that presses less has given way
-_TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
+_YIELD_S = 0.2  # [s] for which joints that do not come to rest are waited for where they were: something pushes them
+_PRESSED_N = 30.0  # [N] an arm that presses more is neither reset nor activated
+_GIVES = 0.5  # the least share of its largest torque that the servo of a blocked joint gives
+_ARRIVED_RAD = 2e-4  # [rad]
+_SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
+_TINY = 1e-9
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -101,28 +101,26 @@ class ArmController(Controller):
         self._half_tick = 0.5 / control_hz  # [s]
         # Ticks for which a joint has been too far from its reference.
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
-        # For so many ticks has an arm that was stopped hard been still.
-        self._still_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._settled_ticks = round(_SETTLED_S * control_hz)
-        # How often an arm that was stopped hard may still give way to what it touches.
-        self._gives_way: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._any_gives_way = False
-        self._giving_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._most_giving_ticks = round(_GIVING_S * control_hz)
+        self._settled_ticks, self._most_yield_ticks = round(_SETTLED_S * control_hz), round(_YIELD_S * control_hz)
         self._stopped = np.zeros(n, np.bool_)  # hard, since it was last reset
+        self._rest_ticks: NDArray[np.int64] = np.zeros(n, np.int64)  # for which its reference has followed nothing
+        self._blind = np.zeros(n, np.bool_)  # it is not known where it is
+        self._relief = ContactRelief(arm, n, control_hz)
         self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
-        # Where a protective stop brings the joints, or where the reference was when another hard stop began; and how
-        # far from `_centre` the reference may be brought after it. All are fixed when the stop begins, or has come to
-        # rest: a reading that is wrong moves an arm no farther.
-        self._aim, self._centre, self._room = (np.zeros((n, width - 1)) for _ in range(3))
-        self._back_rad = np.zeros(n)  # so far it then goes back
-        self._trail = _Trail(n, width - 1, control_hz)
+        self._yield_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
+        # Where a protective stop brings the servos' commands, and how fast. Both are fixed when it begins: a reading
+        # that is wrong moves an arm no farther.
+        self._aim, self._top = (np.zeros((n, width - 1)) for _ in range(2))
+        self._forward = ForwardKinematics(arm.chain)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
         self._bend = 0.9 * WireLimits.of(arm, control_hz).bend[:-1]
         self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
+        self._misread = (
+            f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
+            "encoder is wrong."
+        )
         self._lead = np.asarray(arm.lead_s)
         # [rad] so far a joint may be from its reference when it is found that it does not follow
         self._reach = (arm.blocked_rad + self._speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:-1]
@@ -164,8 +162,6 @@ class ArmController(Controller):
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
             message = "A setpoint came, and the newer command counts."
             self.goals.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, message)
-        self._gives_way[mask] = 0
-        self._unwatched &= ~mask
         self.setpoints.set_setpoint(values, mask, self.command)
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
@@ -175,18 +171,10 @@ class ArmController(Controller):
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
-            mask = mask & (self.protective_stop == 0)  # they are on their way back, and goals have ended
-            self._begin_giving_way(mask & ~self._stopped)
-            np.copyto(self._aim, self.command[:, :-1], where=mask[:, None] & ~self._yields[:, None])
+            self._stopped |= mask
+            mask = mask & ~self._yields  # they stop already, and goals have ended
         self._leave_setpoints(mask)
         self.goals.stop(mask, _STOP_CODES[cause], hard, (self.command, self.velocity, self.acceleration))
-
-    def _begin_giving_way(self, mask: NDArray[np.bool_]) -> None:
-        self._stopped |= mask
-        self._unwatched |= mask
-        self._gives_way[mask] = _MOST_GIVING
-        self._giving_ticks[mask] = self._still_ticks[mask] = 0
-        self._any_gives_way = True
 
     def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
         """Make the reference again what the servos have, at the speed of their commands; play nothing any more."""
@@ -201,12 +189,12 @@ class ArmController(Controller):
         np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
 
     def distrust(self, mask: NDArray[np.bool_]) -> None:
-        """Give way to nothing: where the arms are is not known."""
-        self._gives_way[mask] = 0
+        """Give way to nothing for now: where the arms are is not known."""
+        self._blind |= mask
         if self.force is not None:
             self.force.restart(np.flatnonzero(mask))
 
-    def run(self, reading: PlantReading) -> None:  # noqa: PLR0912  what a tick does, in its order
+    def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
         for sim, held in self.held.update(reading, self.command) if self.held is not None else ():
             self.goals.hold(sim, held)
@@ -219,16 +207,9 @@ class ArmController(Controller):
                 self._leave_setpoints(self.busy)
             self.setpoints.run(*reference)
         self.goals.tick(reference, (reading.position, reading.velocity))
-        if np.count_nonzero(self._unwatched):
-            self._unwatched &= ~self.following
-        self._trail.note(reading, self._gives_way)
-        if self._any_gives_way:
-            self._giving_ticks += self._gives_way > 0
-            if np.count_nonzero(self._giving_ticks > self._most_giving_ticks):
-                self._gives_way[self._giving_ticks > self._most_giving_ticks] = 0
-        if self._any_yields:
-            self._yield(reading)
-        if self._any_gives_way:
+        if np.count_nonzero(self._stopped):
+            if self._any_yields:
+                self._yield(reading)
             self._give_way(reading)
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
@@ -236,44 +217,22 @@ class ArmController(Controller):
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0
-        if self.force is not None and self.force.update(reading):
-            self._protect(self.force.exceeded & ~self._unwatched, reading, Watchdog.FORCE, self.force.explain())
+        if self.force is not None and self.force.update(reading, self._rest_ticks > 0):
+            # One that gives way does what it can.
+            watched = ~self._yields & (~self._stopped | self.goals.following)
+            self._protect(self.force.exceeded & watched, reading, Watchdog.FORCE, self.force.explain())
 
     def _give_way(self, reading: PlantReading) -> None:
-        """After a hard stop, bring the reference to where the arm came to rest: what it presses on is let go of."""
-        dof = self.width - 1
-        still = (np.abs(reading.velocity[:, :dof]) < _STILL).all(axis=1)
-        resting = (np.abs(self.velocity[:, :dof]) < _REST).all(axis=1)
-        waiting = (self._gives_way > 0) & ~self._yields & still & resting & ~self.following
-        self._still_ticks = (self._still_ticks + 1) * waiting
-        ready = self._still_ticks >= self._settled_ticks
-        if not ready.any():
-            return
-        self._still_ticks[ready] = 0
-        where = self._retreat_from(reading)
-        first = ready & (self._gives_way == _MOST_GIVING) & (self._back_rad == 0.0)
-        if first.any():
-            # It may have been away from its reference when the stop began, and have met something on the way to rest.
-            np.copyto(self._centre, self.command[:, :dof], where=first[:, None])
-            np.copyto(self._room, self._reach + np.abs(self.command[:, :dof] - self._aim), where=first[:, None])
-        for sim in np.flatnonzero(ready & (self._back_rad > 0.0)).tolist():
-            positions = reading.position[sim, :dof], self.command[sim, :dof]
-            where[sim, :dof] = self._trail.back(sim, *positions, self._back_rad[sim], where[sim, :dof])
-            # Whatever it slid along on the way here holds it until it is back at where that began.
-            presses = self.force is not None and self.force.force[sim] > LIGHT_N
-            self._back_rad[sim] = 2 * self._back_rad[sim] if presses else 0.0
-        inside = np.minimum(np.maximum(where[:, :dof], self._centre - self._room), self._centre + self._room)
-        np.copyto(where[:, :dof], inside, where=ready[:, None])
-        np.copyto(self._centre, inside, where=first[:, None])
-        np.copyto(self._room, _SPRINGS_RAD, where=first[:, None])
-        off = ready & (np.abs(where - self.command) > _GIVES_WAY_RAD).any(axis=1)
-        # What it leans on springs back, and pushes the arm on: it takes a few times. A load, which makes the arm sag a
-        # little further each time, must not make it sink for ever.
-        self._gives_way[off] -= 1
-        self._gives_way[ready & ~off] = 0
-        self._any_gives_way = bool(self._gives_way.any())
-        if off.any():
-            self.goals.retreat(off, (self.command, self.velocity, self.acceleration), where)
+        """Let go of what stopped arms press on, once they have come to rest."""
+        self._rest_ticks += 1
+        self._rest_ticks *= self._stopped & ~self._yields & ~self.goals.following
+        ready, dof = self._rest_ticks > 0, self.width - 1
+        known = (self._rest_ticks > self._settled_ticks) & ~self._blind & ~self._misread_joints(reading).any(axis=1)
+        efforts = None
+        if self.force is not None and reading.has_effort:
+            efforts = self.force.torque, self.force.force
+        self._blind[:] = False
+        self._relief.run(ready, known, reading.position[:, :dof], efforts, self.command, self.velocity)
 
     def _watch(self, reading: PlantReading) -> None:
         """Find arms that do not go where they are commanded to, and stop pressing on with them.
@@ -283,30 +242,60 @@ class ArmController(Controller):
         """
         dof = self.width - 1
         away = np.abs(self.command[:, :dof] - reading.position[:, :dof])
-        off = (away > self.goals.limit.of(self.velocity[:, :dof])).any(axis=1)
-        self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
-        self._protect(self._off_ticks >= self._most_off_ticks, reading, Watchdog.BLOCKED, self._blocked)
+        limit = self.goals.limit.of(self.velocity[:, :dof])
+        off = (away > limit).any(axis=1)
+        self._off_ticks = (self._off_ticks + 1) * (off & ~self._stopped)
+        blocked = self._off_ticks >= self._most_off_ticks
+        if np.count_nonzero(blocked):
+            wrong = blocked & ((away > limit) & self._misread_joints(reading)).any(axis=1)
+            self._protect(wrong, reading, Watchdog.BLOCKED, self._misread, follows=True)
+            blocked &= ~wrong
+        self._protect(blocked, reading, Watchdog.BLOCKED, self._blocked)
 
-    def _protect(self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str) -> None:
-        """Begin a protective stop."""
+    def _misread_joints(self, reading: PlantReading) -> NDArray[np.bool_]:
+        """Return the joints that are far from where they are commanded to, and not pulled there, shape (n, dof).
+
+        A servo gives all it has then. If it does not, the encoder is wrong.
+        """
+        dof = self.width - 1
+        wanted = self._stiffness * (self.actuators - reading.position) - self._damping * reading.velocity
+        torque = reading.effort[:, :dof] if self.force is None else self.force.torque
+        wrong = torque * np.sign(wanted[:, :dof]) < _GIVES * self._effort[:dof]
+        wrong &= np.abs(wanted[:, :dof]) > _SURE * self._effort[:dof]
+        return wrong if reading.has_effort else np.zeros_like(wrong)
+
+    def _protect(
+        self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str, *, follows: bool = False
+    ) -> None:
+        """Begin a protective stop: at once, or if it `follows` the reference as any other hard stop does."""
         if not mask.any():
             return
         self.protective_stop[mask] = int(cause)
         self._any_stopped = True
         self._off_ticks[mask] = 0
+        self._stopped |= mask
         self._leave_setpoints(mask)
+        if follows:
+            reference = self.command, self.velocity, self.acceleration
+            self.goals.stop(mask, ResultCode.PATH_TOLERANCE, True, reference, message)
+            return
         self.goals.end_all(mask, ResultCode.PATH_TOLERANCE, message)
-        self._begin_giving_way(mask)
-        off = reading.position[:, :-1] - self.actuators[:, :-1]
-        aim = self.actuators[:, :-1] + np.minimum(np.maximum(off, -self._reach), self._reach)
-        for array, value in ((self._aim, aim), (self._centre, aim), (self._room, _MOST_BACK_RAD)):
-            np.copyto(array, value, where=mask[:, None])
+        dof = self.width - 1
+        now, speed = self.actuators[mask, :dof], self.velocity[mask, :dof]
+        off = np.minimum(np.maximum(reading.position[mask, :dof] - now, -self._reach), self._reach)
+        self._aim[mask] = now + off
+        # On a straight line, on which no joint is faster than it was, nor the tool.
+        jacobian = self._forward.jacobian(self.command[mask, :dof])[:, :3]
+        fast, way = (np.linalg.norm(np.einsum("nij,nj->ni", jacobian, one), axis=1) for one in (speed, off))
+        joints = (np.maximum(np.abs(speed), _BACK) / np.maximum(np.abs(off), _TINY)).min(axis=1)
+        rate = np.minimum(joints, np.maximum(fast, _BACK_TOOL) / np.maximum(way, _TINY))
+        self._top[mask] = np.abs(off) * rate[:, None]
         self._yields |= mask
-        self._back_rad[mask] = _BACK_RAD
+        self._yield_ticks[mask] = 0
         self._any_yields = True
 
     def _yield(self, reading: PlantReading) -> None:
-        """Bring the servos' commands to where the joints were, as fast as joints may turn, until these are at rest.
+        """Bring the servos' commands to where the joints were, until these are at rest.
 
         The reference would take its way to brake, against what the joints cannot go through. A servo that is so far
         from its command that it gives its largest torque gives no other on the way back, and one that is where it is
@@ -315,30 +304,18 @@ class ArmController(Controller):
         dof, mask = self.width - 1, self._yields
         off = self._aim - self.actuators[:, :dof]
         step = largest_change(np.abs(off) / self._bend) * self._bend
-        step = np.copysign(np.minimum(step, self._speed[:dof] * 2 * self._half_tick), off)
+        step = np.copysign(np.minimum(step, self._top * 2 * self._half_tick), off)
         np.copyto(self.command[:, :dof], self.actuators[:, :dof] + step, where=mask[:, None])
         np.copyto(self.velocity, 0.0, where=mask[:, None])
         np.copyto(self.acceleration, 0.0, where=mask[:, None])
         there = (np.abs(off) <= self._largest_error[:dof]) & (np.abs(reading.velocity[:, :dof]) < _SLOW)
         there &= np.abs(step) <= self._bend  # then it may stand still in the next tick
-        # One that never comes to rest, by what it reads, is not waited for.
-        self._yields &= ~there.all(axis=1) & ((self._gives_way > 0) | (np.abs(off) > _GIVES_WAY_RAD).any(axis=1))
+        self._yield_ticks += 1
+        waits = (self._yield_ticks < self._most_yield_ticks) | (np.abs(off) > _ARRIVED_RAD).any(axis=1)
+        self._yields &= ~there.all(axis=1) & waits
         self._any_yields = bool(self._yields.any())
         inside = np.minimum(np.maximum(self.command, self._lower), self._upper)
         np.copyto(self.command, inside, where=(mask & ~self._yields)[:, None])
-
-    def _retreat_from(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return where references are to be, so that arms press on nothing, shape (n, width).
-
-        What an arm pressed on springs back: with a reference where the joints are it goes on pressing with about half.
-        So each joint is to be as far on the other side of where it is as its servo pulled on this one; in the end it is
-        to be where it is.
-        """
-        pull = np.minimum(np.maximum(self.command - reading.position, -self._largest_error), self._largest_error)
-        pull[self._gives_way <= 1] = 0.0
-        where = np.minimum(np.maximum(reading.position - pull, self._lower), self._upper)
-        where[:, -1] = self.command[:, -1]  # what is gripped is not let go of
-        return where
 
     def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
         """Follow no setpoints any more; what comes next starts without speeding up.
@@ -354,7 +331,14 @@ class ArmController(Controller):
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
         still: NDArray[np.bool_] = np.all(np.abs(self.velocity) < _REST, axis=1)
-        return still & ~self.busy & ~self._yields & (self._gives_way == 0)
+        still &= ~self._stopped | (self._rest_ticks > self._settled_ticks)  # and it is known what it presses with
+        return still & ~self.busy & ~self._yields & ~self._relief.active()
+
+    def pressed(self) -> NDArray[np.float64]:
+        """Return the forces on the tools [N] that are above 30 N, shape (n,), see `Controller.pressed`."""
+        if self.force is None:
+            return np.zeros(len(self.busy))
+        return np.where(self.force.force > _PRESSED_N, self.force.force, 0.0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -374,9 +358,8 @@ class ArmController(Controller):
         self.setpoints.restart(ids)
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
-        self._unwatched[ids], self._gives_way[ids] = False, 0
-        self._yields[ids], self._stopped[ids], self._back_rad[ids] = False, False, 0.0
-        self._trail.restart(ids)
+        self._yields[ids] = self._stopped[ids] = False
+        self._rest_ticks[ids] = 0
         self.protective_stop[ids] = 0
         if self.force is not None:
             self.force.restart(ids)
@@ -403,10 +386,7 @@ class ArmController(Controller):
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
         """Take a goal; None if it was accepted, otherwise the refusal."""
-        refusal = self.goals.submit(sim, command, blocked)
-        if refusal is None:
-            self._gives_way[sim] = 0
-        return refusal
+        return self.goals.submit(sim, command, blocked)
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
         """Cancel a goal: decelerate, then hold."""
@@ -419,52 +399,6 @@ class ArmController(Controller):
     def feedback(self, sim: int) -> Feedback | None:
         """Return how far the goal is that one arm follows, or None."""
         return self.goals.feedback(sim)
-
-
-class _Trail:
-    """Where the joints of n arms were in the last second, as long as nothing was in their way."""
-
-    def __init__(self, n: int, dof: int, control_hz: int) -> None:
-        self._period = max(1, round(_TRAIL_PERIOD_S * control_hz))
-        self._rows = np.full((round(_TRAIL_S / _TRAIL_PERIOD_S), n, dof), np.nan)
-        self._ticks = 0
-        self._count, self._gone_back = np.zeros(n, np.int64), np.zeros(n, np.int64)  # rows
-
-    def note(self, reading: PlantReading, gives_way: NDArray[np.int64]) -> None:
-        """Take one tick into account; arms that give way leave no trail."""
-        self._ticks += 1
-        if self._ticks % self._period:
-            return
-        ids = np.flatnonzero(gives_way == 0)
-        self._rows[self._count[ids] % len(self._rows), ids] = reading.position[ids, : self._rows.shape[2]]
-        self._count[ids] += 1
-        self._gone_back[ids] = 0
-
-    def back(
-        self,
-        sim: int,
-        position: NDArray[np.float64],
-        command: NDArray[np.float64],
-        least: float,
-        otherwise: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`.
-
-        What it hit may have thrown it back: it was then also away from its reference. One that has gone back already
-        continues from there.
-        """
-        ages = np.arange(self._gone_back[sim], len(self._rows))
-        rows = self._rows[(self._count[sim] - 1 - ages) % len(self._rows), sim]
-        away = np.abs(rows - position).max(axis=1) >= least  # never so where there is no row yet
-        away &= np.abs(rows - command).max(axis=1) >= _BACK_RAD
-        if not away.any():
-            return otherwise
-        self._gone_back[sim] += int(away.argmax())
-        return rows[int(away.argmax())]
-
-    def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget arms that were put somewhere else."""
-        self._rows[:, ids], self._gone_back[ids] = np.nan, 0
 
 
 _STOP_CODES = {

@@ -22,7 +22,7 @@ _LOAD_N, _LOAD_S = 20.0, 0.3
 _DOWN = 0.9  # the least cosine between that force and the vertical
 _STILL = 0.02  # [rad/s]
 _GRAVITY = 9.81  # [m/s^2]
-_LEAST_TORQUE = 10.0  # [N m] where no joint feels more, nothing is estimated: 100 N with a lever of 0.1 m
+_LEAST_TORQUE = 4.0  # [N m] where no joint feels more, nothing is estimated: 10 N with a lever of 0.4 m
 
 
 class ForceLimit:
@@ -36,6 +36,7 @@ class ForceLimit:
 
     Attributes:
         force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
+        torque: what the motors give more than the posture and its motion need [N m], shape (n, dof).
         wrench: what the surroundings put on the tools, in the base frame: forces [N] and moments about the tool centre
             points [N m], shape (n, 6); shape (n, 0) if it is not asked for.
         exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
@@ -61,14 +62,18 @@ class ForceLimit:
         self._period = max(1, round(_PERIOD_S * control_hz))
         self._hz = control_hz / self._period
         self._sum, self._ticks = np.zeros((n, dof)), 0
-        self._position, self._velocity, self._torque = (np.zeros((n, dof)) for _ in range(3))
+        self._position, self._velocity, self.torque = (np.zeros((n, dof)) for _ in range(3))
         self._fresh = np.ones(n, np.bool_)
         self.force: Array = np.zeros(n)
         self.wrench: Array = np.zeros((n, 6 if wrench else 0))
         self.exceeded: NDArray[np.bool_] = np.zeros(n, np.bool_)
 
-    def update(self, reading: PlantReading) -> bool:
-        """Take one tick into account; return whether there is a new estimate that is too large for any arm."""
+    def update(self, reading: PlantReading, resting: NDArray[np.bool_] | bool = False) -> bool:
+        """Take one tick into account; return whether there is a new estimate that is too large for any arm.
+
+        Args:
+            resting: the arms that are at rest whatever speeds are read, shape (n,).
+        """
         if not reading.has_effort:
             return False
         dof = self._dof
@@ -79,12 +84,14 @@ class ForceLimit:
         position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
         middle, speed = (position + self._position) / 2, (velocity + self._velocity) / 2
         change = (velocity - self._velocity) * self._hz
+        moving = np.logical_not(resting).reshape(-1, 1)
+        speed, change = speed * moving, change * moving
         residual = self._sum / self._ticks - self._dynamics.torque(middle, speed, change)
         self._position[:], self._velocity[:] = position, velocity
         self._sum[:], self._ticks = 0.0, 0
         residual[self._fresh] = 0.0  # where they came from is not known yet
         self._fresh[:] = False
-        torque = self._torque
+        torque = self.torque
         torque += _SHARE * (residual - torque)
         if self.wrench.size:
             every = np.ascontiguousarray(self._forward.jacobian(position))
@@ -123,6 +130,6 @@ class ForceLimit:
         """Forget arms that were put somewhere else."""
         self._fresh[ids] = True
         self._hung[ids] = 0
-        self._sum[ids] = self._torque[ids] = self.force[ids] = 0.0
+        self._sum[ids] = self.torque[ids] = self.force[ids] = 0.0
         self.wrench[ids] = 0.0
         self.exceeded[ids] = False

@@ -12,7 +12,7 @@ from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
 from bhd_lerobot.control.motion.supervision import Supervisor
-from bhd_lerobot.control.motion.trajectory import PlanFailure, State, to_target
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 
 Array = NDArray[np.float64]
 Reference = tuple[Array, Array, Array]
@@ -110,7 +110,9 @@ class GoalManager:
         """Plan with something in an arm's gripper from now on; with nothing if None."""
         self._held[sim] = held
 
-    def stop(self, mask: NDArray[np.bool_], code: ResultCode, hard: bool, reference: Reference) -> None:
+    def stop(
+        self, mask: NDArray[np.bool_], code: ResultCode, hard: bool, reference: Reference, message: str = ""
+    ) -> None:
         """End all goals of some arms at once, and brake from the next tick on.
 
         Args:
@@ -118,9 +120,10 @@ class GoalManager:
             code: how their goals end.
             hard: whether to brake with the limits of a stop; a stop that has begun hard stays so.
             reference: where they are.
+            message: why; from the code if it is empty.
         """
         for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, code, REASONS.get(code, "The arm was stopped."))
+            self._end_all(sim, code, message or REASONS.get(code, "The arm was stopped."))
             wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
             if self._motion[sim] < wanted:
                 self._brake(sim, reference, wanted)
@@ -137,19 +140,6 @@ class GoalManager:
         for sim in np.flatnonzero(mask).tolist():
             self._end_all(sim, code, message)
             self._rest(sim)
-            self._changed(sim)
-
-    def retreat(self, mask: NDArray[np.bool_], reference: Reference, target: Array) -> None:
-        """Bring the reference of arms that follow nothing to a target within the limits, shape (n, dof + 1)."""
-        for sim in np.flatnonzero(mask).tolist():
-            state = State.of(*(array[sim] for array in reference))
-            way = to_target(state, target[sim], self.planner.stop_limits, self._hz)
-            if isinstance(way, PlanFailure):
-                self._brake(sim, reference, _Motion.BRAKE)
-            else:
-                self._rest(sim)
-                self._player.start(sim, way)
-                self._motion[sim] = _Motion.BRAKE
             self._changed(sim)
 
     def let_go(self, mask: NDArray[np.bool_]) -> None:

@@ -193,7 +193,7 @@ def test_a_plan_that_fails_ends_the_goal_at_once_and_brakes() -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 50], ids=["at rest", "moving"])
-@pytest.mark.parametrize("way", ["cancel", "stop", "estop", "setpoint", "retreat", "restart", "preempt"])
+@pytest.mark.parametrize("way", ["cancel", "stop", "estop", "setpoint", "restart", "preempt"])
 def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -> None:
     rig, planning = rig_of(NEVER, ticks=ticks)
     rig.go("b", joint_target=BACK, preempt=True)
@@ -213,11 +213,6 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         assert not rig.manager.following.any()
         rig.velocity[:] = rig.acceleration[:] = 0.0  # what follows setpoints brings it to rest
         rig._rows, rig._stopped = [np.stack(rig.reference)], []
-    elif way == "retreat":
-        rig.manager.end_all(mask, ResultCode.PATH_TOLERANCE, "in the way")
-        rig.hard[:] = True
-        rig.manager.retreat(mask, rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
-        due = [("b", ResultCode.PATH_TOLERANCE)]
     elif way == "restart":
         rig.manager.restart(np.array([0]))
         due = []

@@ -1,0 +1,132 @@
+"""Stopped arms that give way to what they press on, or what presses on them, for as long as it does."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LIGHT_N = 12.0  # [N] an arm of which less is felt has given way: it presses with less than 20 N
+_PERIOD_S = 0.04  # between two decisions: a servo and the estimate of force have followed the last one
+_SPEED, _TOOL_SPEED = 0.5, 0.25  # [rad/s, m/s] the most with which an arm gives way
+_FOLLOW, _EASE, _KEEP = 0.5, 0.5, 0.6  # shares of a servo's stretch, of its change, and of the speed once it is light
+_VAIN_RAD = 0.05  # [rad] of all joints, by which an arm gives way though the force stays: a load, or a wrong estimate
+_CREEP = 0.01  # [rad/s] an arm that is slower, and presses on nothing, stands still
+_CHANGE_N = 5.0  # [N] a force that changed by less has stayed as it is
+_PUSHED_RAD = 0.01  # [rad] ahead of its reference, in the direction in which it gives way, a joint is pushed
+_SLACK_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
+_SPRINGS_RAD = 0.05  # [rad] farther than to where it was read an arm without efforts does not give way
+_MARGIN_RAD = 0.005  # [rad] so far from the end of its range a joint stays
+
+
+class ContactRelief:
+    """Moves the references of n arms so that their servos press on nothing.
+
+    A servo whose joint is pressed is stretched by the torque over its stiffness. The reference follows the push: its
+    speed grows with the stretch and with what the stretch grew by, and falls once the force is light. An obstacle that
+    goes on is followed for as long as it goes on, a soft one until it is relaxed. A force that stays as it is however
+    the arm gives way, such as a load's, stops that; one that changes later begins it anew.
+
+    The torques are those that the motors' efforts are more than the posture needs: what encoders read decides nothing.
+    Of a plant that measures no efforts they follow from the positions that were read; the way is then bounded.
+
+    Args:
+        control_hz: ticks a second [Hz].
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
+        limits, dof = arm.limits, len(arm.chain.joints)
+        self._dof = dof
+        self._hz, self._period = control_hz, max(1, round(_PERIOD_S * control_hz))
+        self._stiffness = np.asarray(arm.servo_stiffness[:dof])
+        self._largest = np.asarray(limits.effort[:dof]) / self._stiffness  # stretch [rad]
+        self._change = np.asarray(limits.stop_deceleration[:dof]) / control_hz  # of a speed in a tick [rad/s]
+        self._forward = ForwardKinematics(arm.chain)
+        self._lower = np.asarray(limits.lower[:dof]) + _MARGIN_RAD
+        self._upper = np.asarray(limits.upper[:dof]) - _MARGIN_RAD
+        self._ticks = np.zeros(n, np.int64)  # since the arm came to rest
+        self._wanted, self._stretch = np.zeros((n, dof)), np.zeros((n, dof))
+        self._level, self._vain = np.zeros(n), np.zeros(n)  # a force that stays as it is [N], and the way since [rad]
+        self._room = np.full(n, np.nan)  # so far an arm without efforts may still give way [rad]
+
+    def active(self) -> Mask:
+        """Return whether each arm gives way, shape (n,)."""
+        return np.asarray(self._wanted.any(axis=1))
+
+    def run(  # noqa: PLR0917
+        self,
+        mask: Mask,
+        known: Mask,
+        position: Array,
+        efforts: tuple[Array, Array] | None,
+        command: Array,
+        velocity: Array,
+    ) -> None:
+        """Advance the references of some arms by one tick, in place.
+
+        Args:
+            mask: arms that were stopped and have come to rest, shape (n,).
+            known: whether what is read of them can be trusted, shape (n,); the others stop giving way.
+            position: of the joints [rad], shape (n, dof).
+            efforts: the torques that the motors give more than the posture needs [N m], shape (n, dof), and the forces
+                on the tools that they amount to [N], shape (n,); None if the plant measures none.
+            command: the reference [rad], shape (n, dof or more).
+            velocity: its speed [rad/s], shape (n, dof or more).
+        """
+        trusted = mask & known
+        self._ticks[~trusted] = 0
+        self._wanted[~trusted] = self._level[~trusted] = self._vain[~trusted] = 0.0
+        self._room[~mask] = np.nan
+        self._ticks[trusted] += 1
+        due = trusted & (self._ticks % self._period == 0)
+        if due.any():
+            self._decide(np.flatnonzero(due), position, efforts, command)
+        if not self._wanted.any() and not velocity[mask].any():
+            return
+        dof = self._dof
+        reference, speed = command[mask, :dof], velocity[mask, :dof]
+        wanted = self._wanted[mask]
+        wanted[((reference <= self._lower) & (wanted < 0)) | ((reference >= self._upper) & (wanted > 0))] = 0.0
+        speed += np.minimum(np.maximum(wanted - speed, -self._change), self._change)
+        velocity[mask, :dof] = speed
+        command[mask, :dof] = reference + speed / self._hz
+
+    def _decide(
+        self, ids: NDArray[np.intp], position: Array, efforts: tuple[Array, Array] | None, command: Array
+    ) -> None:
+        """Choose the speeds of the coming period."""
+        stretch: Array
+        presses: Mask
+        off = command[ids, : self._dof] - position[ids]
+        if efforts is None:
+            stretch = np.clip(off, -self._largest, self._largest)
+            presses = np.asarray((np.abs(off) > _SLACK_RAD).any(axis=1))
+            first = np.isnan(self._room[ids])
+            self._room[ids[first]] = np.abs(off[first]).sum(axis=1) + _SPRINGS_RAD
+            presses &= self._room[ids] > 0.0
+        else:
+            stretch, force = efforts[0][ids] / self._stiffness, efforts[1][ids]
+            presses = np.asarray(force > _LIGHT_N)
+            ahead = (off * np.sign(stretch) > _PUSHED_RAD) & (np.abs(stretch) > _SLACK_RAD)
+            same = presses & ~ahead.any(axis=1) & (np.abs(force - self._level[ids]) < _CHANGE_N)
+            self._level[ids] = np.where(same, self._level[ids], force)
+            self._vain[ids] *= same
+            presses &= self._vain[ids] < _VAIN_RAD
+        moving = self._wanted[ids].any(axis=1, keepdims=True)
+        before = np.where(moving, self._stretch[ids], stretch)
+        push = _FOLLOW * stretch + _EASE * (stretch - before)
+        wanted = self._wanted[ids] - push * (self._hz / self._period)
+        wanted *= wanted * stretch < 0.0  # never against the push
+        tool = np.einsum("nij,nj->ni", self._forward.jacobian(command[ids, : self._dof])[:, :3], wanted)
+        joints, tools = np.abs(wanted).max(axis=1) / _SPEED, np.linalg.norm(tool, axis=1) / _TOOL_SPEED
+        wanted /= np.maximum(np.maximum(joints, tools), 1.0)[:, None]
+        slower = _KEEP * self._wanted[ids]
+        slower[np.abs(slower).max(axis=1) < _CREEP] = 0.0
+        self._wanted[ids] = np.where(presses[:, None], wanted, slower)
+        self._stretch[ids] = stretch
+        way = np.abs(self._wanted[ids]).sum(axis=1) * self._period / self._hz
+        self._vain[ids] += way
+        self._room[ids] -= way
