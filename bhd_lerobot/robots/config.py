@@ -70,7 +70,7 @@ class BhdRobotConfig(RobotConfig):
         if self.plant == "ros2":
             self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
             self.clock = "realtime"
-            timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silence_s)
+            timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silent_s)
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
         if self.plant:
             self._check_plant()

@@ -80,6 +80,11 @@ class Device:
                 if rate := getattr(camera, "fps", None):
                     self.camera_period_s = max(self.camera_period_s, 1 / float(rate))
 
+    def begin_episode(self) -> None:
+        """Tell a robot that wants to know that an episode begins."""
+        if callable(begin := getattr(self.robot, "begin_episode", None)):
+            begin()
+
     def observe(self) -> Reading:
         """Return what the robot observes now; it may take as long as the robot takes.
 

@@ -218,6 +218,7 @@ class FrameThread:
         number, due, skipped = 0, self.origin_ns, 0
         last: DeviceFrame | None = None
         self._came_ns = self.origin_ns
+        self._called("begin_episode", self._device.begin_episode)
         while not self._is_over():  # then the robot holds at once, not after another observation
             self._sleep_until(due)
             started = time.monotonic_ns()

@@ -90,19 +90,28 @@ class Ros2Config(NetworkConfig):
         command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
             base, 125 Hz to an arm.
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
-        silence_s: readings that are older are a fault [s]; a TurtleBot3 sends every 0.05 s.
+        silence_s: a topic that sends nothing for so long is a fault [s]; by default 0.5, and 1 of scans. The robot type
+            ``ros2`` has `robot.topic_timeout_s` for it.
         namespace: in front of the robot's topics, such as ``/tb3_1``.
-        scan_frame: the frame of a base's scans; their beam 0 is taken to point ahead.
+        scan_frame: the frame of scans, where ``/tf_static`` does not state how the scanner is mounted.
+        scan_yaw: where the scanner's zero points [rad], 0 is straight ahead; by default as ``/tf_static`` states.
     """
 
     command_hz: float = 0.0
     timeout_s: float = 0.2
-    silence_s: float = 0.5
+    silence_s: float | None = None
     namespace: str = ""
     scan_frame: str = "base_scan"
+    scan_yaw: float | None = None
+
+    @property
+    def silent_s(self) -> float:
+        """`silence_s`, or its default."""
+        return 0.5 if self.silence_s is None else self.silence_s
 
     def in_namespace(self, topic: str) -> str:
         """Return a topic's full name."""
+        topic = f"/{topic.lstrip('/')}"
         return f"/{self.namespace.strip('/')}{topic}" if self.namespace.strip("/") else topic
 
     def __post_init__(self) -> None:
@@ -110,8 +119,11 @@ class Ros2Config(NetworkConfig):
         if not 0 <= self.command_hz < float("inf"):
             raise ConfigError(f"robot.ros2.command_hz is {self.command_hz}; it is finite and not negative.")
         for name in ("timeout_s", "silence_s"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"robot.ros2.{name} is {getattr(self, name)}; it is positive and finite.")
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ConfigError(f"robot.ros2.{name} is {value}; it is positive and finite.")
+        if self.scan_yaw is not None and not abs(self.scan_yaw) < float("inf"):
+            raise ConfigError(f"robot.ros2.scan_yaw is {self.scan_yaw}; it is an angle in rad.")
 
 
 @dataclass(frozen=True)

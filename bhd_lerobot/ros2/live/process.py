@@ -22,14 +22,19 @@ from bhd_lerobot.errors import BhdError, DatasetError, as_text
 from bhd_lerobot.ros2.live.channel import PROBLEM_BYTES, Channel, Word
 from bhd_lerobot.ros2.live.clock_offset import ClockOffset
 from bhd_lerobot.ros2.live.graph import Endpoint
+from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.live.node import Node, Publisher, Received
 from bhd_lerobot.ros2.live.spec import NodeSpec
 from bhd_lerobot.ros2.messages.images import decode_image
+from bhd_lerobot.ros2.messages.scan import ScanReader, static_frames, static_topics
+from bhd_lerobot.ros2.messages.views import TF
 
 _WAIT_S = 0.05  # the longest without a sign of life
 _AGAIN_S = 0.02  # between two stops at the end
 _FIRST_S = 1.0  # so long without a first message a topic is silent
 _CHECK_NS = 500_000_000  # between two looks at who else is there
+_MIXED_NS = 2_000_000_000  # so long two publishers of a topic are a problem after they were heard in turn
+_FRAMES_NS = 5_000_000_000  # so long what states how scanners are mounted is waited for
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
 _TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
@@ -118,7 +123,13 @@ class Receiver:
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
-        self._heard: list[dict[int, int]] = [{} for _ in self._inputs]  # publisher -> when it was heard last [ns]
+        topics = [one.topic for one in (*spec.inputs, *spec.cameras)]
+        self._heard: list[list[int]] = [[] for _ in topics]  # publishers, the one that was heard last at the end
+        self._mixed_ns = [0] * len(topics)  # when a publisher was heard again after another one
+        self._scanners = {one.topic: one.reader for one in spec.inputs if isinstance(one.reader, ScanReader)}
+        frames = sorted({name for scan in self._scanners for name in static_topics(scan)})
+        self._frames = [node.subscription(name, TF, Qos(100, transient_local=True)) for name in frames]
+        self._frame_senders: set[int] = set()
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()
         self._intruders: set[str] = set()
@@ -130,12 +141,17 @@ class Receiver:
     def step(self) -> None:
         """Take what has arrived, and publish it."""
         news = False
+        for subscription in self._frames:
+            for received in subscription.take():
+                self._frame_senders.add(received.sender)
+                for scanner in self._scanners.values():
+                    scanner.static |= static_frames([received.data])[0]
         for index, subscription in enumerate(self._inputs):
-            for one in subscription.take():
-                news = self._take(index, one) or news
+            for received in subscription.take():
+                news = self._take(index, received) or news
         for index, subscription in enumerate(self._cameras):
-            for one in subscription.take()[-1:]:
-                self._take_image(index, one)
+            for received in subscription.take()[-1:]:
+                self._take_image(index, received)
         now = time.monotonic_ns()
         if now - self._checked_ns > _CHECK_NS:
             self._checked_ns = now
@@ -149,15 +165,15 @@ class Receiver:
         one, record = self._spec.inputs[index], self._record
         try:
             message = received.message()
+            if one.topic in self._scanners and (lacking := self._lacking_frames(received.arrived_ns)):
+                raise DatasetError(lacking)
             values = one.reader.read(message)
         except DatasetError as error:
             self._wrong[one.topic] = str(error)
             return False
+        self._hear(index, received)
         header = getattr(message, "header", None)
         stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-        if one.frame and header is not None and header.frame_id != one.frame:
-            self._wrong[one.topic] = f"it is in the frame {header.frame_id!r}, not {one.frame!r}"
-            return False
         if stamp:
             newest = self._stamps[index]
             if any(stamp <= other < stamp + _TOMORROW_NS for other in (newest, self._old_stamps[index])):
@@ -167,12 +183,26 @@ class Receiver:
                 self._old_stamps[index] = newest
             self._stamps[index] = stamp
         self._wrong.pop(one.topic, None)
-        self._heard[index][received.sender] = received.arrived_ns
         record["count"][index] += 1
         record["arrived_ns"][index] = received.arrived_ns
         record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
         record["values"][self._columns[index]] = values
         return True
+
+    def _hear(self, index: int, received: Received) -> None:
+        heard = self._heard[index]
+        if received.sender in heard:
+            if heard[-1] != received.sender:
+                self._mixed_ns[index] = received.arrived_ns
+            heard.remove(received.sender)
+        heard.append(received.sender)
+
+    def _lacking_frames(self, now_ns: int) -> str:
+        """Return as text which topic has not stated yet how scanners are mounted; empty if none is waited for."""
+        if now_ns - self._start_ns > _FRAMES_NS:
+            return ""
+        silent = [one.topic for one in self._frames if not self._frame_senders.issuperset(one.sender_ids)]
+        return f"{' and '.join(silent)} may state how the scanner is mounted, and has not been received" * bool(silent)
 
     def _take_image(self, index: int, received: Received) -> None:
         camera = self._spec.cameras[index]
@@ -193,6 +223,7 @@ class Receiver:
         record["pixels"] = image
         ring.publish(record)
         self._images_ns[index] = received.arrived_ns
+        self._hear(len(self._inputs) + index, received)
 
     # --- problems ----------------------------------------------------------------------------------------------------
 
@@ -244,10 +275,11 @@ class Receiver:
 
     def _twins(self, now_ns: int) -> str:
         """Return which topic two publishers send to at a time, as text; empty if none. A robot may have restarted."""
-        for one, heard in zip(self._spec.inputs, self._heard, strict=True):
-            if one.has_one_source and sum(now_ns - last < _CHECK_NS for last in heard.values()) > 1:
-                everyone = self._node.graph.endpoints()
-                nodes = sorted({other.node for other in everyone if other.is_publisher and other.topic == one.topic})
+        everyone: tuple[Any, ...] = (*self._spec.inputs, *self._spec.cameras)
+        for one, mixed_ns in zip(everyone, self._mixed_ns, strict=True):
+            if mixed_ns and now_ns - mixed_ns < _MIXED_NS:
+                ends = self._node.graph.endpoints()
+                nodes = sorted({end.node or "?" for end in ends if end.is_publisher and end.topic == one.topic})
                 return (
                     f"Several nodes send {one.topic} at a time: {', '.join(nodes)}. Are there two robots of one name?"
                 )

@@ -45,8 +45,6 @@ class InputSpec:
         reader: takes the numbers from a message.
         silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
             when something changes, which is not waited for either: its numbers are not a number until then.
-        frame: what the header's `frame_id` has to be; any if empty.
-        has_one_source: whether messages of two publishers at a time are a problem.
     """
 
     topic: str
@@ -54,8 +52,6 @@ class InputSpec:
     reader: Reader
     qos: Qos = field(default_factory=Qos)
     silence_s: float = 1.0
-    frame: str = ""
-    has_one_source: bool = False
 
     @property
     def is_required(self) -> bool:

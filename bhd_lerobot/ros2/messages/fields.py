@@ -1,6 +1,7 @@
 """Where a number is in a message: ``twist.twist.linear.x``, ``position[name=elbow_joint]``, ``ranges``."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +24,7 @@ class _Step:
         index: of the element; None without one, or where `key` selects it.
         key: the element is the one whose field `key`, or the array `key` beside this one, has the value `value`.
         is_message: whether an element is a message.
+        length: of an array of a fixed length; 0 of any other.
     """
 
     name: str
@@ -30,6 +32,7 @@ class _Step:
     key: str
     value: str
     is_message: bool
+    length: int
 
     def read(self, message: Any) -> Any:
         found = getattr(message, self.name)
@@ -69,6 +72,11 @@ class Field:
     def kind(self) -> str:
         """What is there: ``"number"``, ``"array"`` of numbers, or the type of a message."""
         return self._resolved[1]
+
+    @property
+    def key(self) -> str:
+        """The field by whose value an element is selected, of the last name in the path; empty if none is."""
+        return self._resolved[0][-1].key
 
     def read(self, message: Any) -> Any:
         """Return the value in a deserialised message: a number, an array of them, or a message.
@@ -131,8 +139,9 @@ class Field:
                 if match["key"] not in beside:
                     owner = element[1] if is_message else inside
                     raise ConfigError(f"{self.path}: {unknown_name(f'field of {owner}', match['key'], beside)}")
+            length = node[1][1] if int(node[0]) == _ARRAY else 0
             index = None if match["index"] is None else int(match["index"])
-            steps.append(_Step(match["name"], index, match["key"] or "", match["value"] or "", is_message))
+            steps.append(_Step(match["name"], index, match["key"] or "", match["value"] or "", is_message, length))
             if place < len(parts) - 1:
                 if not is_message or (is_list and not selects):
                     what = "is an array: name an element, as in name[0]" if is_list else "has no fields"
@@ -149,6 +158,25 @@ class Field:
         raise ConfigError(
             f"A field of {self.msgtype} is missing; it has: {', '.join(dict(store.fielddefs[inside][1]))}."
         )
+
+
+def elements_of(fields: Sequence[Field]) -> dict[str, tuple[set[int], int]]:
+    """Return which elements of arrays some fields of one type are in, and how many there have to be, by array.
+
+    An array of a fixed length has all of its elements; any other one those up to the last that is named by its number.
+    """
+    found: dict[str, tuple[set[int], int]] = {}
+    for one in fields:
+        path = ""
+        for step in one._resolved[0]:
+            path += f"{'.' * bool(path)}{step.name}"
+            if step.index is not None:
+                there, size = found.get(path, (set(), step.length))
+                found[path] = ({*there, step.index}, max(size, step.index + 1))
+                path += f"[{step.index}]"
+            elif step.key:
+                path += f"[{step.key}={step.value}]"
+    return found
 
 
 def _child(tree: dict[str, Any], step: _Step) -> dict[str, Any]:

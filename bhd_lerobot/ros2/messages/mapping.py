@@ -1,6 +1,6 @@
 """Which field of which topic is which feature of a robot: one description for bags and for robots on the network."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -10,9 +10,9 @@ import yaml
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text, unknown_name
-from bhd_lerobot.ros2.messages.base import yaw_of
+from bhd_lerobot.ros2.messages.base import unwrapped, yaw_of
 from bhd_lerobot.ros2.messages.definitions import register_types
-from bhd_lerobot.ros2.messages.fields import Field
+from bhd_lerobot.ros2.messages.fields import Field, elements_of
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.types import type_store
@@ -21,6 +21,7 @@ QUATERNION = "geometry_msgs/msg/Quaternion"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 HEADER = "std_msgs/msg/Header"
 SCAN = "sensor_msgs/msg/LaserScan"
+JOINTS = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True)
@@ -194,6 +195,12 @@ class TopicFields:
         """Whether a message begins with a header, and so with a stamp."""
         return has_header(self.msgtype)
 
+    @property
+    def turns(self) -> dict[int, float]:
+        """A whole turn of each feature that is a yaw, in its unit, by its place in `columns`."""
+        yaws = zip(self.fields, self.scales.tolist(), strict=True)
+        return {k: 2 * np.pi * abs(scale) for k, (one, scale) in enumerate(yaws) if one.kind == QUATERNION}
+
     def read(self, message: Any) -> NDArray[np.float64]:
         """Return the features in a deserialised message, shape (len(columns),).
 
@@ -219,6 +226,33 @@ class TopicFields:
         for one, value in zip(self.fields, (features - self.offsets) / self.scales, strict=True):
             one.put(tree, value)
         return encode(self.msgtype, tree, 1)[0]
+
+
+class FieldsReader:
+    """Reads the features of one topic message by message: yaws count on beyond half a turn.
+
+    Args:
+        names: of the features.
+    """
+
+    def __init__(self, fields: TopicFields, names: Sequence[str]) -> None:
+        self._fields, self._names, self.width = fields, names, fields.width
+        self._last = dict.fromkeys(fields.turns, 0.0)
+
+    def read(self, message: Any) -> NDArray[np.float64]:
+        """Return the features, shape (width,).
+
+        Raises:
+            DatasetError: the message lacks an element, or a feature is not finite.
+        """
+        values = self._fields.read(message)
+        if not np.isfinite(values).all():
+            wrong = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise DatasetError(f"{self._names[wrong]} is {values[wrong]}, which is not a finite number")
+        for column, turn in self._fields.turns.items():
+            values[column] = unwrapped(np.array([self._last[column], values[column]]), turn)[1]
+            self._last[column] = float(values[column])
+        return values
 
 
 def features_of(section: Mapping[str, FieldConfig]) -> tuple[str, ...]:
@@ -266,6 +300,42 @@ def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> l
             kinds = ", ".join(one.msgtype for one in found if one.topic == topic)
             raise ConfigError(f"{topic} is mapped with several types: {kinds}. A topic has one.")
     return found
+
+
+def sendable_topics(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> list[TopicFields]:
+    """Return features of an action grouped by topic, if whole messages can be made of them.
+
+    Raises:
+        ConfigError: as for `topics_of`, or what no feature gives would be sent as 0, or without a name.
+    """
+    found = topics_of(section, types)
+    names = list(section)
+    for topic in found:
+        mapped = ", ".join(names[column] for column in topic.columns)
+        if topic.turns:
+            raise ConfigError(
+                f"{mapped}: a quaternion of {topic.msgtype} is read as its yaw, and cannot be sent. Map a number."
+            )
+        for type_, remedy in _NAMELESS.items():
+            if topic.msgtype == type_ and (type_ != JOINTS or any(not one.key for one in topic.fields)):
+                raise ConfigError(
+                    f"{mapped}: a {type_} on {topic.topic} would be sent without the joints' names. {remedy}"
+                )
+        for path, (there, size) in elements_of(topic.fields).items():
+            if missing := [str(k) for k in range(size) if k not in there]:
+                raise ConfigError(
+                    f"{mapped}: of {path} on {topic.topic} the mapping has no element {', '.join(missing)}; they would "
+                    "be sent as 0. Map every element."
+                )
+    return found
+
+
+_NAMELESS = {
+    "trajectory_msgs/msg/JointTrajectory": "Send positions to a position controller (std_msgs/msg/Float64MultiArray), "
+    "or use --robot.plant=ros2 with a robot type that has one.",
+    JOINTS: "Name each joint: position[name=JOINT].",
+}
+"""Messages whose receivers go by names of joints -> what to map instead."""
 
 
 def _number(place: Field, value: Any) -> float:

@@ -1,18 +1,31 @@
-"""From the beams of some scanner to ours: evenly spaced, the first straight ahead, counter-clockwise."""
+"""From the beams of some scanner to ours: evenly spaced, the first straight ahead, counter-clockwise.
 
+How the scanner is mounted is known from ``/tf_static``, from options or from its frame's name.
+"""
+
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, SCAN_FRAME
+from bhd_lerobot.ros2.messages.serialize import decode
+from bhd_lerobot.ros2.messages.views import TF
 
 Array = NDArray[np.float64]
+Static = Mapping[str, tuple[str, Array]]
+"""Frame -> its parent, and its rotation in it, shape (3, 3)."""
+BASE_FRAMES = (FOOTPRINT_FRAME, "base_link")
 GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
+_MOST_RANGES = 10_000  # a multiple of those of any scanner; more would take seconds to resample
 _MOST = 1.5 * 2 * np.pi  # [rad] of a scan; drivers continue a little after a whole turn, and nothing turns twice
+_DEEPEST = 32  # frames between a sensor and the base
 _WIDEST = np.radians(10.0)  # between a beam of ours and the one it is made of; a few beams are no view all around
 
 
@@ -132,3 +145,121 @@ def _without_holes(block: Array) -> Array:
     hole = empty & ~(middle | np.roll(middle, 1, axis=1) | np.roll(middle, -1, axis=1))
     before, after = np.roll(block, 1, axis=1), np.roll(block, -1, axis=1)
     return np.where(hole, np.where(np.isnan(before), after, before), block)
+
+
+# --- how a scanner is mounted -----------------------------------------------------------------------------------------
+
+
+def static_frames(messages: Sequence[bytes]) -> tuple[dict[str, tuple[str, Array]], int]:
+    """Return the transforms of ``/tf_static``, and how many of its messages cannot be read."""
+    frames: dict[str, tuple[str, Array]] = {}
+    lost = 0
+    for message, times in Counter(messages).items():  # a latched message may be there many times
+        try:
+            transforms = decode(TF, message).transforms
+        except DatasetError:
+            transforms = None
+        if transforms is None or not np.isfinite([_quaternion(transform) for transform in transforms]).all():
+            lost += times
+            continue
+        for transform in transforms:
+            frames[transform.child_frame_id.lstrip("/")] = (
+                transform.header.frame_id.lstrip("/"),
+                _matrix(_quaternion(transform)),
+            )
+    return frames, lost
+
+
+def static_topics(scan: str) -> set[str]:
+    """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
+    return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
+
+
+@dataclass
+class ScanReader:
+    """Ranges [m] of our beams from the scans of a scanner, whatever its beams and however it is mounted.
+
+    Attributes:
+        topic: of the scans.
+        lidar: the ranges that the features have.
+        width: the number of beams.
+        frame: the scanner's frame, if the user names it.
+        yaw: the scanner's angle in the robot [rad], if the user gives it.
+        prefix: what the names of the options begin with by which the user does.
+        static: the transforms of ``/tf_static``.
+    """
+
+    topic: str
+    lidar: LidarSpec
+    width: int
+    frame: str | None = None
+    yaw: float | None = None
+    prefix: str = "--"
+    static: dict[str, tuple[str, Array]] = field(default_factory=dict)
+
+    def rotation(self, frame: str) -> tuple[Array, str]:
+        """Return how a scanner with this frame is turned in the robot, shape (3, 3), and where that is known from."""
+        rotation = _from_base(frame, self.static)
+        is_given = self.frame in (frame, last_name(frame))
+        if rotation is None and not is_given and last_name(frame) != SCAN_FRAME:
+            raise DatasetError(
+                f"The scans of {self.topic} are in the frame {frame!r}, whose rotation in the robot is not known: it "
+                f"is not {SCAN_FRAME!r}, and /tf_static has no way from {' or '.join(BASE_FRAMES)} to it. Say that it "
+                f"is the scanner with {self.prefix}scan_frame={frame}, and where its zero points with "
+                f"{self.prefix}scan_yaw (0 is straight ahead)."
+            )
+        if self.yaw is not None:
+            return _matrix(np.array([np.cos(self.yaw / 2), 0.0, 0.0, np.sin(self.yaw / 2)])), f"{self.prefix}scan_yaw"
+        if rotation is not None:
+            return rotation, "/tf_static"
+        return np.eye(3), f"{self.prefix}scan_frame" if is_given else "its name"
+
+    def resampled(self, scans: Sequence[Any], rotation: Array) -> Array:
+        """Return scans of a scanner that is turned like this, shape (n, width); not a number where a scan is none."""
+        return resampled_scans(
+            [scan.ranges for scan in scans],
+            {name: np.array([getattr(scan, name) for scan in scans], np.float64) for name in GEOMETRY},
+            lidar=self.lidar,
+            beams=self.width,
+            rotation=rotation,
+            topic=self.topic,
+        )
+
+    def read(self, message: Any) -> Array:
+        """Return the ranges of one scan, shape (width,)."""
+        if len(message.ranges) > _MOST_RANGES:
+            raise DatasetError(f"the scan has {len(message.ranges)} ranges; at most {_MOST_RANGES} are read")
+        rotation, _ = self.rotation(message.header.frame_id.lstrip("/"))
+        [ranges] = self.resampled([message], rotation)
+        if np.isnan(ranges).any():
+            raise DatasetError(f"the scan has {len(message.ranges)} ranges, or no angles")
+        return ranges
+
+
+def _from_base(frame: str, static: Static) -> Array | None:
+    rotation = np.eye(3)
+    for _ in range(_DEEPEST):
+        if last_name(frame) in BASE_FRAMES:
+            return rotation
+        if frame not in static:
+            return None
+        frame, turn = static[frame][0], static[frame][1]
+        rotation = turn @ rotation
+    return None
+
+
+def last_name(frame: str) -> str:
+    """Return a frame's name without the robot's in front of it."""
+    return frame.rsplit("/", 1)[-1]
+
+
+def _quaternion(transform: Any) -> Array:
+    turn = transform.transform.rotation
+    return np.array([turn.w, turn.x, turn.y, turn.z])
+
+
+def _matrix(quaternion: Array) -> Array:
+    """Return the rotation matrix of a quaternion wxyz; one that was never set, all zeros, is no rotation."""
+    from scipy.spatial.transform import Rotation  # not at the start of every command
+
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix() if quaternion.any() else np.eye(3)

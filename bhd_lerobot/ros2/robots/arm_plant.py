@@ -86,7 +86,7 @@ class ArmPlant(Ros2Plant):
         self._opening = body.home[-1]
         inputs = (
             InputSpec(
-                "/joint_states", JOINT_STATE, JointReader(joints), SENSOR_DATA, max(_SILENCE_S, config.ros2.silence_s)
+                "/joint_states", JOINT_STATE, JointReader(joints), SENSOR_DATA, max(_SILENCE_S, config.ros2.silent_s)
             ),
             InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), SENSOR_DATA, _FOREVER),
             InputSpec(ur.SAFETY_TOPIC, ur.SAFETY_MODE, NumberReader("mode"), LATCHED, silence_s=_FOREVER),

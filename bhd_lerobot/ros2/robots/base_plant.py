@@ -6,23 +6,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import LidarSpec, MobileBase
+from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages.base import BareTwistPart, GyroPart, ScanPart, TwistPart, twist_tree
 from bhd_lerobot.ros2.messages.parts import header
-from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.views import JOINT_STATE
-from bhd_lerobot.ros2.robots.plant import Ros2Plant
+from bhd_lerobot.ros2.robots.plant import Ros2Plant, scan_reader
 
 _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
-_MOST_RANGES = 10_000  # a multiple of those of any scanner; more would take seconds to resample
 
 
 @dataclass(frozen=True)
@@ -42,27 +40,6 @@ class WheelReader:
             )
         order = [names.index(joint) for joint in _JOINTS]
         return np.concatenate([message.position[order], message.velocity[order] / self.wheel_radius])
-
-
-@dataclass(frozen=True)
-class ScanReader:
-    """Ranges [m] of our beams, whatever the scanner's are."""
-
-    topic: str
-    lidar: LidarSpec
-    width: int
-
-    def read(self, message: Any) -> NDArray[np.float64]:
-        """Return the ranges, counter-clockwise from ahead, shape (width,)."""
-        if len(message.ranges) > _MOST_RANGES:
-            raise DatasetError(f"the scan has {len(message.ranges)} ranges; at most {_MOST_RANGES} are read")
-        geometry = {name: np.array([getattr(message, name)], np.float64) for name in GEOMETRY}
-        [ranges] = resampled_scans(
-            [message.ranges], geometry, lidar=self.lidar, beams=self.width, rotation=np.eye(3), topic=self.topic
-        )
-        if np.isnan(ranges).any():
-            raise DatasetError(f"the scan has {len(message.ranges)} ranges, or no angles")
-        return ranges
 
 
 @dataclass(frozen=True)
@@ -115,25 +92,16 @@ class BasePlant(Ros2Plant):
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
-        node_silence = max(_NODE_SILENCE_S, config.ros2.silence_s)
+        node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
-            InputSpec(
-                "/joint_states",
-                JOINT_STATE,
-                WheelReader(body.drive.wheel_radius),
-                SENSOR_DATA,
-                node_silence,
-                has_one_source=True,
-            ),
+            InputSpec("/joint_states", JOINT_STATE, WheelReader(body.drive.wheel_radius), SENSOR_DATA, node_silence),
             InputSpec(
                 "/scan",
                 ScanPart.msgtype,
-                ScanReader("/scan", body.lidar, beams),
+                scan_reader(config.ros2, "/scan", body.lidar, beams),
                 SENSOR_DATA,
-                max(_SCAN_SILENCE_S, config.ros2.silence_s),
-                config.ros2.scan_frame,
-                has_one_source=True,
+                max(_SCAN_SILENCE_S, config.ros2.silent_s),
             ),
         ]
         if config.imu:

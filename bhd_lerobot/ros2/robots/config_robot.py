@@ -28,5 +28,10 @@ class Ros2RobotConfig(RobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.ros2.silence_s is not None:
+            raise ConfigError(
+                f"robot.ros2.silence_s is {self.ros2.silence_s}; it is of robots with --robot.plant=ros2. Of the robot "
+                f"type ros2 use --robot.topic_timeout_s={self.ros2.silence_s}."
+            )
         if not 0 < self.topic_timeout_s < float("inf"):
             raise ConfigError(f"robot.topic_timeout_s is {self.topic_timeout_s}; it is positive and finite.")

@@ -7,10 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.link import NodeLink
+from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec
+from bhd_lerobot.ros2.messages.scan import ScanReader
+
+
+def scan_reader(network: Ros2Config, topic: str, lidar: LidarSpec, beams: int) -> ScanReader:
+    """Return what reads the scans of a robot, mounted as its options or ``/tf_static`` state."""
+    return ScanReader(network.in_namespace(topic), lidar, beams, network.scan_frame, network.scan_yaw, "--robot.ros2.")
 
 
 class Ros2Plant(Plant):
@@ -38,7 +46,7 @@ class Ros2Plant(Plant):
         )
         self.link = NodeLink(spec)
         self._parts = spec.columns
-        self._silence_s = network.silence_s
+        self._silence_s = network.silent_s
         self._enabled = False
 
     def open(self) -> None:

@@ -16,9 +16,17 @@ from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError, unknown_
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import CameraSpec, InputSpec, NodeSpec, OutputSpec
-from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, features_of, topics_of
-from bhd_lerobot.ros2.robots.base_plant import ScanReader
+from bhd_lerobot.ros2.messages.mapping import (
+    SCAN,
+    FieldsReader,
+    MappingConfig,
+    TopicFields,
+    features_of,
+    sendable_topics,
+    topics_of,
+)
 from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.robots.plant import scan_reader
 
 _COMMAND_HZ = 50.0
 
@@ -30,6 +38,7 @@ class Ros2Robot(Robot):
     newest message of each topic; the time at which the oldest of them was measured is `state_timestamp`.
 
     Attributes:
+        spec: its node.
         state_timestamp: when the oldest number of the last observation was measured, on `time.perf_counter` [s].
 
     Args:
@@ -54,38 +63,44 @@ class Ros2Robot(Robot):
             raise ConfigError(unknown_name("action in robot.stop", unknown[0], mapping.action))
         self._names, self._actions = features_of(mapping.observation), tuple(mapping.action)
         inputs, self._places = self._inputs(mapping)
-        self._acted = topics_of(mapping.action, mapping.types)
-        self._link = NodeLink(
-            NodeSpec(
-                f"bhd_{os.getpid()}",
-                config.ros2,
-                inputs,
-                tuple(OutputSpec(one.topic, one.msgtype, one, stop=self._stop_of(one)) for one in self._acted),
-                tuple(
-                    CameraSpec(name, one.topic, one.type, one.width, one.height, silence_s=config.topic_timeout_s)
-                    for name, one in mapping.images.items()
-                ),
-                command_hz=config.ros2.command_hz or _COMMAND_HZ,
-                timeout_s=config.ros2.timeout_s,
-            )
+        self._acted = sendable_topics(mapping.action, mapping.types)
+        named = config.ros2.in_namespace
+        self.spec = NodeSpec(
+            f"bhd_{os.getpid()}",
+            config.ros2,
+            inputs,
+            tuple(OutputSpec(named(one.topic), one.msgtype, one, stop=self._stop_of(one)) for one in self._acted),
+            tuple(
+                CameraSpec(name, named(one.topic), one.type, one.width, one.height, silence_s=config.topic_timeout_s)
+                for name, one in mapping.images.items()
+            ),
+            command_hz=config.ros2.command_hz or _COMMAND_HZ,
+            timeout_s=config.ros2.timeout_s,
         )
+        self._link = NodeLink(self.spec)
         self.cameras = {name: Ros2Camera(self._link, index) for index, name in enumerate(mapping.images)}
         self.state_timestamp = 0.0
         self._is_connected = False
+        self._whole_turns: NDArray[np.float64] | None = None
 
     def _inputs(self, mapping: MappingConfig) -> tuple[tuple[InputSpec, ...], list[list[int]]]:
         """Return what is received, and where its numbers are in the observation."""
-        found, places = [], []
+        found, places, named = [], [], self.config.ros2.in_namespace
+        yaws: list[tuple[int, float]] = []
         numbers = {name: one for name, one in mapping.observation.items() if not one.beams}
         for topic in topics_of(numbers, mapping.types):
-            found.append(InputSpec(topic.topic, topic.msgtype, topic, SENSOR_DATA, self.config.topic_timeout_s))
-            places.append([self._names.index(list(numbers)[column]) for column in topic.columns])
+            features = [list(numbers)[column] for column in topic.columns]
+            reader = FieldsReader(topic, features)
+            found.append(InputSpec(named(topic.topic), topic.msgtype, reader, SENSOR_DATA, self.config.topic_timeout_s))
+            places.append([self._names.index(feature) for feature in features])
+            yaws += [(places[-1][place], turn) for place, turn in topic.turns.items()]
         for name, one in mapping.observation.items():
             if one.beams:
                 lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
-                reader = ScanReader(one.topic, lidar, one.beams)
-                found.append(InputSpec(one.topic, SCAN, reader, SENSOR_DATA, self.config.topic_timeout_s))
+                scans = scan_reader(self.config.ros2, one.topic, lidar, one.beams)
+                found.append(InputSpec(named(one.topic), SCAN, scans, SENSOR_DATA, self.config.topic_timeout_s))
                 places.append([self._names.index(feature) for feature in one.names(name)])
+        self._yaws, self._turns = [place for place, _ in yaws], np.array([turn for _, turn in yaws])
         return tuple(found), places
 
     def _stop_of(self, topic: TopicFields) -> tuple[float, ...] | None:
@@ -134,6 +149,10 @@ class Ros2Robot(Robot):
     def configure(self) -> None:
         """Nothing to configure beyond the configuration."""
 
+    def begin_episode(self) -> None:
+        """Let yaws begin within half a turn of 0 with the next observation, as the import of a bag does."""
+        self._whole_turns = None
+
     def get_observation(self) -> dict[str, Any]:
         """Return the newest values of all features: floats, and images of shape (height, width, 3), uint8 RGB.
 
@@ -145,6 +164,9 @@ class Ros2Robot(Robot):
         values = np.empty(len(self._names))
         for place, part in zip(self._places, self._link.spec.columns, strict=True):
             values[place] = state["values"][part]
+        if self._whole_turns is None:
+            self._whole_turns = self._turns * np.round(values[self._yaws] / self._turns)
+        values[self._yaws] -= self._whole_turns
         measured = state["measured_ns"]
         self.state_timestamp = (int(measured.min()) if len(measured) else time.monotonic_ns()) / 1e9
         observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))

@@ -13,6 +13,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.messages.scan import ScanReader
 from bhd_lerobot.ros2.robots.base_plant import BasePlant
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
@@ -122,7 +123,10 @@ def test_a_robot_that_is_gone_is_named(robot: Peer, plant: BasePlant) -> None:
     ("options", "text"),
     [
         (["--silence", "scan:6"], "/scan has a publisher and no message for"),
-        (["--frame", "scan:laser"], "The newest message of /scan cannot be used: it is in the frame 'laser', not"),
+        (
+            ["--frame", "scan:laser"],
+            "cannot be used: The scans of /scan are in the frame 'laser', whose rotation in the robot is not",
+        ),
     ],
 )
 @pytest.mark.thorough(but=1)
@@ -156,7 +160,9 @@ def test_a_namespace_and_another_scanner(domain: int) -> None:
     plant = make(domain, namespace="tb3_1", scan_frame="laser")  # type: ignore[arg-type]
     assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
     assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
-    assert plant.link.spec.inputs[1].frame == "laser"
+    reader = plant.link.spec.inputs[1].reader
+    assert isinstance(reader, ScanReader)
+    assert (reader.topic, reader.frame) == ("/tb3_1/scan", "laser")
 
 
 def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant: BasePlant, domain: int) -> None:

@@ -16,9 +16,9 @@ from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
 from bhd_lerobot.ros2.bag.storage.read import Messages
 from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
-from bhd_lerobot.ros2.messages.mapping import QUATERNION, SCAN, MappingConfig, TopicFields, topics_of
+from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, topics_of
 from bhd_lerobot.ros2.messages.parts import Part, header_stamps
-from bhd_lerobot.ros2.messages.scan import GEOMETRY, resampled_scans
+from bhd_lerobot.ros2.messages.scan import ScanReader, Static
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Reading:
     topic: str
     messages: Messages
     decoded: Sequence[Any]
-    static: frames.Static
+    static: Static
     static_lost: bool
     notes: list[str]
 
@@ -102,17 +102,16 @@ def mapped_sources(
             raise ConfigError(f"The mapping's {place}: {error}") from error
         for topic in topics:
             names = tuple(list(numbers)[column] for column in topic.columns)
-            yaws = zip(names, topic.fields, topic.scales.tolist(), strict=True)
-            angles = {name: 2 * np.pi * abs(scale) for name, one, scale in yaws if one.kind == QUATERNION}
-            angles = angles if feature == keys.OBSERVATION_STATE else {}
+            is_observed = feature == keys.OBSERVATION_STATE
+            angles = {names[column]: turn for column, turn in topic.turns.items() if is_observed}
             key, readers = f"{feature}{topic.topic}", {topic.msgtype: partial(_fields, topic, names, angles)}
             meaning = f"{place}.{names[0]}" + f" and {len(names) - 1} more" * (len(names) > 1)
             found.append(Source(key, topic.topic, feature, names, readers, meaning, angles=angles))
         for name, one in section.items():
             if one.beams:
                 lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
-                reader = partial(_scans, lidar, scan_frame, scan_yaw)
                 topic_name, names = "/" + one.topic.lstrip("/"), one.names(name)
+                reader = partial(_scans, ScanReader(topic_name, lidar, one.beams, scan_frame, scan_yaw))
                 key, meaning = f"{feature}{topic_name}", f"{place}.{name}"
                 found.append(Source(key, topic_name, feature, names, {SCAN: reader}, meaning, is_turned=True))
     for name, camera in mapping.images.items():
@@ -225,10 +224,11 @@ def _odometry(read: Reader, frame: str | None, reading: Reading) -> Array:
     return read(reading)
 
 
-def _scans(lidar: LidarSpec, scan_frame: str | None, scan_yaw: float | None, reading: Reading) -> Array:
-    topic, scans, notes = reading.topic, reading.decoded, reading.notes
+def _scans(reader: ScanReader, reading: Reading) -> Array:
+    topic, scans, notes, lidar = reading.topic, reading.decoded, reading.notes, reader.lidar
     frame = frames.the_frame(topic, [scan.header.frame_id for scan in scans])
-    rotation, source = frames.scanner_rotation(topic, frame, reading.static, scan_frame, scan_yaw)
+    reader = replace(reader, topic=topic, static=dict(reading.static))
+    rotation, source = reader.rotation(frame)
     if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
         raise DatasetError(
             f"Messages of /tf_static cannot be read, and with them may be lost how the scanner of {topic} is "
@@ -248,11 +248,4 @@ def _scans(lidar: LidarSpec, scan_frame: str | None, scan_yaw: float | None, rea
             f"{topic}: the scanner sees to {reach:.2f} m (range_max); where nothing came back, the dataset "
             f"has {lidar.range_max:g} m all the same"
         )
-    return resampled_scans(
-        [scan.ranges for scan in scans],
-        {name: np.array([getattr(scan, name) for scan in scans]) for name in GEOMETRY},
-        lidar=lidar,
-        beams=lidar.beams,
-        rotation=rotation,
-        topic=topic,
-    )
+    return reader.resampled(scans, rotation)

@@ -99,12 +99,6 @@ def _damage(bag: Bag) -> str:
     return "".join(f" Damaged: {problem}." for problem in bag.problems)
 
 
-def static_topics(scan: str) -> set[str]:
-    """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
-    names = {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
-    return names | {other_form(name) for name in names}
-
-
 def publisher_notes(bag: Bag, wanted: Sequence[tuple[Source, Topic]]) -> list[str]:
     """Return, in sentences, which topics that are read may have more than one publisher."""
     notes = []

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import pace, pace_warnings
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.ros2.bag.importer.sources import Reading, Source
-from bhd_lerobot.ros2.bag.importer.topics import publisher_notes, static_topics, wanted_topics
+from bhd_lerobot.ros2.bag.importer.topics import other_form, publisher_notes, wanted_topics
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
 from bhd_lerobot.ros2.messages.mapping import has_header
 from bhd_lerobot.ros2.messages.parts import NANO, head_stamps, header_stamps
+from bhd_lerobot.ros2.messages.scan import static_frames, static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
 
 Array = NDArray[np.float64]
@@ -72,10 +72,10 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> list[Trac
     wanted = wanted_topics(bag, options.sources)
     notes += publisher_notes(bag, wanted)
     turned = {name for source, _ in wanted if source.is_turned for name in static_topics(source.topic)}
-    latched = sorted(turned & bag.topics.keys())
+    latched = sorted((turned | {other_form(name) for name in turned}) & bag.topics.keys())
     images = {topic.name for source, topic in wanted if not source.names}
     messages = bag.read({topic.name for _, topic in wanted} - images | {*latched}, images)
-    static, lost = frames.static_frames([one for name in latched for one in messages[name].data])
+    static, lost = static_frames([one for name in latched for one in messages[name].data])
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
     tracks: list[Track] = []

@@ -1,0 +1,212 @@
+"""A robot by its mapping: whose topics it is, what may be sent, and the numbers that its bag has."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.ros2.bag.importer.sources import Reading, mapped_sources
+from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.messages.mapping import FieldsReader, MappingConfig, topics_of
+from bhd_lerobot.ros2.messages.scan import static_frames
+from bhd_lerobot.ros2.messages.serialize import decode, encode
+from bhd_lerobot.ros2.messages.views import TF
+from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
+from bhd_lerobot.ros2.robots.robot import Ros2Robot
+from tests.ros2.feed import FLOATS, JOINTS, ODOMETRY, SCAN, TWIST, Sent, feed, mounted, odometry, scan
+from tests.waiting import until
+
+ODOM = {"topic": "/odom", "type": ODOMETRY}
+SPEED, YAW = ODOM | {"field": "twist.twist.linear.x"}, ODOM | {"field": "pose.pose.orientation"}
+SCANNER = {"topic": "/scan", "type": SCAN, "beams": 8, "range_min": 0.1, "range_max": 10.0}
+DRIVE = {"topic": "/cmd_vel", "type": TWIST, "field": "linear.x"}
+RANGES = np.arange(1.0, 9.0)
+
+
+def config(tmp_path: Path, tree: dict[str, Any], **network: Any) -> Ros2RobotConfig:
+    import yaml
+
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return Ros2RobotConfig(mapping=str(path), ros2=Ros2Config(**network), topic_timeout_s=5.0)
+
+
+@contextmanager
+def connected(tmp_path: Path, observation: dict[str, Any], **network: Any) -> Iterator[Ros2Robot]:
+    robot = Ros2Robot(config(tmp_path, {"observation": observation, "action": {"x.vel": DRIVE}}, **network))
+    try:
+        robot.connect()
+        yield robot
+    finally:
+        robot.disconnect()
+
+
+def test_a_namespace_is_in_front_of_every_topic(tmp_path: Path, domain: int) -> None:
+    """Two robots are on the network; the one without a namespace is neither read nor commanded."""
+    feeding = feed(
+        domain,
+        lambda _: [
+            ("/odom", ODOMETRY, odometry(0.11)),
+            ("/tb3_1/odom", ODOMETRY, odometry(0.55)),
+            ("/tb3_1/scan", SCAN, scan(RANGES)),
+        ],
+        receives=(("/tb3_1/cmd_vel", TWIST), ("/cmd_vel", TWIST)),
+        frames=(("/tb3_1/tf_static", mounted("base_scan", math.pi / 2)),),
+    )
+    observed = {"x.vel": SPEED, "scan": SCANNER}
+    with feeding as received, connected(tmp_path, observed, domain=domain, namespace="tb3_1/") as robot:
+        observation = robot.get_observation()
+        assert observation["x.vel"] == 0.55
+        assert [observation[f"scan_{k:03d}.pos"] for k in range(8)] == np.roll(RANGES, 2).tolist()
+        until(lambda: [robot.send_action({"x.vel": 0.2}), len(received) > 3][1], "it is commanded")
+    assert {topic for topic, _ in received} == {"/tb3_1/cmd_vel"}
+
+
+@pytest.mark.parametrize("section", ["images", "observation"])
+def test_a_namespace_is_in_front_of_images_and_of_topics_without_a_slash(tmp_path: Path, section: str) -> None:
+    image = {"topic": "image", "width": 4, "height": 4}
+    tree = {"observation": {"x.vel": SPEED | {"topic": "odom"}}, "images": {"front": image}}
+    spec = Ros2Robot(config(tmp_path, tree, domain=1, namespace="/r")).spec
+    topics = {"images": spec.cameras[0].topic, "observation": spec.inputs[0].topic}
+    assert topics[section] == {"images": "/r/image", "observation": "/r/odom"}[section]
+
+
+def test_an_option_of_another_robot_type_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"robot.ros2.silence_s is 0.5;.*--robot.topic_timeout_s=0.5"):
+        config(tmp_path, {"observation": {"x.vel": SPEED}}, silence_s=0.5)
+
+
+def element(field: str, kind: str = FLOATS) -> dict[str, str]:
+    return {"topic": "/commands", "type": kind, "field": field}
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([element("data[0]"), element("data[5]")], "no element 1, 2, 3, 4; they would be sent as 0"),
+        ([element("data[1]")], "no element 0"),
+        ([element("layout.dim[1].size")], "layout.dim on /commands the mapping has no element 0"),
+        (
+            [element("pose.covariance[0]", "geometry_msgs/msg/PoseWithCovarianceStamped")],
+            "pose.covariance on /commands the mapping has no element 1, 2",
+        ),
+        ([element("points[0].positions[0]", "trajectory_msgs/msg/JointTrajectory")], "without the joints' names"),
+        ([element("position[0]", JOINTS)], "without the joints' names. Name each joint"),
+        ([element("pose.orientation", "geometry_msgs/msg/PoseStamped")], "a quaternion .* cannot be sent"),
+    ],
+)
+def test_what_would_be_sent_as_zero_or_without_a_name_is_refused(
+    tmp_path: Path, action: list[dict[str, str]], message: str
+) -> None:
+    tree = {"observation": {"x.vel": SPEED}, "action": {f"a{k}.pos": one for k, one in enumerate(action)}}
+    with pytest.raises(ConfigError, match=message):
+        Ros2Robot(config(tmp_path, tree, domain=1))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        [element(f"data[{k}]") for k in (2, 0, 1)],
+        [element(f"position[name={name}]", JOINTS) for name in ("elbow", "wrist")],
+        [element("linear.x", TWIST)],
+    ],
+)
+def test_what_is_whole_may_be_sent(tmp_path: Path, action: list[dict[str, str]]) -> None:
+    tree = {"observation": {"x.vel": SPEED}, "action": {f"a{k}.pos": one for k, one in enumerate(action)}}
+    assert len(Ros2Robot(config(tmp_path, tree, domain=1)).action_features) == len(action)
+
+
+# --- the numbers of a bag ---------------------------------------------------------------------------------------------
+
+ANGLES = {
+    "on and on": np.arange(0, 25, 0.3),
+    "backwards over the half turn": 3.0 - np.arange(0, 12, 0.7),
+    "to and fro at the half turn": math.pi + 0.2 * np.sin(np.arange(0, 20)),
+}
+
+
+@pytest.mark.parametrize("angles", ANGLES.values(), ids=ANGLES)
+@pytest.mark.parametrize("scale", [1.0, -1.0, 180 / math.pi])
+@pytest.mark.parametrize("signs", ["one", "both"])
+def test_a_yaw_counts_on_live_as_in_a_bag(angles: np.ndarray, scale: float, signs: str) -> None:
+    mapping = MappingConfig.of({"observation": {"yaw": YAW | {"scale": scale}}}, "it")
+    flips = np.where(np.arange(len(angles)) % 3 == 1, -1.0, 1.0) if signs == "both" else np.ones(len(angles))
+    pairs = zip(angles.tolist(), flips.tolist(), strict=True)
+    messages = [decode(ODOMETRY, encode(ODOMETRY, odometry(yaw=yaw, sign=sign), 1)[0]) for yaw, sign in pairs]
+    [fields], [source] = topics_of(mapping.observation, {}), mapped_sources(mapping)
+    empty: Any = None
+    in_bag = source.readers[ODOMETRY](Reading("/odom", empty, messages, {}, static_lost=False, notes=[]))[:, 0]
+    reader = FieldsReader(fields, ["yaw"])
+    live = np.array([reader.read(message)[0] for message in messages])
+    np.testing.assert_allclose(np.diff(live), scale * np.diff(angles), atol=1e-9)
+    turn = 2 * math.pi * abs(scale)
+    np.testing.assert_allclose(live - turn * round(live[0] / turn), in_bag - turn * round(in_bag[0] / turn), atol=1e-9)
+
+
+def test_a_message_whose_feature_is_not_finite_is_left_out_as_in_a_bag() -> None:
+    from bhd_lerobot.errors import DatasetError
+
+    [fields] = topics_of(MappingConfig.of({"observation": {"x.vel": SPEED}}, "it").observation, {})
+    with pytest.raises(DatasetError, match=r"x\.vel is nan"):
+        FieldsReader(fields, ["x.vel"]).read(decode(ODOMETRY, encode(ODOMETRY, odometry(math.nan), 1)[0]))
+
+
+def test_a_yaw_begins_within_half_a_turn_with_each_episode(tmp_path: Path, domain: int) -> None:
+    with (
+        feed(domain, lambda at: [("/odom", ODOMETRY, odometry(yaw=5 * at))]),
+        connected(tmp_path, {"yaw.pos": YAW}, domain=domain) as robot,
+    ):
+        until(lambda: robot.get_observation()["yaw.pos"] > 10, "it has turned")
+        robot.begin_episode()
+        assert abs(robot.get_observation()["yaw.pos"]) <= math.pi
+
+
+@pytest.mark.parametrize("frame", ["base_scan", "laser", "robot/laser"])
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -math.pi / 4, math.pi])
+def test_a_scanner_that_is_mounted_turned_reads_live_as_in_a_bag(
+    tmp_path: Path, domain: int, frame: str, yaw: float
+) -> None:
+    frames = mounted(frame, yaw)
+    mapping = MappingConfig.of({"observation": {"scan": SCANNER}}, "it")
+    [source] = mapped_sources(mapping)
+    message = decode(SCAN, encode(SCAN, scan(RANGES, frame), 1)[0])
+    static, _ = static_frames(encode(TF, frames, 1))
+    reading = Reading("/scan", None, [message], static, static_lost=False, notes=[])  # type: ignore[arg-type]
+    [in_bag] = source.readers[SCAN](reading)
+    assert source.feature == keys.OBSERVATION_STATE
+    with (
+        feed(domain, lambda _: [("/scan", SCAN, scan(RANGES, frame))], frames=(("/tf_static", frames),)),
+        connected(tmp_path, {"scan": SCANNER}, domain=domain) as robot,
+    ):
+        assert list(robot.get_observation().values()) == in_bag.tolist()
+
+
+@pytest.mark.parametrize(
+    ("network", "shift"), [({"scan_frame": "laser"}, 0), ({"scan_frame": "laser", "scan_yaw": math.pi / 2}, 2)]
+)
+def test_options_say_how_a_scanner_is_mounted(tmp_path: Path, domain: int, network: dict[str, Any], shift: int) -> None:
+    with (
+        feed(domain, lambda _: [("/scan", SCAN, scan(RANGES, "laser"))]),
+        connected(tmp_path, {"scan": SCANNER}, domain=domain, **network) as robot,
+    ):
+        assert list(robot.get_observation().values()) == np.roll(RANGES, shift).tolist()
+
+
+def test_two_publishers_of_one_topic_are_named_however_rare_its_messages(tmp_path: Path, domain: int) -> None:
+    second: list[bool] = []
+
+    def make(at: float) -> list[Sent]:
+        also = [("/odom#2", ODOMETRY, odometry(0.9))] if second and int(at * 3) % 2 else []
+        return [("/odom", ODOMETRY, odometry(0.1)), *also]
+
+    with feed(domain, make, hz=3), connected(tmp_path, {"x.vel": SPEED}, domain=domain) as robot:
+        robot.get_observation()
+        second.append(True)
+        with pytest.raises(RealtimeError, match=r"Several nodes send /odom at a time: /robot"):
+            until(lambda: [robot.get_observation(), False][1], "it is noticed")
