@@ -58,6 +58,7 @@ def feed(
     hz: float = 20.0,
     receives: tuple[tuple[str, str], ...] = (("/cmd_vel", TWIST),),
     frames: tuple[tuple[str, dict[str, Any]], ...] = (),
+    kept: tuple[Sent, ...] = (),
 ) -> Iterator[list[tuple[str, Any]]]:
     """Send what `make` returns at a time since the start [s], so many times a second; give what is received.
 
@@ -66,14 +67,15 @@ def feed(
     Args:
         receives: topics that are subscribed to, with their types.
         frames: topics of transforms that are sent once, and the transforms.
+        kept: further messages that are sent once, for those that come later, too.
     """
     end, received = threading.Event(), list[tuple[str, Any]]()
     with Node(name, NetworkConfig(domain)) as node:
         inputs = [node.subscription(topic, kind) for topic, kind in receives]
         outputs: dict[str, Any] = {}
-        for topic, tree in frames:
-            outputs[topic] = node.publisher(topic, TF, Qos(1, transient_local=True))
-            outputs[topic].send(encode(TF, tree, 1)[0])
+        for topic, kind, tree in (*[(topic, TF, tree) for topic, tree in frames], *kept):
+            outputs[topic] = node.publisher(topic, kind, Qos(1, transient_local=True))
+            outputs[topic].send(encode(kind, tree, 1)[0])
 
         def run() -> None:
             start = time.monotonic()

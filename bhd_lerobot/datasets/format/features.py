@@ -29,6 +29,7 @@ MODE = "control.mode"
 EFFORT = "control.effort"
 WRENCH = "control.wrench"
 IMAGE_AGE = "control.image_age"
+READING_AGE = "control.reading_age"
 EXPERT_ACTION = "expert.action"
 
 REWARD = "next.reward"

@@ -22,15 +22,21 @@ class Reading:
     Attributes:
         state: the observation's floats, shape (features,).
         images: by camera name, shape (height, width, 3).
-        state_ns: when the motors had answered, or when it was measured if the robot says so (`state_timestamp`),
-            monotonic [ns].
+        state_ns: when the observation was taken: the motors had answered; monotonic [ns].
         image_ns: when each image was taken, or had come, monotonic [ns].
+        reading_ns: when each of the robot's readings was measured, by name, if it states that; monotonic [ns].
     """
 
     state: NDArray[np.float64]
     images: dict[str, NDArray[np.uint8]]
     state_ns: int
     image_ns: dict[str, int] = field(default_factory=dict)
+    reading_ns: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def oldest_ns(self) -> int:
+        """When the oldest number or image was measured."""
+        return min([self.state_ns, *self.image_ns.values(), *self.reading_ns.values()])
 
 
 class _Stamp:
@@ -50,6 +56,7 @@ class Device:
         observation_names: names of the observation's floats, in order.
         action_names: names of the action's floats, in order.
         camera_shapes: image shapes (height, width, 3) by camera name.
+        reading_names: names of the readings of which the robot states when they were measured.
         camera_period_s: time between two images of the slowest camera [s]; 0 if it is not known.
 
     Raises:
@@ -71,6 +78,7 @@ class Device:
                 )
         if not self.action_names:
             raise ConfigError(f"The robot {self.name} has no action features: there is nothing to drive.")
+        self.reading_names = tuple(getattr(robot, "reading_names", ()))
         self.camera_period_s = 0.0
         self._stamps = {name: _Stamp() for name in self.camera_shapes}
         cameras = getattr(robot, "cameras", None)
@@ -79,6 +87,11 @@ class Device:
                 _stamp_reads(camera, self._stamps[name])
                 if rate := getattr(camera, "fps", None):
                     self.camera_period_s = max(self.camera_period_s, 1 / float(rate))
+
+    @property
+    def sensor_period_s(self) -> float:
+        """Time between two readings of the slowest sensor or camera [s]; 0 if it is not known."""
+        return max(self.camera_period_s, float(getattr(self.robot, "reading_period_s", 0.0)))
 
     def begin_episode(self) -> None:
         """Tell a robot that wants to know that an episode begins."""
@@ -105,9 +118,9 @@ class Device:
             images[name] = image
         asked = [stamp.asked_ns for stamp in self._stamps.values() if stamp.asked_ns >= started]
         taken = {name: stamp.taken_ns or ended for name, stamp in self._stamps.items()}
-        measured = getattr(self.robot, "state_timestamp", None)  # as the cameras' `latest_timestamp`
-        state_ns = round(measured * 1e9) if isinstance(measured, float) else min(asked, default=ended)
-        return Reading(state, images, state_ns, taken)
+        measured = getattr(self.robot, "reading_timestamps", {})  # as the cameras' `latest_timestamp`
+        readings = {name: round(measured[name] * 1e9) for name in self.reading_names}
+        return Reading(state, images, min(asked, default=ended), taken, readings)
 
     def send(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Send an action, shape (actions,); return what the robot says that it applied.

@@ -30,8 +30,13 @@ class FrameClock:
 
     grants = None
 
-    def __init__(self, frames: FrameThread, sensor_period_s: float) -> None:
-        self._frames, self.sensor_period_s = frames, sensor_period_s
+    def __init__(self, frames: FrameThread, device: Device) -> None:
+        self._frames, self._device = frames, device
+
+    @property
+    def sensor_period_s(self) -> float:
+        """Time between two readings of the slowest sensor [s]; 0 if it is not known."""
+        return self._device.sensor_period_s
 
     def statistics(self) -> TimingStatistics:
         """Return how punctual the frames of the present episode are; live."""
@@ -67,7 +72,7 @@ class LeRobotHost:
         self.gate = Gate(self.action_names, config, self.device.known_ranges())
         self.running = np.ones(1, np.bool_)
         self._frames = FrameThread(self.device, self.gate, fps, config)
-        self.clock = FrameClock(self._frames, self.device.camera_period_s)
+        self.clock = FrameClock(self._frames, self.device)
         self._seen: DeviceFrame | None = None  # the frame that the brain observes
         self._shown: DeviceFrame | None = None  # the frame whose images are given out
         self._chunk: tuple[int, NDArray[np.float64]] | None = None  # the frame of its first action, and its actions
@@ -75,7 +80,8 @@ class LeRobotHost:
     @property
     def columns(self) -> dict[str, tuple[str, ...]]:
         """What frames and reports hold beside observation and action."""
-        return {keys.IMAGE_AGE: tuple(self.camera_shapes)} if self.camera_shapes else {}
+        ages = {keys.IMAGE_AGE: tuple(self.camera_shapes), keys.READING_AGE: self.device.reading_names}
+        return {key: names for key, names in ages.items() if names}
 
     @property
     def notes(self) -> list[str]:
@@ -135,13 +141,13 @@ class LeRobotHost:
 
     def _frame_of(self, frame: DeviceFrame, now_ns: int) -> Frame:
         reading = frame.reading
-        columns = {}
-        if self.camera_shapes:
-            ages = [now_ns - reading.image_ns[name] for name in self.camera_shapes]
-            columns[keys.IMAGE_AGE] = np.array([ages]) / NANOSECONDS
-        oldest = min([reading.state_ns, *reading.image_ns.values()])
+        times = {keys.IMAGE_AGE: reading.image_ns, keys.READING_AGE: reading.reading_ns}
+        columns = {
+            key: np.array([[now_ns - times[key][name] for name in names]]) / NANOSECONDS
+            for key, names in self.columns.items()
+        }
         time_ns = np.array([reading.state_ns - self._frames.origin_ns])
-        return Frame(reading.state[None], time_ns, np.array([now_ns - oldest]), columns)
+        return Frame(reading.state[None], time_ns, np.array([now_ns - reading.oldest_ns]), columns)
 
     def step(self, command: Command) -> FrameReport:
         """Send an action, wait for the end of the frame that it is now, and report it.

@@ -30,6 +30,8 @@ class Word(IntEnum):
     """How often the node has looked who else is there."""
     OTHERS = 5
     """How many other publishers it found on the topics of commands."""
+    UNRECEIVED = 6
+    """How many of these topics nobody receives whose commands have to arrive."""
 
 
 class Channel:
@@ -37,7 +39,7 @@ class Channel:
 
     Attributes:
         words: see `Word`.
-        states: counts, times and numbers of the inputs.
+        states: counts, times and numbers of the inputs; mean times between two messages of inputs and cameras.
         commands: numbers of the outputs.
         images: of each camera, records of `image_dtypes`.
 
@@ -56,6 +58,7 @@ class Channel:
                 ("arrived_ns", np.int64, (inputs,)),
                 ("measured_ns", np.int64, (inputs,)),
                 ("dropped", np.int64, (inputs,)),
+                ("period_ns", np.int64, (inputs + len(spec.cameras),)),
                 ("values", np.float64, (width,)),
                 ("problem", np.bytes_, PROBLEM_BYTES),
             ]

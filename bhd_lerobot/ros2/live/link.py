@@ -24,6 +24,7 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 _START_S = 30.0
 _END_S = 3.0
 _CHECKS = 3  # looks at who else is there, before a command is sent
+_RECEIVED_S = 8.0  # that it may take until nodes are found that receive commands
 _GHOST_S = 25.0  # a node that was killed counts for up to 20 s
 SILENCE_S = 3.0  # so long without a sign of life a process counts as stopped; old readings are noticed sooner
 
@@ -70,7 +71,7 @@ class NodeLink:
             if patience_s is not None:
                 self._wait_for_topics(time.monotonic() + patience_s)
             if self.spec.outputs and self.spec.is_alone:
-                self._wait_for_others(time.monotonic() + _GHOST_S)
+                self._wait_for_others()
         except BaseException:
             self.close()
             raise
@@ -110,11 +111,11 @@ class NodeLink:
             self.check()
             time.sleep(0.01)
 
-    def _wait_for_others(self, end: float) -> None:
-        """Wait until no other node commands the robot; one that was killed counts for a while."""
-        words = self.channel.words
-        while words[Word.CHECKS] < _CHECKS or words[Word.OTHERS]:
-            if time.monotonic() > end:
+    def _wait_for_others(self) -> None:
+        """Wait until the robot receives commands, and no other node's; one that was killed counts for a while."""
+        words, start = self.channel.words, time.monotonic()
+        while words[Word.CHECKS] < _CHECKS or words[Word.OTHERS] or words[Word.UNRECEIVED]:
+            if time.monotonic() - start > (_GHOST_S if words[Word.OTHERS] else _RECEIVED_S):
                 raise RealtimeError(self.problem or "The ROS 2 node has not looked who else commands the robot.")
             self.check()
             time.sleep(0.01)

@@ -92,6 +92,8 @@ class Ros2Config(NetworkConfig):
         timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
         silence_s: a topic that sends nothing for so long is a fault [s]; by default 0.5, and 1 of scans. The robot type
             ``ros2`` has `robot.topic_timeout_s` for it.
+        synchronised: the clocks of the robot and of this machine are synchronised (NTP, PTP), so that a reading's age
+            is known from its stamp. Otherwise the smallest delay of the network counts as none.
         namespace: in front of the robot's topics, such as ``/tb3_1``.
         scan_frame: the frame of scans, where ``/tf_static`` does not state how the scanner is mounted.
         scan_yaw: where the scanner's zero points [rad], 0 is straight ahead; by default as ``/tf_static`` states.
@@ -100,6 +102,7 @@ class Ros2Config(NetworkConfig):
     command_hz: float = 0.0
     timeout_s: float = 0.2
     silence_s: float | None = None
+    synchronised: bool = False
     namespace: str = ""
     scan_frame: str = "base_scan"
     scan_yaw: float | None = None

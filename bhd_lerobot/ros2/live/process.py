@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -37,6 +38,7 @@ _MIXED_NS = 2_000_000_000  # so long two publishers of a topic are a problem aft
 _FRAMES_NS = 5_000_000_000  # so long what states how scanners are mounted is waited for
 _STOP_S = 1.0  # so long the stop is sent
 _SILENT_S = 0.3  # so long without a sign of life the node counts as stopped
+_SLACK_NS = 100_000_000  # by so much more than time passed may a clock that was set go on with the next message
 _TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a clock that was set
 
 
@@ -115,27 +117,35 @@ class Receiver:
     def __init__(self, spec: NodeSpec, channel: Channel, node: Node) -> None:
         self._spec, self._channel, self._node = spec, channel, node
         self._columns = spec.columns
-        self._inputs = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.inputs]
+        self._inputs = [
+            [node.subscription(one.topic, one.msgtype, qos) for qos in _either(one.qos)] for one in spec.inputs
+        ]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
-        self._clocks = [ClockOffset() for _ in (*self._inputs, *self._cameras)]
+        self._clocks = [
+            ClockOffset(is_synchronised=spec.network.is_local or spec.is_synchronised)
+            for _ in (*self._inputs, *self._cameras)
+        ]
+        self._is_rate_known = False  # whether it was printed that a clock is slow
+        self._dropped: dict[int, tuple[int, int]] = {}  # stamp and arrival of the message that was dropped last [ns]
         self._stamps = [0] * len(self._inputs)  # newest of each [ns]
         self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
         self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
-        topics = [one.topic for one in (*spec.inputs, *spec.cameras)]
-        self._heard: list[list[int]] = [[] for _ in topics]  # publishers, the one that was heard last at the end
-        self._mixed_ns = [0] * len(topics)  # when a publisher was heard again after another one
+        self._topics: list[Any] = [*spec.inputs, *spec.cameras]
+        self._heard: list[list[int]] = [[] for _ in self._topics]  # publishers, the one that was heard last at the end
+        self._mixed_ns = [0] * len(self._topics)  # when a publisher was heard again after another one
         self._scanners = {one.topic: one.reader for one in spec.inputs if isinstance(one.reader, ScanReader)}
         frames = sorted({name for scan in self._scanners for name in static_topics(scan)})
         self._frames = [node.subscription(name, TF, Qos(100, transient_local=True)) for name in frames]
         self._frame_senders: set[int] = set()
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()
+        self._missed: set[str] = set()  # topics of commands that nobody received
         self._intruders: set[str] = set()
         self._checked_ns = 0
         self._start_ns = time.monotonic_ns()
-        self._network_problem = ""
+        self._network_problem = self._unreceived_problem = ""
         channel.states.publish(self._record)
 
     def step(self) -> None:
@@ -146,8 +156,11 @@ class Receiver:
                 self._frame_senders.add(received.sender)
                 for scanner in self._scanners.values():
                     scanner.static |= static_frames([received.data])[0]
-        for index, subscription in enumerate(self._inputs):
-            for received in subscription.take():
+        for index, subscriptions in enumerate(self._inputs):
+            received_now = [received for subscription in subscriptions for received in subscription.take()]
+            for received in (
+                sorted(received_now, key=lambda one: one.sent_ns) if len(subscriptions) > 1 else received_now
+            ):
                 news = self._take(index, received) or news
         for index, subscription in enumerate(self._cameras):
             for received in subscription.take()[-1:]:
@@ -156,7 +169,9 @@ class Receiver:
         if now - self._checked_ns > _CHECK_NS:
             self._checked_ns = now
             self._network_problem = self._intrusion() or self._twins(now)
-        problem = (self._network_problem or self._silence(now)).encode()[:PROBLEM_BYTES]
+            self._unreceived_problem = self._unreceived()
+        text = self._network_problem or self._silence(now) or self._unreceived_problem
+        problem = text.encode()[:PROBLEM_BYTES]
         if news or problem != self._record["problem"]:
             self._record["problem"] = problem
             self._channel.states.publish(self._record)
@@ -171,23 +186,49 @@ class Receiver:
         except DatasetError as error:
             self._wrong[one.topic] = str(error)
             return False
-        self._hear(index, received)
+        if not one.qos.transient_local:
+            self._hear(index, received)
         header = getattr(message, "header", None)
         stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         if stamp:
             newest = self._stamps[index]
             if any(stamp <= other < stamp + _TOMORROW_NS for other in (newest, self._old_stamps[index])):
-                record["dropped"][index] += 1
-                return False  # out of order; a stamp that is far behind is of a clock that was set
+                before, self._dropped[index] = self._dropped.get(index), (stamp, received.arrived_ns)
+                goes_on = before and 0 <= stamp - before[0] <= received.arrived_ns - before[1] + _SLACK_NS
+                if not goes_on:
+                    record["dropped"][index] += 1
+                    return False  # out of order; a stamp that is far behind, or the next, is of a clock that was set
+            self._dropped.pop(index, None)
             if abs(stamp - newest) > _TOMORROW_NS:
                 self._old_stamps[index] = newest
             self._stamps[index] = stamp
         self._wrong.pop(one.topic, None)
         record["count"][index] += 1
+        self._count_interval(index, received.arrived_ns - int(record["arrived_ns"][index]), record["count"][index])
         record["arrived_ns"][index] = received.arrived_ns
-        record["measured_ns"][index] = self._clocks[index].measured_ns(stamp, received.arrived_ns)
+        record["measured_ns"][index] = self._measured_ns(index, stamp, received)
         record["values"][self._columns[index]] = values
         return True
+
+    def _measured_ns(self, index: int, stamp_ns: int, received: Received) -> int:
+        """Return when a message was measured, monotonic [ns]; print once that a topic's clock is slow or fast."""
+        clock, arrived = self._clocks[index], received.arrived_ns
+        wall = arrived + time.time_ns() - time.monotonic_ns()
+        measured = clock.measured_ns(stamp_ns, arrived, received.sent_ns, wall)
+        if clock.rate != 1.0 and not self._is_rate_known:
+            self._is_rate_known = True
+            print(
+                f"warning: the clock of the stamps of {self._topics[index].topic} goes at {clock.rate:.2f} of real "
+                "time: a simulation whose real time factor is not 1? The robot and its sensors are slower, or faster, "
+                "than the commands that they get.",
+                file=sys.stderr,
+            )
+        return measured
+
+    def _count_interval(self, index: int, interval_ns: int, count: int) -> None:
+        periods = self._record["period_ns"]
+        if count > 1:
+            periods[index] += (interval_ns - periods[index]) // 8 if periods[index] else interval_ns
 
     def _hear(self, index: int, received: Received) -> None:
         heard = self._heard[index]
@@ -201,7 +242,7 @@ class Receiver:
         """Return as text which topic has not stated yet how scanners are mounted; empty if none is waited for."""
         if now_ns - self._start_ns > _FRAMES_NS:
             return ""
-        silent = [one.topic for one in self._frames if not self._frame_senders.issuperset(one.sender_ids)]
+        silent = [each.topic for each in self._frames if not self._frame_senders.issuperset(each.sender_ids)]
         return f"{' and '.join(silent)} may state how the scanner is mounted, and has not been received" * bool(silent)
 
     def _take_image(self, index: int, received: Received) -> None:
@@ -218,10 +259,12 @@ class Receiver:
             return
         self._wrong.pop(camera.topic, None)
         record = np.zeros((), self._channel.image_dtypes[index])
-        clock = self._clocks[len(self._inputs) + index]
-        record["measured_ns"] = clock.measured_ns(_header_stamp(received.data), received.arrived_ns)
+        stamp = _header_stamp(received.data)
+        record["measured_ns"] = self._measured_ns(len(self._inputs) + index, stamp, received)
         record["pixels"] = image
         ring.publish(record)
+        interval, known = received.arrived_ns - self._images_ns[index], 1 + bool(self._images_ns[index])
+        self._count_interval(len(self._inputs) + index, interval, known)
         self._images_ns[index] = received.arrived_ns
         self._hear(len(self._inputs) + index, received)
 
@@ -243,7 +286,7 @@ class Receiver:
     def _why(self, one: Any, silent_s: float, *, heard: bool) -> str:
         if wrong := self._wrong.get(one.topic):
             return f"The newest message of {one.topic} cannot be used: {wrong}"
-        mismatches = self._node.graph.mismatches(one.topic, one.msgtype, one.qos, is_publisher=False)
+        mismatches = self._node.graph.mismatches(one.topic, one.msgtype, _either(one.qos)[-1], is_publisher=False)
         if mismatches:
             return " ".join(mismatches)
         endpoints = [other for other in self._node.graph.endpoints() if other.is_publisher and not self._is_ours(other)]
@@ -273,10 +316,29 @@ class Receiver:
             "counts for up to 20 s more."
         )
 
+    def _unreceived(self) -> str:
+        """Return which commands no node receives, and why, as text; empty if all are received."""
+        found: dict[str, str] = {}
+        subscriptions = [end for end in self._node.graph.endpoints() if not (end.is_publisher or end.is_own)]
+        for one in self._spec.outputs if self._spec.is_alone else ():
+            ends = [end for end in subscriptions if end.topic == one.topic]
+            if any(end.msgtype == one.msgtype and one.qos.serves(end.qos) for end in ends):
+                continue
+            if wrong := self._node.graph.mismatches(one.topic, one.msgtype, one.qos, is_publisher=True):
+                found[one.topic] = f"{' '.join(wrong)} {one.remedy}".rstrip()
+            elif one.is_required:
+                found[one.topic] = (
+                    f"No node receives {one.topic} ({one.msgtype}), so the robot cannot be commanded. Check that its "
+                    f"driver or controller runs, and robot.ros2.namespace. {_offers(one, subscriptions, 'receives')}"
+                )
+        before, self._missed = self._missed, set(found)  # one that has just appeared may not be known yet
+        lasting = before & self._missed
+        self._channel.words[Word.UNRECEIVED] = len(self._missed)
+        return " ".join(text for topic, text in found.items() if topic in lasting)
+
     def _twins(self, now_ns: int) -> str:
         """Return which topic two publishers send to at a time, as text; empty if none. A robot may have restarted."""
-        everyone: tuple[Any, ...] = (*self._spec.inputs, *self._spec.cameras)
-        for one, mixed_ns in zip(everyone, self._mixed_ns, strict=True):
+        for one, mixed_ns in zip(self._topics, self._mixed_ns, strict=True):
             if mixed_ns and now_ns - mixed_ns < _MIXED_NS:
                 ends = self._node.graph.endpoints()
                 nodes = sorted({end.node or "?" for end in ends if end.is_publisher and end.topic == one.topic})
@@ -289,6 +351,11 @@ class Receiver:
         return endpoint.is_own or endpoint.node == f"/{self._spec.name}_guard"
 
 
+def _either(qos: Qos) -> tuple[Qos, ...]:
+    """Return how a topic is received: what is transient local here is volatile in older drivers, or later ones."""
+    return (qos, replace(qos, transient_local=False)) if qos.transient_local else (qos,)
+
+
 def _header_stamp(data: bytes) -> int:
     """Return the stamp [ns] of a serialised message that begins with a header."""
     order: Any = "little" if data[1] & 1 else "big"
@@ -296,12 +363,12 @@ def _header_stamp(data: bytes) -> int:
     return seconds * 1_000_000_000 + nanoseconds
 
 
-def _offers(one: Any, endpoints: list[Endpoint]) -> str:
+def _offers(one: Any, endpoints: list[Endpoint], does: str = "publishes") -> str:
     fitting = sorted({other.topic for other in endpoints if other.msgtype == one.msgtype})
     if fitting:
         return f"Of this type there are: {', '.join(fitting)}."
     there = sorted({other.topic for other in endpoints})
-    return f"There are: {', '.join(there)}." if there else "No node publishes anything on this network."
+    return f"There are: {', '.join(there)}." if there else f"No node {does} anything on this network."
 
 
 def _run_node(spec: NodeSpec, channel: Channel, connection: Connection, wake: int) -> None:

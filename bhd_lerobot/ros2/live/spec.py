@@ -41,7 +41,7 @@ class InputSpec:
     """A topic that is received.
 
     Attributes:
-        topic, msgtype, qos: of the subscription.
+        topic, msgtype, qos: of the subscription; what is transient local is received from volatile publishers, too.
         reader: takes the numbers from a message.
         silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
             when something changes, which is not waited for either: its numbers are not a number until then.
@@ -66,6 +66,8 @@ class OutputSpec:
     Attributes:
         topic, msgtype, qos: of the publisher.
         writer: makes a message of the command's numbers.
+        is_required: whether a node has to receive it.
+        remedy: what to do if a node receives another type.
         stop: the numbers that stop the robot, sent when no command comes any more; None for a robot that stops by
             itself.
     """
@@ -74,6 +76,8 @@ class OutputSpec:
     msgtype: str
     writer: Writer
     qos: Qos = field(default_factory=Qos)
+    is_required: bool = True
+    remedy: str = ""
     stop: tuple[float, ...] | None = None
 
 
@@ -107,6 +111,7 @@ class NodeSpec:
         command_hz: a command is sent at once, but at most so often; without a new one, the last is repeated as often
             [Hz].
         timeout_s: without a command for so long the stop is sent instead [s].
+        is_synchronised: whether the clocks of the other machines are that of this one.
         is_alone: whether another publisher on a topic that is sent is a problem.
     """
 
@@ -117,6 +122,7 @@ class NodeSpec:
     cameras: tuple[CameraSpec, ...] = ()
     command_hz: float = 50.0
     timeout_s: float = 0.2
+    is_synchronised: bool = False
     is_alone: bool = True
 
     @property

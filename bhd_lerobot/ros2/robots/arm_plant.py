@@ -35,10 +35,13 @@ class JointReader:
     def read(self, message: Any) -> NDArray[np.float64]:
         """Return the angles and then the speeds, shape (width,)."""
         names = list(message.name)
-        if not set(self.joints) <= set(names) or min(len(message.position), len(message.velocity)) < len(names):
-            raise DatasetError(
-                f"it has positions and velocities of {', '.join(names) or 'no joint'}; needed: {', '.join(self.joints)}"
-            )
+        if missing := [joint for joint in self.joints if joint not in names]:
+            raise DatasetError(f"it has no {', '.join(missing)}; it has {', '.join(names) or 'no joint'}")
+        for what, values in (("positions", message.position), ("velocities", message.velocity)):
+            if len(values) != len(names):
+                raise DatasetError(
+                    f"it has {len(values)} {what} of {len(names)} joints; both are needed of every joint"
+                )
         order = [names.index(joint) for joint in self.joints]
         return np.concatenate([message.position[order], message.velocity[order]])
 
@@ -93,7 +96,7 @@ class ArmPlant(Ros2Plant):
         )
         outputs = (
             OutputSpec(ur.POSITION_TOPIC, ur.FLOATS, FloatsWriter(self._count), Qos(1)),
-            OutputSpec(ur.GRIPPER_TOPIC, ur.FLOATS, FloatsWriter(1), Qos(1)),
+            OutputSpec(ur.GRIPPER_TOPIC, ur.FLOATS, FloatsWriter(1), Qos(1), is_required=False),
         )
         super().__init__(body.name, config, inputs, outputs)
 

@@ -106,9 +106,10 @@ class BasePlant(Ros2Plant):
         ]
         if config.imu:
             inputs.append(InputSpec("/imu", GyroPart.msgtype, GyroReader(), SENSOR_DATA, node_silence))
-        super().__init__(
-            body.name, config, tuple(inputs), (OutputSpec("/cmd_vel", writer.msgtype, writer, stop=_STOP),)
-        )
+        other = "humble" if writer.stamped else "jazzy"
+        remedy = f"Set --robot.ros2.distro={other}."
+        output = OutputSpec("/cmd_vel", writer.msgtype, writer, remedy=remedy, stop=_STOP)
+        super().__init__(body.name, config, tuple(inputs), (output,))
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the wheels, the scan and the gyroscope into `out`."""

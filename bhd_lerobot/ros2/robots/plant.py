@@ -43,6 +43,7 @@ class Ros2Plant(Plant):
             tuple(replace(one, topic=network.in_namespace(one.topic)) for one in outputs),
             command_hz=network.command_hz or self.command_hz,
             timeout_s=network.timeout_s,
+            is_synchronised=network.synchronised,
         )
         self.link = NodeLink(spec)
         self._parts = spec.columns
@@ -68,7 +69,7 @@ class Ros2Plant(Plant):
             RealtimeError: something is wrong with the topics, or the node's process has ended.
         """
         state = self.link.state
-        silent_s = (time.monotonic_ns() - int(state["measured_ns"][0])) / 1e9
+        silent_s = (time.monotonic_ns() - int(state["arrived_ns"][0])) / 1e9
         is_old = silent_s > self._silence_s
         self.link.check(self._silence_s / 2 if is_old else self._silence_s)
         if problem := bytes(state["problem"]).decode(errors="ignore"):

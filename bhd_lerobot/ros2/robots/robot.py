@@ -1,7 +1,6 @@
 """Any ROS 2 robot as a LeRobot `Robot`: a mapping says which fields of which topics are its features."""
 
 import os
-import time
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -35,11 +34,12 @@ class Ros2Robot(Robot):
     """A robot on a ROS 2 network.
 
     Observation and action are the features of its mapping, the images those of its cameras. An observation is the
-    newest message of each topic; the time at which the oldest of them was measured is `state_timestamp`.
+    newest message of each topic.
 
     Attributes:
         spec: its node.
-        state_timestamp: when the oldest number of the last observation was measured, on `time.perf_counter` [s].
+        reading_timestamps: when each topic's numbers in the last observation were measured, on `time.perf_counter`
+            [s]; none of messages that are on their way for an unknown time.
 
     Args:
         config: the configuration.
@@ -64,22 +64,26 @@ class Ros2Robot(Robot):
         self._names, self._actions = features_of(mapping.observation), tuple(mapping.action)
         inputs, self._places = self._inputs(mapping)
         self._acted = sendable_topics(mapping.action, mapping.types)
-        named = config.ros2.in_namespace
+        named, remedy = config.ros2.in_namespace, f"Correct the type in {config.mapping}."
         self.spec = NodeSpec(
             f"bhd_{os.getpid()}",
             config.ros2,
             inputs,
-            tuple(OutputSpec(named(one.topic), one.msgtype, one, stop=self._stop_of(one)) for one in self._acted),
+            tuple(
+                OutputSpec(named(one.topic), one.msgtype, one, remedy=remedy, stop=self._stop_of(one))
+                for one in self._acted
+            ),
             tuple(
                 CameraSpec(name, named(one.topic), one.type, one.width, one.height, silence_s=config.topic_timeout_s)
                 for name, one in mapping.images.items()
             ),
             command_hz=config.ros2.command_hz or _COMMAND_HZ,
             timeout_s=config.ros2.timeout_s,
+            is_synchronised=config.ros2.synchronised,
         )
         self._link = NodeLink(self.spec)
         self.cameras = {name: Ros2Camera(self._link, index) for index, name in enumerate(mapping.images)}
-        self.state_timestamp = 0.0
+        self.reading_timestamps: dict[str, float] = {}
         self._is_connected = False
         self._whole_turns: NDArray[np.float64] | None = None
 
@@ -149,6 +153,17 @@ class Ros2Robot(Robot):
     def configure(self) -> None:
         """Nothing to configure beyond the configuration."""
 
+    @property
+    def reading_names(self) -> tuple[str, ...]:
+        """The topics whose numbers it observes."""
+        return tuple(dict.fromkeys(one.topic for one in self.spec.inputs))
+
+    @property
+    def reading_period_s(self) -> float:
+        """Time between two messages of the slowest topic, and a quarter more for its jitter [s]."""
+        periods = self._link.state["period_ns"] if self._is_connected else np.zeros(0)
+        return 1.25e-9 * float(max(periods, default=0))
+
     def begin_episode(self) -> None:
         """Let yaws begin within half a turn of 0 with the next observation, as the import of a bag does."""
         self._whole_turns = None
@@ -167,8 +182,8 @@ class Ros2Robot(Robot):
         if self._whole_turns is None:
             self._whole_turns = self._turns * np.round(values[self._yaws] / self._turns)
         values[self._yaws] -= self._whole_turns
-        measured = state["measured_ns"]
-        self.state_timestamp = (int(measured.min()) if len(measured) else time.monotonic_ns()) / 1e9
+        topics = (one.topic for one in self.spec.inputs)
+        self.reading_timestamps = dict(zip(topics, (state["measured_ns"] / 1e9).tolist(), strict=True))
         observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))
         return observation | {name: camera.read_latest() for name, camera in self.cameras.items()}
 

@@ -50,6 +50,7 @@ def taken(stamps: list[float]) -> list[float]:
         ([10.0, 10.2, 10.1, 10.3], [0, 1, 3]),
         ([0.0, 0.0, 0.0], [0, 1, 2]),  # no stamps
         ([10.0, 3610.0, 3610.1, 10.3, 10.4], [0, 1, 2, 3, 4]),  # the clock is set, and set back
+        ([10.0, 10.1, 9.6, 9.7, 9.8], [0, 1, 3, 4]),  # set back by less than a second
         ([10.0, 10.2, 3610.3, 10.1, 3610.4, 10.2, 3610.3, 3610.5], [0, 1, 2, 4, 7]),  # one is late from before
     ],
 )

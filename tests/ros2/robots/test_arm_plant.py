@@ -11,10 +11,13 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.robots.arm_plant import ArmPlant
+from tests.ros2.feed import JOINTS, Sent, feed, head
 from tests.ros2.peer_env import Peer, environment
 from tests.waiting import until
 
+SAFETY = (ur.SAFETY_TOPIC, ur.SAFETY_MODE, {"mode": np.array([3])})
 ACTIVE = ("ur_driver_standin.py", "--active=forward_position_controller")
 
 
@@ -85,3 +88,32 @@ def test_a_driver_that_is_silent_is_named(plant: ArmPlant, domain: int) -> None:
         robot.signal(signal.SIGUSR1)
         with pytest.raises(RealtimeError, match=r"/joint_states has .*no message"):
             until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_the_safety_mode_is_read_of_drivers_that_keep_it_and_of_those_that_do_not(
+    plant: ArmPlant, domain: int, latched: bool
+) -> None:
+    """`ur_robot_driver` publishes it volatile before 2024; a node that receives no gripper's commands is no problem."""
+    joints = [f"{joint}_joint" for joint in ur5().chain.joints]
+    out = reading()
+
+    def make(at: float) -> list[Sent]:
+        angles = {"name": joints, "position": np.zeros((1, 6)), "velocity": np.zeros((1, 6))}
+        return [("/joint_states", JOINTS, {"header": head(), **angles})] + [SAFETY] * (not latched and at > 3)
+
+    kept = ((ur.SAFETY_TOPIC, ur.SAFETY_MODE, SAFETY[2]),) if latched else ()
+    with feed(domain, make, hz=125, receives=((ur.POSITION_TOPIC, ur.FLOATS),), kept=kept):
+        plant.open()
+        until(lambda: [plant.read(out), out.safety[0] == SafetyStatus.STOPPED][1], "the stop is noticed")
+
+
+def test_a_driver_without_the_position_controller_is_named(plant: ArmPlant, domain: int) -> None:
+    joints = [f"{joint}_joint" for joint in ur5().chain.joints]
+    angles = {"name": joints, "position": np.zeros((1, 6)), "velocity": np.zeros((1, 6))}
+    receives = ((ur.TRAJECTORY_TOPIC, ur.TRAJECTORY),)
+    with (
+        feed(domain, lambda _: [("/joint_states", JOINTS, {"header": head(), **angles})], hz=125, receives=receives),
+        pytest.raises(RealtimeError, match="No node receives /forward_position_controller/commands"),
+    ):
+        plant.open()

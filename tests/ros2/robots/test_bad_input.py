@@ -91,7 +91,8 @@ def test_a_topic_that_does_not_fit_is_named(options: tuple[str, ...], text: str,
 
 def test_a_flood_is_read(plant: BasePlant, domain: int) -> None:
     out = PlantReading(1, 2, 360)
-    with joints(domain, "--hz=1000", "--burst=10"), scans(domain, json.dumps(GOOD)):
+    driver = Peer("topic.py", "echo", "/cmd_vel", "geometry_msgs/msg/TwistStamped", domain=domain)
+    with driver, joints(domain, "--hz=1000", "--burst=10"), scans(domain, json.dumps(GOOD)):
         plant.link.open(patience_s=30.0)
         plant.read(out)
         np.testing.assert_array_equal(out.position, [[1.0, 2.0]])

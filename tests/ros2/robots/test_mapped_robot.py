@@ -1,6 +1,7 @@
 """A robot by its mapping: whose topics it is, what may be sent, and the numbers that its bag has."""
 
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.external.device import Device
 from bhd_lerobot.ros2.bag.importer.sources import Reading, mapped_sources
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.messages.mapping import FieldsReader, MappingConfig, topics_of
@@ -19,13 +21,14 @@ from bhd_lerobot.ros2.messages.serialize import decode, encode
 from bhd_lerobot.ros2.messages.views import TF
 from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.robots.robot import Ros2Robot
-from tests.ros2.feed import FLOATS, JOINTS, ODOMETRY, SCAN, TWIST, Sent, feed, mounted, odometry, scan
+from tests.ros2.feed import FLOATS, JOINTS, ODOMETRY, SCAN, TWIST, Sent, feed, head, mounted, odometry, scan
 from tests.waiting import until
 
 ODOM = {"topic": "/odom", "type": ODOMETRY}
 SPEED, YAW = ODOM | {"field": "twist.twist.linear.x"}, ODOM | {"field": "pose.pose.orientation"}
 SCANNER = {"topic": "/scan", "type": SCAN, "beams": 8, "range_min": 0.1, "range_max": 10.0}
 DRIVE = {"topic": "/cmd_vel", "type": TWIST, "field": "linear.x"}
+BATTERY, STAMPED = "sensor_msgs/msg/BatteryState", "geometry_msgs/msg/TwistStamped"
 RANGES = np.arange(1.0, 9.0)
 
 
@@ -33,7 +36,7 @@ def config(tmp_path: Path, tree: dict[str, Any], **network: Any) -> Ros2RobotCon
     import yaml
 
     path = tmp_path / "robot.yaml"
-    path.write_text(yaml.safe_dump(tree))
+    path.write_text(yaml.safe_dump(tree, sort_keys=False))
     return Ros2RobotConfig(mapping=str(path), ros2=Ros2Config(**network), topic_timeout_s=5.0)
 
 
@@ -210,3 +213,48 @@ def test_two_publishers_of_one_topic_are_named_however_rare_its_messages(tmp_pat
         second.append(True)
         with pytest.raises(RealtimeError, match=r"Several nodes send /odom at a time: /robot"):
             until(lambda: [robot.get_observation(), False][1], "it is noticed")
+
+
+# --- times ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_is_taken_when_it_is_asked_for_and_each_topic_has_an_age(tmp_path: Path, domain: int) -> None:
+    """A scan that is 0.8 s late by its stamp, on the same clock, is so old; the frame is of now all the same."""
+
+    def make(at: float) -> list[Sent]:
+        rare = (
+            [("/battery", BATTERY, {"header": head(), "percentage": np.array([0.5])})] if int(at * 20) % 20 == 0 else []
+        )
+        return [("/odom", ODOMETRY, odometry(0.1)), ("/scan", SCAN, scan(RANGES, late_s=0.8)), *rare]
+
+    observed = {"x.vel": SPEED, "scan": SCANNER, "b.pos": {"topic": "/battery", "type": BATTERY, "field": "percentage"}}
+    with feed(domain, make), connected(tmp_path, observed, domain=domain) as robot:
+        device = Device(robot)
+        assert device.reading_names == ("/odom", "/battery", "/scan")
+        times = []
+        for _ in range(5):
+            before = time.monotonic_ns()
+            reading = device.observe()
+            times.append(reading.state_ns)
+            assert before <= reading.state_ns <= time.monotonic_ns()
+            ages = {name: (reading.state_ns - at) / 1e9 for name, at in reading.reading_ns.items()}
+            assert min(ages.values()) >= 0
+            assert ages["/scan"] >= 0.8 > ages["/odom"]
+            assert reading.oldest_ns == min(reading.reading_ns.values())
+        assert times == sorted(set(times))
+        until(lambda: 1.0 < device.sensor_period_s < 2.0, "the slowest topic's period is known")
+
+
+def test_a_command_that_no_node_receives_is_named_before_the_first_episode(tmp_path: Path, domain: int) -> None:
+    def fails(message: str, *receives: tuple[str, str]) -> None:
+        with (
+            feed(domain, lambda _: [("/odom", ODOMETRY, odometry())], receives=receives),
+            pytest.raises(RealtimeError, match=message),
+            connected(tmp_path, {"x.vel": SPEED}, domain=domain),
+        ):
+            pass
+
+    fails(
+        r"The subscription of /cmd_vel in /robot is of type .*TwistStamped; .*Correct the type", ("/cmd_vel", STAMPED)
+    )
+    fails(r"No node receives /cmd_vel \(.*Twist\).*Of this type there are: /base/cmd_vel", ("/base/cmd_vel", TWIST))
