@@ -384,6 +384,9 @@ class Arm(Body):
         servo_damping: torque per speed error of each joint's servo [N m s/rad], and of the gripper's [N s/m].
         actuators: actuator names, the gripper's last.
         actuation: ``"position"``: servos take positions and compensate gravity; ``"torque"``: they take torques.
+        brake_damping: torque per speed of each joint's closed brake [N m s/rad]; none if empty. An arm with torque
+            motors needs them: no sensor that is wrong moves it while they are closed.
+        brake_slip: with which torque a joint slips whose brake has been closed for a while [N m].
         home: the posture that it starts in [rad], and the gripper's opening [m].
         payload: largest mass in the gripper [kg].
         load: mass that the gripper is declared to carry, at the tool centre point [kg]: motions are planned with it.
@@ -403,6 +406,8 @@ class Arm(Body):
     home: tuple[float, ...]
     payload: float
     load: float = 0.0
+    brake_damping: tuple[float, ...] = ()
+    brake_slip: tuple[float, ...] = ()
     latency_s: float = 0.0
     blocked_rad: float = 0.1
     blocked_s: float = 0.05

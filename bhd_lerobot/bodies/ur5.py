@@ -14,7 +14,8 @@ Estimates of ours: link inertias, from solid cylinders of the links' outlines, b
 are an order of magnitude too large for 1.2 kg; the gripper's inertia, from a cylinder and two bars; the capsules of the
 collision checks, from the arm's outlines; the reflected rotor inertias: 0.5 kg m^2 on the first three joints, 0.15 on
 the wrists, 0.3 kg on each finger; the servos' gains, with which 1 kg in the gripper at full reach lowers the tool by
-0.4 mm, and a joint is where a small step commands it after 60 ms, with 4 % overshoot at the most; accelerations and
+0.4 mm, and a joint is where a small step commands it after 60 ms, with 4 % overshoot at the most; the brakes of an arm
+with torque motors; accelerations and
 jerks, which Universal Robots does not publish: with the payload at full reach they need less than the joints' torque
 limits.
 """
@@ -62,6 +63,8 @@ _DISJOINT = (
 _MOVING = ("upper_arm", "elbow", "forearm", "wrist_1", "wrist_2", "wrist_3", *_TOOLING)
 
 _PAYLOAD = 5.0  # [kg]
+_BRAKING_SPEED = 0.35  # [rad/s] the speed at which a brake gives a joint's largest torque
+_SLIP = 0.2  # share of a joint's largest torque with which its brake slips
 
 
 def ur5(
@@ -91,6 +94,8 @@ def ur5(
     if not 0.0 <= load <= _PAYLOAD:
         raise ConfigError(f"The load (robot.payload) is {load} kg; a UR5 carries between 0 and {_PAYLOAD:g} kg.")
     turn = 2 * math.pi
+    effort = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # [N m], [torque]
+    torque = actuation == "torque"
     return Arm(
         name="ur5",
         mjcf=resources.files(__package__).joinpath("ur5.xml").read_text(encoding="utf-8"),
@@ -104,7 +109,7 @@ def ur5(
             jerk=(80.0, 80.0, 100.0, 150.0, 150.0, 150.0, 40.0),
             stop_deceleration=(12.0, 12.0, 15.0, 20.0, 20.0, 20.0, 4.0),
             stop_jerk=(400.0, 400.0, 500.0, 700.0, 700.0, 700.0, 200.0),
-            effort=(150.0, 150.0, 150.0, 28.0, 28.0, 28.0, 60.0),
+            effort=(*effort, 60.0),
             command_timeout_s=command_timeout_s,
         ),
         chain=ArmChain(
@@ -123,6 +128,8 @@ def ur5(
         servo_damping=(800.0, 800.0, 450.0, 80.0, 80.0, 80.0, 150.0),
         actuators=(*JOINTS, "gripper"),
         actuation=actuation,
+        brake_damping=tuple(most / _BRAKING_SPEED for most in effort) if torque else (),
+        brake_slip=tuple(_SLIP * most for most in effort) if torque else (),
         # The tool points down, 0.49 m before the base and 0.11 m to its left, 0.28 m above the table.
         home=(math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, MAX_OPENING),
         payload=_PAYLOAD,

@@ -159,6 +159,9 @@ class Cerebellum:
         """Stop robots that report a stop of their own, or whose readings are no measurements."""
         reading = self.reading
         wrong = self.readings.wrong_positions(reading, self._now_ns)
+        odd = self.readings.wrong_motions(reading, self.guard.written, self.mode)
+        if odd is not None:
+            wrong = odd if wrong is None else wrong | odd
         if wrong is None and self._flat_reading.dot(self._zeros) == 0.0 and not np.count_nonzero(reading.safety):
             return
         bad: NDArray[np.bool_] = np.asarray(~np.isfinite(reading.values).all(axis=(0, 2)))

@@ -138,6 +138,8 @@ class Watchdog(IntFlag):
     suddenly: mode FAULT, and the last safe commands are continued at a falling speed until the stop begins."""
     FORCE = 128
     """An arm pressed with more than its largest force: a protective stop, mode FAULT."""
+    SPEED = 256
+    """A tool under impedance control, or a joint of its arm, moved too fast: a protective stop, mode FAULT."""
 
 
 class Request(IntEnum):

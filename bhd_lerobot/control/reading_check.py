@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase
 from bhd_lerobot.control.kernels import clamp, kernel
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.plant import PlantReading
 
 Array = NDArray[np.float64]
@@ -19,6 +19,10 @@ Times = NDArray[np.int64]
 _FASTER = 2.0
 _SLACK_PERIODS = 3  # by so much may stamps be off
 _TURN = 2 * math.pi
+_MEMORY_S = 0.1  # over which the ways of joints are compared with their speeds
+_CONTRADICTION_RAD, _CONTRADICTION_SHARE = 0.01, 0.1  # so far they may differ: at least, and of the way
+_FROZEN_S = 0.02  # a reading that is the same for so long
+_FROZEN_SHARE = 0.01  # while the torque changed by more than this share of the largest does not measure
 
 
 @kernel(
@@ -70,6 +74,72 @@ def follow_positions(  # noqa: PLR0917
     return any_wrong
 
 
+class MotionCheck:
+    """Finds joints with torque motors whose positions and speeds contradict each other, or follow no torque.
+
+    A torque controller damps with the speeds that it reads: where these are wrong it drives the arm.
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
+        self.problem = ""
+        self._names, dof = arm.chain.joints, len(arm.chain.joints)
+        self._period_s = 1.0 / control_hz
+        self._last, self._since_ns = np.full((2, n, dof), np.nan), np.full(n, -1, np.int64)
+        self._same, self._torque = np.zeros((2, n, dof), np.int64), np.zeros((2, n, dof))
+        self._off, self._way = np.zeros((2, n, dof))
+        self._frozen_ticks = round(_FROZEN_S * control_hz)
+        self._least_torque = _FROZEN_SHARE * np.asarray(arm.limits.effort[:dof])
+
+    def forget(self, ids: NDArray[np.intp]) -> None:
+        """Take the next readings of some arms for the first ones."""
+        self._last[:, ids], self._same[:, ids] = np.nan, 0
+        self._off[ids] = self._way[ids] = 0.0
+
+    def find(self, reading: PlantReading, torque: Array, mode: NDArray[np.int8]) -> Mask | None:
+        """Return the arms whose reading is no measurement, shape (n,); None if there are none.
+
+        Args:
+            torque: that the motors were commanded last [N m], shape (n, dof).
+            mode: the `Mode` of each arm, shape (n,).
+        """
+        driven = (mode >= Mode.HOLD) & (mode <= Mode.STOPPING)  # elsewhere the brakes are closed
+        new = reading.values[:2, :, : len(self._names)]
+        elapsed = np.full(len(driven), self._period_s)
+        if reading.stamp_ns is not None:
+            elapsed = np.where(self._since_ns < 0, 0.0, (reading.stamp_ns - self._since_ns) / NANOSECONDS)
+            self._since_ns[:] = reading.stamp_ns
+        before, fresh = self._last, np.isnan(self._last).any(axis=(0, 2))
+        step = np.where(fresh[:, None], 0.0, new[0] - before[0])
+        turned = np.where(fresh[:, None], 0.0, 0.5 * (new[1] + before[1]) * elapsed[:, None])
+        kept = np.maximum(1.0 - elapsed / _MEMORY_S, 0.0)[:, None]
+        self._off *= kept
+        self._off += step - turned
+        self._way *= kept
+        self._way += np.maximum(np.abs(step), np.abs(turned))
+        contradicts = np.abs(self._off) > _CONTRADICTION_RAD + _CONTRADICTION_SHARE * self._way
+        same = (new == before) & driven[:, None]
+        self._same += 1
+        self._same *= same
+        np.copyto(self._torque, torque, where=~same)
+        frozen = (self._same >= self._frozen_ticks) & (np.abs(torque - self._torque) > self._least_torque)
+        self._last[:] = new
+        wrong = contradicts | frozen.any(axis=0)
+        if not np.count_nonzero(wrong):
+            return None
+        if not self.problem:
+            sim, joint = np.argwhere(wrong)[0]
+            self.problem = self._explain(self._names[joint], bool(contradicts[sim, joint]))
+        return np.asarray(wrong.any(axis=1))
+
+    def _explain(self, name: str, contradicts: bool) -> str:
+        if contradicts:
+            return (
+                f"{name} reads a speed that its positions contradict: no measurement. Check its encoder, and the unit, "
+                "the sign and the filter of its speed in the plant"
+            )
+        return f"{name} reads the same for {_FROZEN_S:g} s while its torque changes: no measurement. Check its encoder"
+
+
 class ReadingCheck:
     """Finds readings of n robots that are no measurements of the present.
 
@@ -91,7 +161,10 @@ class ReadingCheck:
         period = NANOSECONDS // control_hz
         self.oldest_ns, self.ahead_ns = _SLACK_PERIODS * period, period
         self.problem = self.silence = ""
+        self._motion: MotionCheck | None = None
         if isinstance(body, Arm):
+            if body.actuation == "torque":
+                self._motion = MotionCheck(body, n, control_hz)
             self._names: tuple[str, ...] = (*body.chain.joints, "gripper")
             speed = np.array([*body.limits.velocity[:-1], np.inf])
         elif isinstance(body, MobileBase):
@@ -116,6 +189,9 @@ class ReadingCheck:
         """Accept the next positions of some robots, whatever they are."""
         self._near[ids] = np.nan
         self.problem = self.silence = ""
+        if self._motion is not None:
+            self._motion.forget(ids)
+            self._motion.problem = ""
 
     def wrong_positions(self, reading: PlantReading, now_ns: int) -> Mask | None:
         """Return the robots whose positions are not finite or changed too fast, shape (n,), until the next call.
@@ -129,6 +205,19 @@ class ReadingCheck:
             sim, joint = (int(index) for index in np.argwhere(self._beyond)[0])
             self.problem = self._explain(joint, float(self._beyond[sim, joint]), int(self._elapsed[sim]))
         return self._wrong
+
+    def wrong_motions(self, reading: PlantReading, actuators: Array, mode: NDArray[np.int8]) -> Mask | None:
+        """Return the arms with torque motors whose readings contradict each other, shape (n,); None if there are none.
+
+        Args:
+            actuators: what was written last, shape (n, actuators).
+            mode: the `Mode` of each arm, shape (n,).
+        """
+        if self._motion is None:
+            return None
+        wrong = self._motion.find(reading, actuators[:, :-1], mode)
+        self.problem = self.problem or self._motion.problem
+        return wrong
 
     def _explain(self, joint: int, way: float, elapsed_ns: int) -> str:
         turns = round(way / _TURN)

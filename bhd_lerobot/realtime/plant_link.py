@@ -62,9 +62,10 @@ class PlantShape:
 
         - ``number``: counts from 1; ``stamp_ns``: when it was written, monotonic.
         - ``acknowledged``: up to which of its own stops the plant may be driven again.
+        - ``mode``: the `Mode` that the robot is in.
         - ``actuators``: wheel speeds [rad/s], or joint positions [rad] or torques [N m] and the opening [m].
         """
-        numbers = [(name, np.int64) for name in ("number", "stamp_ns", "acknowledged")]
+        numbers = [(name, np.int64) for name in ("number", "stamp_ns", "acknowledged", "mode")]
         return np.dtype([*numbers, ("actuators", np.float64, (1, self.joints))])
 
     @property
@@ -182,6 +183,10 @@ class RemotePlant(Plant):
             out.sensors[:], out.sensors_ns[0] = state["sensors"], state["sensors_ns"]
         out.safety[:] = SafetyStatus.STOPPED if self.has_stopped else SafetyStatus.NORMAL
 
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Send the mode, shape (1,), with the next commands."""
+        self._record["mode"] = mode[0]
+
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Send actuator commands, shape (1, joints)."""
         record = self._record
@@ -204,6 +209,7 @@ class CommandGuard:
         number: number of the newest command.
         stamp_ns: when that was written [ns].
         actuators: the commands in force, shape (1, joints).
+        mode: the robot's `Mode` when they were written, shape (1,).
 
     Args:
         link: the rings.
@@ -217,6 +223,7 @@ class CommandGuard:
         self.phase = PlantPhase.WAITING
         self.stops = self.stopped_ns = self.number = self.stamp_ns = 0
         self.actuators: NDArray[np.float64] = wire.written  # the same array
+        self.mode = np.zeros(1, np.int8)
         self._begun = self._acknowledged = self._seen = self._taken_ns = 0
         self._checked_ns: int | None = None
         self._is_safe = True
@@ -269,4 +276,5 @@ class CommandGuard:
             ticks = _START_TICKS
         self.number, self.stamp_ns = int(command["number"]), int(command["stamp_ns"])
         self._acknowledged, self._taken_ns = int(command["acknowledged"]), now_ns
+        self.mode[0] = command["mode"]
         self._is_safe = self._wire.check(command["actuators"], position, ticks) is None

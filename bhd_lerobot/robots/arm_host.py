@@ -97,7 +97,7 @@ class ArmHost(Host):
         ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":
-            self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks)
+            self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks, config.max_force)
         else:
             self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
             if not config.held_clearance:

@@ -44,6 +44,10 @@ class LatePlant(Plant):
         """Write the newest joint readings into `out`."""
         self._plant.read(out)
 
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Pass on the modes at once."""
+        self._plant.set_mode(mode)
+
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the actuator commands, shape (n, actuators)."""
         if not self._late:

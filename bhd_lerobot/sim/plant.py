@@ -19,7 +19,10 @@ class JointReading(Protocol):
     has_effort: bool
 
 
+MODES_WITH_MOTION = (2, 3, 4)  # `Mode.HOLD`, `TRACKING`, `STOPPING` of the cerebellum
 _MOST_VIEWS = 8  # readings that are remembered
+_CLOSING_S = 1.0  # [s] for which a brake only damps: what was pressed springs back
+_CREEP = 0.001  # [rad/s] a joint that slips slower than this feels less than the slip torque
 _Array = NDArray[np.float64]
 _Views = tuple[_Array, _Array, _Array, list[tuple[_Array, _Array, _Array]]]
 
@@ -57,6 +60,7 @@ class SimulatedPlant:
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
+        self._brakes = _Brakes(world, body) if isinstance(body, Arm) and body.brake_damping else None
         # The views into the readings that are used, with the readings, which must live as long as their numbers count.
         self._views: dict[int, tuple[JointReading, _Views]] = {}
 
@@ -91,6 +95,8 @@ class SimulatedPlant:
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""
         self._ctrl[:] = ctrl
+        if self._brakes is not None:
+            self._brakes.run()
 
     def open(self) -> None:
         """Connect to nothing."""
@@ -99,7 +105,9 @@ class SimulatedPlant:
         """Switch nothing on."""
 
     def set_mode(self, mode: NDArray[np.int8]) -> None:
-        """Take the robots' modes, shape (n,): servos have none."""
+        """Take the robots' modes, shape (n,): brakes are open in those with motion."""
+        if self._brakes is not None:
+            self._brakes.close(~np.isin(mode, MODES_WITH_MOTION))
 
     def recover(self) -> bool:
         """Return that no robot has moved by itself."""
@@ -107,3 +115,28 @@ class SimulatedPlant:
 
     def close(self) -> None:
         """Disconnect from nothing."""
+
+
+class _Brakes:
+    """The brakes of n arms: dampers that work without any sensor's help, and after a while also friction."""
+
+    def __init__(self, world: World, arm: Arm) -> None:
+        brakes = [world.model.actuator(f"{joint}_brake").id for joint in arm.chain.joints]
+        self._ctrl = world.ctrl[:, brakes[0] : brakes[-1] + 1]
+        self._velocity = world.qvel[:, world.joint_slice(arm.chain.joints)[1]]
+        self._friction = np.asarray(arm.brake_slip) / np.asarray(arm.brake_damping)  # [rad/s]
+        self._closed, self._ticks = np.zeros(world.n, np.bool_), np.zeros(world.n, np.int64)
+        self._closing_ticks = round(_CLOSING_S * arm.control_hz)
+
+    def close(self, mask: NDArray[np.bool_]) -> None:
+        """Close the brakes in `mask`, shape (n,), and open the others."""
+        self._ticks[~(mask & self._closed)] = 0
+        self._closed[:], self._ctrl[:] = mask, mask[:, None]
+
+    def run(self) -> None:
+        """Advance by one tick."""
+        self._ticks += self._closed
+        held = self._ticks > self._closing_ticks
+        if held.any():
+            friction = self._friction / np.maximum(np.abs(self._velocity), _CREEP)
+            np.copyto(self._ctrl, np.maximum(friction, 1.0), where=held[:, None])

@@ -65,6 +65,15 @@ def _add_servos(spec: mujoco.MjSpec, arm: Arm) -> None:
             actuator.set_to_position(kp=stiffness, kv=damping)
         else:
             actuator.set_to_motor()
+    for joint, damping, effort in zip(arm.chain.joints, arm.brake_damping, arm.limits.effort[:-1], strict=False):
+        brake = spec.add_actuator(
+            name=f"{joint}_brake",
+            target=joint,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-effort, effort],
+            ctrlrange=[0.0, 1e6],
+        )
+        brake.set_to_damper(kv=damping)
     # The robot's own controller carries its own weight, with torque that counts against the limits.
     for body in spec.bodies:
         if positions and body.name not in ("world", arm.root):

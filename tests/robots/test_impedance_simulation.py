@@ -112,7 +112,7 @@ def test_an_emergency_stop_in_contact_presses_no_more_and_stays() -> None:
     assert rig.log["force"][-1][0] == 0
 
 
-def test_an_emergency_stop_in_motion_ends_where_it_was_pressed() -> None:
+def test_an_emergency_stop_in_motion_ends_near_to_where_it_was_pressed() -> None:
     rig = Rig()
     rig.move((0, -0.15, 0), 0.25)
     pressed = rig.log["tool"][-1]
@@ -122,7 +122,7 @@ def test_an_emergency_stop_in_motion_ends_where_it_was_pressed() -> None:
     rig.wait(2.0)
     away = np.linalg.norm(rig.logged("tool", -1000) - pressed, axis=1)
     assert away.max() < 0.02
-    assert away[-1] < 1e-3
+    assert np.ptp(away[-500:]) < 1e-5  # its brakes hold it where it came to rest
     assert rig.bridge.reset().accepted.all()
 
 

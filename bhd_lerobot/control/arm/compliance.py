@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 # from the 80 Hz at which a damped loop with one tick of delay starts to ring.
 MAX_STIFFNESS = 5000.0  # [N/m]
 MAX_TURN_STIFFNESS = 300.0  # [N m/rad]
+MIN_RATIO = 0.5  # a tool that is damped less swings back and forth against what it touches
+MAX_FORCE = 120.0  # [N] below what ISO/TS 15066 permits on a hand that is clamped, 140 N
+MAX_MOMENT = 20.0  # [N m] below what the wrists have
 # [rad/s] Where there is no spring there is no natural frequency to damp: damping is that of a spring of this one.
 _LEAST_FREQUENCY = 2.0
 
@@ -23,10 +26,13 @@ class Compliance:
 
     Attributes:
         stiffness: [N/m, N m/rad], shape (6, 6), symmetric without negative eigenvalues; or its diagonal, shape (6,).
-        damping_ratio: 1 for critical damping of the inertia that the tool has in its posture.
+        damping_ratio: 1 for critical damping of the inertia that the tool has in its posture; 0.5 to 2.
         damping: a damping matrix to use in place of the ratio [N s/m, N m s/rad], shape (6, 6) or (6,); None for none.
-        max_force: largest force of spring and feed-forward together [N].
-        max_moment: largest moment of both together [N m].
+        max_force: largest force of spring and feed-forward together [N], at most 120.
+        max_moment: largest moment of both together [N m], at most 20.
+
+    Raises:
+        ConfigError: a value is out of its range, or a matrix is not symmetric or has negative eigenvalues.
     """
 
     stiffness: ArrayLike = (500.0, 500.0, 500.0, 40.0, 40.0, 40.0)
@@ -41,11 +47,11 @@ class Compliance:
             value = float(np.linalg.eigvalsh(stiffness[block, block])[-1])
             if value > largest * (1 + 1e-9):
                 raise ConfigError(f"The stiffness is {value:.6g} {unit}; at most {largest:.6g} {unit} is allowed.")
-        if not 0.1 <= self.damping_ratio <= 2.0:
-            raise ConfigError(f"damping_ratio is {self.damping_ratio}; it must be between 0.1 and 2.")
-        for name in ("max_force", "max_moment"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
+        if not MIN_RATIO <= self.damping_ratio <= 2.0:
+            raise ConfigError(f"damping_ratio is {self.damping_ratio}; it must be between {MIN_RATIO:g} and 2.")
+        for name, most, unit in (("max_force", MAX_FORCE, "N"), ("max_moment", MAX_MOMENT, "N m")):
+            if not 0.0 < getattr(self, name) <= most:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be above 0 and at most {most:g} {unit}.")
         object.__setattr__(self, "stiffness", stiffness)
         if self.damping is not None:
             object.__setattr__(self, "damping", _matrix("damping", self.damping))

@@ -86,6 +86,23 @@ class Equilibrium:
         self.speed[ids] = 0.0
         self.active[ids] = False
 
+    def keep_near(self, tool: Array, share: Array) -> None:
+        """Bring the equilibrium nearer to the tool, and stop it there: what is in the tool's way stops both.
+
+        Args:
+            tool: the tool's pose in the base frame, shape (n, 4, 4).
+            share: of the way between them that remains, of the position and of the turn, shape (n, 2).
+        """
+        far, twisted = share[:, 0] < 1.0, share[:, 1] < 1.0
+        if far.any():
+            place = tool[far, :3, 3]
+            self.position[far] = place + (self.position[far] - place) * share[far, :1]
+            self.speed[far, :3] = 0.0
+        if twisted.any():
+            turn = rotation_vectors(self.rotation[twisted] @ np.swapaxes(tool[twisted, :3, :3], 1, 2))
+            self.rotation[twisted] = turned(tool[twisted, :3, :3], turn * share[twisted, 1:])
+            self.speed[twisted, 3:] = 0.0
+
     def place_opening(self, ids: NDArray[np.intp], opening: Array) -> None:
         """Put the opening's equilibrium somewhere [m], at rest; `opening` has shape (len(ids),)."""
         self.opening[ids, 0], self._opening_speed[ids] = opening, 0.0

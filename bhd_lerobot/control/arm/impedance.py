@@ -5,14 +5,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
-from bhd_lerobot.control.arm.equilibrium import Equilibrium
+from bhd_lerobot.control.arm.equilibrium import SPEED, TURN_SPEED, Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, DynamicsTerms, product
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.guard import FULL_TORQUE_S
-from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
@@ -23,6 +23,13 @@ _JOINT_DAMPING = 0.01  # [s/rad] share of a joint's largest torque that brakes i
 _FORCE_RATE, _MOMENT_RATE = 100.0, 20.0  # [N/s, N m/s] of the feed-forward wrench
 _MOBILITY_DAMPING = 1e-3  # [1/kg, 1/(kg m^2)] beside about 0.1 1/kg: no direction weighs more than 1000 kg
 _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
+_STIFFENING, _TURN_STIFFENING = 5000.0, 300.0  # [N/m/s, N m/rad/s] a spring that stiffens gains energy
+# From the first speed on the spring pushes less, from the second on no more, at the third the arm is stopped: shares of
+# the equilibrium's largest for the tool, of their own for joints.
+_TOOL_SPEED, _JOINT_SPEED = (1.0, 1.4, 2.0), (0.7, 1.0, 1.1)
+_MOST_EFFORT = 0.8  # share of a joint's largest torque that the surroundings may put on it
+_LIGHT_N = 20.0  # [N] what presses less is no obstacle to an activation
+_ROOM_RAD = 0.1  # so far from where a brake closed does the torque that carries the arm's weight follow the readings
 _NORM_RANGE = (0.5, 2.0)  # a quaternion with a norm beyond this is no orientation with a rounding error
 
 
@@ -50,6 +57,7 @@ class ImpedanceController(Controller):
         arm: the arm; its actuation is ``"torque"``.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
+        max_force: a larger force between the tool and its surroundings is a protective stop [N].
 
     Raises:
         ConfigError: the arm does not take torques.
@@ -57,10 +65,12 @@ class ImpedanceController(Controller):
 
     width = WIDTH
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int, max_force: float = 150.0) -> None:
         if arm.actuation != "torque":
             raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
-        self.arm, self.n = arm, n
+        if not arm.brake_damping:
+            raise ConfigError(f"The arm {arm.name!r} has no brakes (Arm.brake_damping); impedance needs them.")
+        self.arm, self.n, self._max_force = arm, n, max_force
         self.joints = len(arm.limits.names)
         self.dynamics = ArmDynamics(arm)
         dof = self.dynamics.dof
@@ -73,17 +83,23 @@ class ImpedanceController(Controller):
         self.wrench: Array = np.zeros((n, 6))
         self._wanted_wrench = np.zeros((n, 6))
         self._wrench_step = np.repeat([_FORCE_RATE, _MOMENT_RATE], 3) / control_hz
-        self._stiffness, self._fixed_damping = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+        self._stiffness, self._wanted_stiffness, self._fixed_damping = (np.zeros((n, 6, 6)) for _ in range(3))
         self._ratio, self._is_fixed = np.ones(n), np.zeros(n, np.bool_)
         self._largest = np.zeros((n, 2))
         self._effort = np.asarray(arm.limits.effort[:dof])
         self._effort_step = self._effort / (FULL_TORQUE_S * control_hz)
+        most_stiffening = np.repeat([_STIFFENING, _TURN_STIFFENING], 3)
+        self._stiffening = np.sqrt(np.outer(most_stiffening, most_stiffening)) / control_hz
+        tool_speed = np.outer([SPEED, TURN_SPEED], _TOOL_SPEED)
+        joint_speed = np.outer(arm.limits.velocity[:dof], _JOINT_SPEED)
+        self._tool_speed, self._joint_speed = tool_speed, joint_speed  # shape (2, 3), (dof, 3)
         # An opening and positions beyond what the arm can ever reach; nearer ones are for the spring to find out.
         reach = float(np.abs((*arm.chain.a, *arm.chain.d, *arm.chain.tool)).sum())
         self._lower = np.array([*(-reach,) * 3, arm.limits.lower[-1]])
         self._upper = np.array([*(reach,) * 3, arm.limits.upper[-1]])
-        self._capture = np.ones(n, np.bool_)  # the equilibrium is to be put where the tool is
-        self._held = np.zeros(n, np.bool_)  # stopped hard
+        self._braked = np.ones(n, np.bool_)  # in a mode without motion
+        self._carried = np.zeros((n, dof))  # the posture whose weight is carried then [rad]
+        self._position = np.zeros((n, dof))
         self._still = np.ones(n, np.bool_)
         self.limits = self.equilibrium.limits  # the same array
         self.set_compliance(Compliance())
@@ -92,14 +108,14 @@ class ImpedanceController(Controller):
     # --- what a brain may set beside commands ------------------------------------------------------------------------
 
     def set_compliance(self, compliance: Compliance, mask: NDArray[np.bool_] | None = None) -> None:
-        """Change stiffness and damping.
+        """Change stiffness and damping; a stiffness changes by at most 5000 N/m and 300 N m/rad in a second.
 
         Args:
             compliance: the new ones.
             mask: the arms, shape (n,); all if None.
         """
         to = slice(None) if mask is None else mask
-        self._stiffness[to], self._ratio[to] = compliance.stiffness, compliance.damping_ratio
+        self._wanted_stiffness[to], self._ratio[to] = compliance.stiffness, compliance.damping_ratio
         self._is_fixed[to] = compliance.damping is not None
         self._fixed_damping[to] = 0.0 if compliance.damping is None else compliance.damping
         self._largest[to] = compliance.max_force, compliance.max_moment
@@ -144,15 +160,17 @@ class ImpedanceController(Controller):
         clipped = np.minimum(np.maximum(places, self._lower), self._upper)
         self.limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
         self.equilibrium.set_setpoint(clipped[:, :3], rotation_matrices(setpoint[:, 3:7]), clipped[:, 3:], mask)
-        self._held &= ~mask
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
-        """Brake the equilibrium to rest and stay there; after a hard stop stay where the tool is, and press nothing."""
+        """Brake the equilibrium to rest and stay there; in a mode without motion carry the weight, and no more."""
         self.equilibrium.drop(mask)
         self._wanted_wrench[mask] = 0.0
-        if cause in (Mode.ESTOP, Mode.FAULT):
-            self._capture |= mask & ~self._held
-            self._held |= mask
+        closed = cause not in (Mode.HOLD, Mode.STOPPING)
+        new = mask & (self._braked != closed)
+        if new.any():
+            self._braked[new] = closed
+            self._carried[new] = self._position[new]
+            self._put(np.flatnonzero(new))
 
     def go_back(self, mask: NDArray[np.bool_], actuators: Array, rate: Array) -> None:
         """Put the equilibrium where the tool is, and continue from the torques that the motors have."""
@@ -160,21 +178,32 @@ class ImpedanceController(Controller):
         self.actuators[ids] = actuators[ids]
         self.equilibrium.place_opening(ids, actuators[ids, -1])
         self.wrench[ids] = 0.0
-        self._capture |= mask
+        self._put(ids)
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
-        dof = self.dynamics.dof
+        dof, braked = self.dynamics.dof, self._braked[:, None]
         position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
+        self._position[:] = position
         terms = self.dynamics.terms(position, velocity)
-        self.contact.update(terms, velocity, self.actuators[:, :dof])
-        if self._capture.any():
-            self._put(np.flatnonzero(self._capture), terms.tool)
+        before = self.actuators[:, :dof]
+        # What a brake gives is known to the sensors of the efforts alone.
+        applied = np.where(braked, reading.effort[:, :dof], before) if reading.has_effort else before
+        self.contact.update(terms, velocity, applied)
+        self.protective_stop[:] = 0
+        self._supervise(velocity, product(terms.jacobian, velocity))
+        change = self._wanted_stiffness - self._stiffness
+        if change.any():
+            most = np.abs(change / self._stiffening).max(axis=(1, 2), keepdims=True)
+            self._stiffness += change / np.maximum(most, 1.0)
         self.equilibrium.run()
         self._advance_wrench()
-        self._publish_command()
         torque = self._torque(terms, velocity)
-        before = self.actuators[:, :dof]
+        if self._braked.any():
+            near = np.minimum(np.maximum(position, self._carried - _ROOM_RAD), self._carried + _ROOM_RAD)
+            still = np.zeros_like(near)
+            np.copyto(torque, self.dynamics.torque(near, still, still), where=braked)
+        self._publish_command()
         given = np.minimum(np.maximum(torque, before - self._effort_step), before + self._effort_step)
         given = np.minimum(np.maximum(given, -self._effort), self._effort)
         self.limits[(given != torque).any(axis=1)] |= int(Limit.EFFORT)
@@ -183,15 +212,16 @@ class ImpedanceController(Controller):
         self._still[:] = (np.abs(velocity) < _STILL).all(axis=1)
 
     def at_rest(self) -> NDArray[np.bool_]:
-        """Return whether the equilibrium is at rest and nothing is pushed, and after a hard stop whether the arm is."""
-        rest = self.equilibrium.at_rest() & ~self.wrench.any(axis=1) & ~(self._capture & self._held)
-        return np.asarray(rest & (self._still | ~self._held))
+        """Return whether the equilibrium is at rest and pushes nothing, and with closed brakes whether the arm is."""
+        rest = self.equilibrium.at_rest() & ~self.wrench.any(axis=1)
+        return np.asarray(rest & (self._still | ~self._braked))
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from where tool and fingers are, with the torque that the posture needs."""
         dof = self.dynamics.dof
         terms = self.dynamics.terms(reading.position[:, :dof], reading.velocity[:, :dof])
-        self._put(ids, terms.tool)
+        self._carried[ids] = self._position[ids] = reading.position[ids, :dof]
+        self._put(ids)
         lower, upper = self._lower[3], self._upper[3]
         self.equilibrium.place_opening(ids, np.minimum(np.maximum(reading.position[ids, dof], lower), upper))
         self.actuators[ids, :dof] = np.minimum(np.maximum(terms.gravity, -self._effort), self._effort)[ids]
@@ -202,14 +232,21 @@ class ImpedanceController(Controller):
         """Forget everything about arms that were put somewhere else; until they are configured they stay there."""
         home = np.asarray(self.arm.home)
         terms = self.dynamics.terms(home[None, :-1], np.zeros((1, self.dynamics.dof)))
-        self._put(ids, np.repeat(terms.tool, self.n, axis=0))
         self.equilibrium.place_opening(ids, np.full(len(ids), home[-1]))
         self.actuators[ids] = (*terms.gravity[0], home[-1])
         self.contact.restart(ids)
         self.wrench[ids] = self._wanted_wrench[ids] = 0.0
-        self._capture[ids] = True
-        self._held[ids], self._still[ids], self.limits[ids] = False, True, 0
+        self._stiffness[ids] = self._wanted_stiffness[ids]
+        self._carried[ids] = self._position[ids] = home[:-1]
+        self._put(ids)
+        self._braked[ids] = self._still[ids] = True
+        self.protective_stop[ids] = self.limits[ids] = 0
         self._publish_command()
+
+    def pressed(self) -> Array:
+        """Return the force between each tool and its surroundings [N], shape (n,); 0 if it is small."""
+        force = np.linalg.norm(self.contact.wrench[:, :3], axis=1)
+        return np.where(self._braked & self._still & (force > _LIGHT_N), force, 0.0)
 
     # --- reports -----------------------------------------------------------------------------------------------------
 
@@ -228,36 +265,61 @@ class ImpedanceController(Controller):
 
     # --- inside a tick -----------------------------------------------------------------------------------------------
 
+    def _supervise(self, velocity: Array, tool_speed: Array) -> None:
+        """Begin a protective stop of arms that are too fast, or in too hard a contact."""
+        moves = ~self._braked
+        fast = (np.abs(velocity) > self._joint_speed[:, 2]).any(axis=1)
+        hard = np.linalg.norm(self.contact.wrench[:, :3], axis=1) > self._max_force
+        hard |= (np.abs(self.contact.torque) > _MOST_EFFORT * self._effort).any(axis=1)
+        for part, most in zip((tool_speed[:, :3], tool_speed[:, 3:]), self._tool_speed[:, 2], strict=True):
+            fast |= np.linalg.norm(part, axis=1) > most
+        self.protective_stop |= np.where(fast & moves, int(Watchdog.SPEED), 0)
+        self.protective_stop |= np.where(hard & moves, int(Watchdog.FORCE), 0)
+
     def _torque(self, terms: DynamicsTerms, velocity: Array) -> Array:
         """Return the torques that are wanted [N m], shape (n, dof)."""
         error = np.empty((self.n, 6))
         error[:, :3] = self.equilibrium.position - terms.tool[:, :3, 3]
         error[:, 3:] = rotation_vectors(self.equilibrium.rotation @ np.swapaxes(terms.tool[:, :3, :3], 1, 2))
-        push = product(self._stiffness, error) + self.wrench
-        for number, part in enumerate((push[:, :3], push[:, 3:])):
-            size, largest = np.linalg.norm(part, axis=1), self._largest[:, number]
-            self.limits[size > largest] |= int(Limit.EFFORT)
-            np.multiply(part, (largest / np.maximum(size, largest))[:, None], out=part)
+        push, speed = product(self._stiffness, error), product(terms.jacobian, velocity)
+        # The damper's pull by the equilibrium's speed ends where the spring's is the largest.
+        lead = self.equilibrium.speed.copy()
+        share = np.ones((self.n, 2))
+        for number, part in enumerate((slice(3), slice(3, 6))):
+            size, largest = np.linalg.norm(push[:, part], axis=1), self._largest[:, number]
+            np.minimum(largest / np.maximum(size, 1e-12), 1.0, out=share[:, number])
+            push[:, part] *= share[:, number, None]
+            lead[:, part] *= np.clip(2.0 * (1.0 - size / largest), 0.0, 1.0)[:, None]
+            push[:, part] += self.wrench[:, part]
+            size = np.linalg.norm(push[:, part], axis=1)
+            self.limits[(size > largest) | (share[:, number] < 1.0)] |= int(Limit.EFFORT)
+            first, last, _ = self._tool_speed[number]
+            along = (push[:, part] * speed[:, part]).sum(axis=1) / np.maximum(size, 1e-12)
+            within = np.clip((last - along) / (last - first), 0.0, 1.0) * largest / np.maximum(size, largest)
+            push[:, part] *= within[:, None]
+        self.equilibrium.keep_near(terms.tool, share)
         damping = self._fixed_damping.copy()
         if not self._is_fixed.all():
             designed = critical_damping(terms.mobility(_MOBILITY_DAMPING), self._stiffness, self._ratio)
             np.copyto(damping, designed, where=~self._is_fixed[:, None, None])
-        slip = self.equilibrium.speed - product(terms.jacobian, velocity)
-        push += product(damping, slip)
+        push += product(damping, lead - speed)
+        torque = product(np.swapaxes(terms.jacobian, 1, 2), push)
+        first, last = self._joint_speed[:, 0], self._joint_speed[:, 1]
+        torque *= np.clip((last - velocity * np.sign(torque)) / (last - first), 0.0, 1.0).min(axis=1, keepdims=True)
         own = product(terms.coriolis, velocity) + terms.gravity
-        return product(np.swapaxes(terms.jacobian, 1, 2), push) + own - _JOINT_DAMPING * self._effort * velocity
+        return torque + own - _JOINT_DAMPING * self._effort * velocity
 
     def _advance_wrench(self) -> None:
         """Move the feed-forward wrench towards what is wanted; none without setpoints, none at once if held."""
         wanted = np.where(self.equilibrium.active[:, None], self._wanted_wrench, 0.0)
         step = np.minimum(np.maximum(wanted - self.wrench, -self._wrench_step), self._wrench_step)
         self.wrench += step
-        self.wrench[self._held] = 0.0
+        self.wrench[self._braked] = 0.0
 
-    def _put(self, ids: NDArray[np.intp], tool: Array) -> None:
-        """Put the equilibrium of some arms where the tool is; `tool` has shape (n, 4, 4)."""
-        self.equilibrium.place(ids, tool[ids])
-        self._capture[ids] = False
+    def _put(self, ids: NDArray[np.intp]) -> None:
+        """Put the equilibrium of some arms where the tool is."""
+        position = self._position[ids]
+        self.equilibrium.place(ids, self.dynamics.terms(position, np.zeros_like(position)).tool)
 
     def _publish_command(self) -> None:
         equilibrium = self.equilibrium

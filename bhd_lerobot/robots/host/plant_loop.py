@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import MOVING
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantPhase
 from bhd_lerobot.robots.host.plant_stop import PlantStop
 
+_OWN_STOP = np.array([Mode.FAULT], np.int8)
 _ENDING_S = 4.0  # so long at the most a robot may take to come to rest before the process ends
 
 
@@ -44,6 +45,9 @@ class PlantWorld(Protocol):
 
     def write(self, actuators: NDArray[np.float64]) -> None:
         """Take actuator commands, shape (1, joints)."""
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Take the mode of the robot, shape (1,)."""
 
     def advance(self) -> None:
         """Let one tick go by."""
@@ -121,6 +125,7 @@ class PlantLoop:
         if guard.stops != stops:
             self.stop.begin(self._actuators)
         if phase != PlantPhase.WAITING:
+            world.set_mode(guard.mode if phase == PlantPhase.DRIVEN else _OWN_STOP)
             for _ in range(1 + min(slot.skipped, self._most_catch_up)):
                 if phase == PlantPhase.DRIVEN:
                     actuators: NDArray[np.float64] = guard.actuators

@@ -63,6 +63,10 @@ class SensedWorld:
         """Take actuator commands, shape (1, joints)."""
         self._plant.write(actuators)
 
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Take the mode of the robot, shape (1,)."""
+        self._plant.set_mode(mode)
+
     def advance(self) -> None:
         """Let one tick go by."""
         self.simulation.advance()

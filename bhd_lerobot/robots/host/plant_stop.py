@@ -4,13 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.control.geometry.dynamics import ArmDynamics, product
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.plant import PlantReading
 
 Array = NDArray[np.float64]
 
 _SLOW = 0.2  # [rad/s] a joint slower than this is held where it is
-_HOLD_RATE = 20.0  # [rad/s] of the critically damped spring that holds an arm with torque motors
 
 
 class WheelStop:
@@ -64,28 +63,23 @@ class ServoStop:
 
 
 class TorqueStop:
-    """Torque motors that carry the arm's weight, brake it, and then hold it where it is."""
+    """Torque motors that carry the arm's weight; its brakes stop it."""
 
     def __init__(self, arm: Arm) -> None:
-        self._where = ServoStop(arm)
         self._dynamics = ArmDynamics(arm)
         self._effort = np.asarray(arm.limits.effort[:-1])
-        self._actuators = self._where.hold.copy()
+        self._actuators = np.asarray(arm.home)[None].copy()
 
     def begin(self, actuators: Array) -> None:
         """Start a stop."""
-        self._where.begin(actuators)
+        self._actuators[:] = actuators
 
     def command(self, reading: PlantReading) -> Array:
         """Return torques, and the opening."""
-        hold, dof = self._where.command(reading), self._dynamics.dof
-        position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
-        terms = self._dynamics.terms(position, velocity)
-        # Every joint brakes alike, whatever hangs on it: the damping is the inertia's, and stable at any rate of ours.
-        wanted = _HOLD_RATE**2 * (hold[:, :dof] - position) - 2 * _HOLD_RATE * velocity
-        torque = product(terms.mass, wanted) + product(terms.coriolis, velocity) + terms.gravity
-        np.minimum(np.maximum(torque, -self._effort), self._effort, out=self._actuators[:, :dof])
-        self._actuators[:, dof:] = hold[:, dof:]
+        position = reading.position[:, : self._dynamics.dof]
+        still = np.zeros_like(position)
+        weight = self._dynamics.torque(position, still, still)
+        self._actuators[:, :-1] = np.minimum(np.maximum(weight, -self._effort), self._effort)
         return self._actuators
 
 
