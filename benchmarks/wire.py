@@ -7,7 +7,9 @@ controller's own reference are overwritten at random. Every write to the plant i
 finite, in the actuator's range, and changes from tick to tick that the body permits. The second table is about readings
 that are no measurements: false, drifting, wrapped, frozen, counting twice, from the future, of robots that move; with
 the largest distance of a joint or a wheel from where the stop found it, and how many times as fast joints and tool are
-after the stop, by physics. The third is the share of the guard, the last
+after the stop, by physics. The third attacks impedance control: with such readings, late ones and speeds of the wrong
+sign, walls that vanish, stiffnesses that change with every frame; with the largest speeds and forces. The last is the
+share of the guard, the last
 check before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits
 with 3 if anything unsafe was written, or a stop was followed by more motion than it needs.
 """
@@ -25,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from benchmarks._impedance_attacks import ATTACKS, attack
 from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import TableScene
@@ -469,6 +472,36 @@ def main(arguments: list[str] | None = None) -> int:
             numbers = (f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}")
             lies.add_row(space, lie, *numbers, f"{one.moved:.3f} rad", f"{one.faster:.2f}")
     console.print(lies)
+    forced = Table(title="Impedance control")
+    for column in (
+        "attack",
+        "streams",
+        "stopped",
+        "unsafe",
+        "tool",
+        "joint",
+        "motion after the stop",
+        "force",
+        "later",
+    ):
+        forced.add_column(column, justify="left" if column == "attack" else "right")
+    for kind in ATTACKS:
+        arm = make("impedance", options.streams)
+        judge = arm.cerebellum.plant = Judge(arm)
+        effect = attack(arm, kind, options.frames, options.seed)
+        unsafe += judge.unsafe + (not effect.is_safe(kind))
+        forced.add_row(
+            kind,
+            f"{options.streams:,}",
+            f"{100 * effect.stopped:.0f} %",
+            f"{judge.unsafe:,}",
+            f"{effect.speed:.2f} m/s",
+            f"{effect.joint_speed:.2f} rad/s",
+            f"{effect.moved:.3f} rad",
+            f"{effect.force:.0f} N",
+            f"{effect.pressed:.0f} N",
+        )
+    console.print(forced)
     compile_at_once()
     shares = Table(title="The share of the checks in a tick, physics and sensors included")
     for column in ("robot", "n", "check", "tick", "share"):

@@ -64,7 +64,7 @@ _MOVING = ("upper_arm", "elbow", "forearm", "wrist_1", "wrist_2", "wrist_3", *_T
 
 _PAYLOAD = 5.0  # [kg]
 _BRAKING_SPEED = 0.35  # [rad/s] the speed at which a brake gives a joint's largest torque
-_SLIP = 0.2  # share of a joint's largest torque with which its brake slips
+_SLIP = 0.1  # share of a joint's largest torque with which its brake slips
 
 
 def ur5(

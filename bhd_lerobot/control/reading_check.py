@@ -84,7 +84,7 @@ class MotionCheck:
         self.problem = ""
         self._names, dof = arm.chain.joints, len(arm.chain.joints)
         self._period_s = 1.0 / control_hz
-        self._last, self._since_ns = np.full((2, n, dof), np.nan), np.full(n, -1, np.int64)
+        self._last, self._since_ns = np.full((2, n, dof), np.nan), np.zeros(n, np.int64)
         self._same, self._torque = np.zeros((2, n, dof), np.int64), np.zeros((2, n, dof))
         self._off, self._way = np.zeros((2, n, dof))
         self._frozen_ticks = round(_FROZEN_S * control_hz)
@@ -104,11 +104,12 @@ class MotionCheck:
         """
         driven = (mode >= Mode.HOLD) & (mode <= Mode.STOPPING)  # elsewhere the brakes are closed
         new = reading.values[:2, :, : len(self._names)]
-        elapsed = np.full(len(driven), self._period_s)
+        elapsed: Array = np.full(len(driven), self._period_s)
         if reading.stamp_ns is not None:
-            elapsed = np.where(self._since_ns < 0, 0.0, (reading.stamp_ns - self._since_ns) / NANOSECONDS)
+            elapsed = np.maximum((reading.stamp_ns - self._since_ns) / NANOSECONDS, 0.0)
             self._since_ns[:] = reading.stamp_ns
-        before, fresh = self._last, np.isnan(self._last).any(axis=(0, 2))
+        before = self._last
+        fresh = np.isnan(before).any(axis=(0, 2)) | (elapsed > _MEMORY_S)
         step = np.where(fresh[:, None], 0.0, new[0] - before[0])
         turned = np.where(fresh[:, None], 0.0, 0.5 * (new[1] + before[1]) * elapsed[:, None])
         kept = np.maximum(1.0 - elapsed / _MEMORY_S, 0.0)[:, None]

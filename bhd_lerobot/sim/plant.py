@@ -139,4 +139,4 @@ class _Brakes:
         held = self._ticks > self._closing_ticks
         if held.any():
             friction = self._friction / np.maximum(np.abs(self._velocity), _CREEP)
-            np.copyto(self._ctrl, np.maximum(friction, 1.0), where=held[:, None])
+            np.copyto(self._ctrl, 1.0 + friction, where=held[:, None])

@@ -25,5 +25,5 @@ def test_recorded_enum_values_are_stable() -> None:
     }  # fmt: skip
     assert {flag.name: int(flag) for flag in Watchdog} == {
         "COMMAND_AGE": 1, "BLOCKED": 2, "BRAIN": 4, "RECORDER": 8, "PLANT": 16, "MISSES": 32, "GUARD": 64,
-        "FORCE": 128,
+        "FORCE": 128, "SPEED": 256,
     }  # fmt: skip

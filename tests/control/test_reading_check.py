@@ -1,5 +1,8 @@
 """What is taken for a measurement of the present: all that joints can do, and nothing that they cannot."""
 
+from collections.abc import Callable
+from typing import Literal
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +10,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.control.reading_check import ReadingCheck
 
@@ -117,3 +120,58 @@ def test_both_sides_of_an_age_are_checked() -> None:
         "a stamp is 10.000 s ahead of now: of another clock. Stamps are of the monotonic clock of this machine "
         "(time.monotonic_ns)"
     )
+
+
+def moving(check: ReadingCheck, reading: PlantReading, spoil: Callable[[int], None], ticks: int = 300) -> int | None:
+    """Sway an arm with torque motors, torques changing; return the tick in which its reading was refused, or None."""
+    rng = np.random.default_rng(0)
+    phase, mode = rng.uniform(0, 6, 6), np.array([Mode.TRACKING], np.int8)
+    for tick in range(ticks):
+        time_s = tick / HZ
+        reading.position[0, :6] = 0.4 * np.sin(2 * time_s + phase) + rng.normal(0, 1e-4, 6)
+        reading.velocity[0, :6] = 0.8 * np.cos(2 * time_s + phase) + rng.normal(0, 5e-3, 6)
+        if reading.stamp_ns is not None:
+            reading.stamp_ns[0] = tick * PERIOD
+        spoil(tick)
+        torque = np.array([[*np.sin(3 * time_s + phase) * 10.0, 0.0]])
+        if check.wrong_motions(reading, torque, mode) is not None:
+            return tick
+    return None
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_a_noisy_swaying_arm_is_no_contradiction_and_each_lie_about_its_motion_is_one_soon(stamped: bool) -> None:
+    begin = 100
+
+    def run(spoil: Callable[[PlantReading], None], actuation: Literal["position", "torque"] = "torque") -> int | None:
+        reading = PlantReading(1, 7)
+        if stamped:
+            reading.stamp_ns = np.zeros(1, np.int64)
+        check = ReadingCheck(ur5(actuation=actuation), 1, HZ)
+        found = moving(check, reading, lambda tick: spoil(reading) if tick >= begin else None)
+        assert (found is not None) == bool(check.problem)
+        return found
+
+    held = np.full((2, 6), 0.3)
+
+    def wrong_sign(reading: PlantReading) -> None:
+        reading.velocity[:, :6] *= -1.0
+
+    def no_speed(reading: PlantReading) -> None:
+        reading.velocity[:, :6] = 0.0
+
+    def half_speed(reading: PlantReading) -> None:
+        reading.velocity[:, :6] *= 0.5
+
+    def frozen_joint(reading: PlantReading) -> None:
+        reading.values[:2, 0, 2] = held[:, 2] * (1.0, 0.0)
+
+    def frozen_position(reading: PlantReading) -> None:
+        reading.position[0, 4] = held[0, 4]
+
+    assert run(lambda _: None) is None
+    for lie in (wrong_sign, no_speed, half_speed, frozen_joint, frozen_position):
+        found = run(lie)
+        assert found is not None, lie
+        assert begin <= found < begin + 75, lie
+        assert run(lie, "position") is None  # servos damp by themselves

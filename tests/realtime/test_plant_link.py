@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.guard import Guard, WireLimits
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 from tests.control.support import shared_block
@@ -54,6 +55,15 @@ class Rig:
         self.send()
         self.check()
         assert self.check(21) == PlantPhase.STOPPED
+
+
+def test_the_plant_gets_the_mode_with_the_commands() -> None:
+    rig = Rig()
+    for mode in (Mode.TRACKING, Mode.FAULT):
+        rig.remote.set_mode(np.array([mode], np.int8))
+        rig.send()
+        rig.check(1)
+        assert rig.guard.mode.tolist() == [mode]
 
 
 def test_a_plant_waits_until_it_is_commanded() -> None:

@@ -26,8 +26,14 @@ _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
 _STIFFENING, _TURN_STIFFENING = 5000.0, 300.0  # [N/m/s, N m/rad/s] a spring that stiffens gains energy
 # From the first speed on the spring pushes less, from the second on no more, at the third the arm is stopped: shares of
 # the equilibrium's largest for the tool, of their own for joints.
+_FREE_PUSH = (15.0, 3.0)  # [N, N m] what a tool in free motion needs at most
 _TOOL_SPEED, _JOINT_SPEED = (1.0, 1.4, 2.0), (0.7, 1.0, 1.1)
 _MOST_EFFORT = 0.8  # share of a joint's largest torque that the surroundings may put on it
+_GAINED = 0.8  # share of the tool's largest speed that it may gain while torques fall
+# A joint that turns at this speed [rad/s] one way and the other in turns, more often than every so many seconds and the
+# equilibrium, is part of a loop that swings: its readings are late.
+_SWING_SPEED, _SWING_S, _MOST_SWINGS = 0.15, 0.4, 2.0
+_PARTS, _TINY = (slice(3), slice(3, 6)), 1e-12
 _LIGHT_N = 20.0  # [N] what presses less is no obstacle to an activation
 _ROOM_RAD = 0.1  # so far from where a brake closed does the torque that carries the arm's weight follow the readings
 _NORM_RANGE = (0.5, 2.0)  # a quaternion with a norm beyond this is no orientation with a rounding error
@@ -87,7 +93,8 @@ class ImpedanceController(Controller):
         self._ratio, self._is_fixed = np.ones(n), np.zeros(n, np.bool_)
         self._largest = np.zeros((n, 2))
         self._effort = np.asarray(arm.limits.effort[:dof])
-        self._effort_step = self._effort / (FULL_TORQUE_S * control_hz)
+        self._torque_rate = self._effort / FULL_TORQUE_S  # [N m/s]
+        self._effort_step = self._torque_rate / control_hz
         most_stiffening = np.repeat([_STIFFENING, _TURN_STIFFENING], 3)
         self._stiffening = np.sqrt(np.outer(most_stiffening, most_stiffening)) / control_hz
         tool_speed = np.outer([SPEED, TURN_SPEED], _TOOL_SPEED)
@@ -97,6 +104,8 @@ class ImpedanceController(Controller):
         reach = float(np.abs((*arm.chain.a, *arm.chain.d, *arm.chain.tool)).sum())
         self._lower = np.array([*(-reach,) * 3, arm.limits.lower[-1]])
         self._upper = np.array([*(reach,) * 3, arm.limits.upper[-1]])
+        self._swung, self._swings = np.zeros((n, dof + 6)), np.zeros((n, dof))  # last directions, turns of the joints'
+        self._swing_decay = 1.0 / (_SWING_S * control_hz)
         self._braked = np.ones(n, np.bool_)  # in a mode without motion
         self._carried = np.zeros((n, dof))  # the posture whose weight is carried then [rad]
         self._position = np.zeros((n, dof))
@@ -170,6 +179,7 @@ class ImpedanceController(Controller):
         if new.any():
             self._braked[new] = closed
             self._carried[new] = self._position[new]
+            self._swung[new] = self._swings[new] = 0.0
             self._put(np.flatnonzero(new))
 
     def go_back(self, mask: NDArray[np.bool_], actuators: Array, rate: Array) -> None:
@@ -241,6 +251,7 @@ class ImpedanceController(Controller):
         self._put(ids)
         self._braked[ids] = self._still[ids] = True
         self.protective_stop[ids] = self.limits[ids] = 0
+        self._swung[ids] = self._swings[ids] = 0.0
         self._publish_command()
 
     def pressed(self) -> Array:
@@ -271,8 +282,15 @@ class ImpedanceController(Controller):
         fast = (np.abs(velocity) > self._joint_speed[:, 2]).any(axis=1)
         hard = np.linalg.norm(self.contact.wrench[:, :3], axis=1) > self._max_force
         hard |= (np.abs(self.contact.torque) > _MOST_EFFORT * self._effort).any(axis=1)
-        for part, most in zip((tool_speed[:, :3], tool_speed[:, 3:]), self._tool_speed[:, 2], strict=True):
-            fast |= np.linalg.norm(part, axis=1) > most
+        for part, (*_, most) in zip(_PARTS, self._tool_speed, strict=True):
+            fast |= np.linalg.norm(tool_speed[:, part], axis=1) > most
+        motion = np.concatenate([velocity * (np.abs(velocity) > _SWING_SPEED), self.equilibrium.speed], axis=1)
+        direction = np.where(motion == 0.0, self._swung, np.sign(motion))
+        turned, dof = direction * self._swung < 0.0, self.dynamics.dof
+        wanted = self._swing_decay + turned[:, dof:].any(axis=1, keepdims=True)
+        self._swings = np.maximum(self._swings - wanted, 0.0) + turned[:, :dof]
+        self._swung = direction
+        fast |= (self._swings > _MOST_SWINGS).any(axis=1)
         self.protective_stop |= np.where(fast & moves, int(Watchdog.SPEED), 0)
         self.protective_stop |= np.where(hard & moves, int(Watchdog.FORCE), 0)
 
@@ -282,28 +300,36 @@ class ImpedanceController(Controller):
         error[:, :3] = self.equilibrium.position - terms.tool[:, :3, 3]
         error[:, 3:] = rotation_vectors(self.equilibrium.rotation @ np.swapaxes(terms.tool[:, :3, :3], 1, 2))
         push, speed = product(self._stiffness, error), product(terms.jacobian, velocity)
+        mobility, transposed = terms.mobility(_MOBILITY_DAMPING), np.swapaxes(terms.jacobian, 1, 2)
         # The damper's pull by the equilibrium's speed ends where the spring's is the largest.
-        lead = self.equilibrium.speed.copy()
-        share = np.ones((self.n, 2))
-        for number, part in enumerate((slice(3), slice(3, 6))):
+        lead, tether = self.equilibrium.speed.copy(), np.ones((self.n, 2))
+        for number, part in enumerate(_PARTS):
             size, largest = np.linalg.norm(push[:, part], axis=1), self._largest[:, number]
-            np.minimum(largest / np.maximum(size, 1e-12), 1.0, out=share[:, number])
-            push[:, part] *= share[:, number, None]
+            tether[:, number] = largest / np.maximum(size, largest)
             lead[:, part] *= np.clip(2.0 * (1.0 - size / largest), 0.0, 1.0)[:, None]
+            push[:, part] *= tether[:, number, None]
             push[:, part] += self.wrench[:, part]
-            size = np.linalg.norm(push[:, part], axis=1)
-            self.limits[(size > largest) | (share[:, number] < 1.0)] |= int(Limit.EFFORT)
+        # What is pressed may give way at once, and the motors' torques need their time to fall.
+        fall_s = (np.abs(product(transposed, push)) / self._torque_rate).max(axis=1)
+        gained = product(mobility, push) * (0.5 * fall_s)[:, None]
+        sizes = [np.linalg.norm(gained[:, part], axis=1) for part in _PARTS]
+        share = 1.0 / np.sqrt(np.maximum(np.max(sizes / (_GAINED * self._tool_speed[:, :1]), axis=0), 1.0))
+        self.equilibrium.keep_near(terms.tool, tether * share[:, None])
+        for number, part in enumerate(_PARTS):
+            size, largest = np.linalg.norm(push[:, part], axis=1), self._largest[:, number]
+            self.limits[(tether[:, number] * share < 1.0) | (size > largest)] |= int(Limit.EFFORT)
+            # The faster the tool moves where it is pushed to, the less it is pushed.
             first, last, _ = self._tool_speed[number]
-            along = (push[:, part] * speed[:, part]).sum(axis=1) / np.maximum(size, 1e-12)
-            within = np.clip((last - along) / (last - first), 0.0, 1.0) * largest / np.maximum(size, largest)
-            push[:, part] *= within[:, None]
-        self.equilibrium.keep_near(terms.tool, share)
+            along = (push[:, part] * speed[:, part]).sum(axis=1) / np.maximum(size, _TINY)
+            least = np.minimum(_FREE_PUSH[number], largest) * np.clip((last - along) / (last - first), 0.0, 1.0)
+            allowed = np.minimum(np.clip(largest * (1.0 - along / first), least, largest), size * share)
+            push[:, part] *= (allowed / np.maximum(size, _TINY))[:, None]
         damping = self._fixed_damping.copy()
         if not self._is_fixed.all():
-            designed = critical_damping(terms.mobility(_MOBILITY_DAMPING), self._stiffness, self._ratio)
+            designed = critical_damping(mobility, self._stiffness, self._ratio)
             np.copyto(damping, designed, where=~self._is_fixed[:, None, None])
         push += product(damping, lead - speed)
-        torque = product(np.swapaxes(terms.jacobian, 1, 2), push)
+        torque = product(transposed, push)
         first, last = self._joint_speed[:, 0], self._joint_speed[:, 1]
         torque *= np.clip((last - velocity * np.sign(torque)) / (last - first), 0.0, 1.0).min(axis=1, keepdims=True)
         own = product(terms.coriolis, velocity) + terms.gravity

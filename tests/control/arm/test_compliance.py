@@ -49,9 +49,9 @@ BAD = {
     "finite": {"stiffness": (float("nan"), 1, 1, 1, 1, 1)},
     "6000 N/m": {"stiffness": (6000.0, 1, 1, 1, 1, 1)},
     "400 N m/rad": {"stiffness": (1.0, 1, 1, 1, 400, 1)},
-    "damping_ratio": {"damping_ratio": 0.0},
+    "damping_ratio": {"damping_ratio": 0.4},
     "The damping": {"damping": (-1.0, 1, 1, 1, 1, 1)},
-    "max_force": {"max_force": 0.0},
+    "max_force": {"max_force": 1000.0},
     "max_moment": {"max_moment": float("inf")},
 }
 

@@ -67,6 +67,8 @@ class FakeWorld:
     def write(self, actuators: NDArray[np.float64]) -> None:
         self.wanted = actuators.copy()
 
+    def set_mode(self, mode: NDArray[np.int8]) -> None: ...
+
     def advance(self) -> None:
         self.advanced += 1
         wanted = float(self.wanted[0, 0])
@@ -219,6 +221,7 @@ def test_an_arm_comes_to_rest_and_stays_there_by_itself(actuation: Any) -> None:
     plant, stop, reading = SimulatedPlant(world), make_stop(body, 7), PlantReading(1, 7)
     world.qvel[:, :6] = [1.0, -1.0, 1.5, 2.0, 2.0, -2.0]
     stop.begin(np.asarray(body.home)[None])
+    plant.set_mode(np.array([Mode.FAULT], np.int8))
     effort = np.asarray(body.limits.effort)
     speeds, positions = [], []
     for _ in range(1000):

@@ -1,0 +1,110 @@
+"""Impedance control under readings that are no measurements, surroundings that change, and closed brakes."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks._impedance_attacks import ATTACKS, attack
+from benchmarks.wire import Judge, make
+from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.sim import plant as sim_plant
+from tests.robots.impedance_rig import Rig
+
+Array = NDArray[np.float64]
+
+
+@pytest.mark.parametrize("kind", ATTACKS)
+def test_an_attack_makes_no_arm_fast_and_presses_no_harder_than_stated(kind: str) -> None:
+    arm = make("impedance", 4)
+    judge = arm.cerebellum.plant = Judge(arm)
+    effect = attack(arm, kind, 50, 1)
+    assert effect.is_safe(kind), effect
+    assert judge.unsafe == 0
+    if kind in ("frozen", "one frozen", "wrong sign", "late", "false", "from the future"):
+        assert effect.stopped == 1.0
+
+
+def test_the_measurement_of_an_attack_is_not_blind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without supervision late readings make the tool faster than is stated."""
+    from bhd_lerobot.control.arm.impedance import ImpedanceController
+
+    monkeypatch.setattr(ImpedanceController, "_supervise", lambda *_: None)
+    assert not attack(make("impedance", 2), "late", 50, 1).is_safe("late")
+
+
+class DriftingPlant(Plant):
+    """A plant whose positions and speeds drift from a moment on, all joints alike."""
+
+    n = 1
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant, self.drift, self._ticks = plant, 0.0, 0
+
+    def read(self, out: PlantReading) -> None:
+        self._plant.read(out)
+        self._ticks += bool(self.drift)
+        out.position[:, :6] += self.drift * self._ticks / 500
+        out.velocity[:, :6] += self.drift
+
+    def write(self, ctrl: Array) -> None:
+        self._plant.write(ctrl)
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        self._plant.set_mode(mode)
+
+
+@pytest.mark.parametrize("mode", [Mode.ESTOP, Mode.FAULT, Mode.SAFE_OFF, Mode.INACTIVE], ids=lambda mode: mode.name)
+def test_in_modes_without_motion_no_reading_moves_the_arm(mode: Mode) -> None:
+    rig = Rig()
+    plant = rig.cerebellum.plant = DriftingPlant(rig.cerebellum.plant)
+    rig.move((0.0, 0.05, 0.0), 0.1)
+    if mode == Mode.FAULT:
+        plant.drift = 1e4  # no joint turns so fast
+        rig.wait(0.002)
+    elif mode == Mode.SAFE_OFF:
+        rig.bridge.deactivate()
+    else:
+        rig.bridge.estop()
+    rig.wait(1.0)
+    if mode == Mode.INACTIVE:
+        assert rig.bridge.reset().accepted.all()
+        rig.wait(0.1)
+    assert rig.mode == mode
+    posture = rig.world.qpos[0, :6].copy()
+    plant.drift = 0.2
+    rig.wait(3.0)
+    assert np.abs(rig.world.qpos[0, :6] - posture).max() < 0.02
+
+
+def test_closed_brakes_give_way_to_what_pushes_and_a_reset_is_refused_until_it_is_gone() -> None:
+    rig = Rig()
+    rig.bridge.estop()
+    rig.wait(2.0)
+    start = rig.log["tool"][-1]
+    rig.push[:3] = (-90.0, 0.0, 0.0)
+    rig.wait(1.0)
+    pushed = rig.log["tool"][-1]
+    assert (pushed - start)[0] < -0.01
+    refusal = rig.bridge.reset()
+    assert refusal.reasons.tolist() in ([Reason.PRESSED], [Reason.NOT_AT_REST])
+    rig.push[:] = 0.0
+    rig.wait(1.0)
+    assert np.linalg.norm(rig.log["tool"][-1] - pushed) < 0.01  # it does not come back by itself
+    assert rig.bridge.reset().accepted.all()
+    assert rig.bridge.activate().accepted.all()
+    rig.wait(0.5)
+    assert np.linalg.norm(rig.log["tool"][-1] - pushed) < 0.01
+
+
+def test_what_rests_on_an_arm_forbids_its_activation_with_the_force() -> None:
+    rig = Rig()
+    rig.push[:3] = (0.0, 0.0, -25.0)
+    rig.bridge.estop()
+    rig.wait(3.0)
+    assert rig.bridge.reset().reasons.tolist() == [Reason.PRESSED]
+    assert rig.bridge.state().pressed[0] == pytest.approx(25.0, abs=2.0)
+
+
+def test_the_modes_with_motion_of_the_simulated_brakes_are_those_of_the_cerebellum() -> None:
+    assert sim_plant.MODES_WITH_MOTION == (Mode.HOLD, Mode.TRACKING, Mode.STOPPING)
