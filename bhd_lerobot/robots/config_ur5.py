@@ -28,7 +28,7 @@ class UR5Config(BhdRobotConfig):
         scene: what is on the table when the robot is used by itself: ``"empty"``, ``"reach"`` (a target pose) or
             ``"pick"`` (objects). In a task the task decides.
         max_force: force [N] with which the tool may press on something, whatever moves it; more is a protective stop.
-            Used with ``control = "servo"``. A force on another part of the arm counts with what the joints feel of it.
+            A force on another part of the arm counts with what the joints feel of it.
         payload: mass of what the gripper is going to carry [kg]. Accelerations are planned so that the motors can move
             it; what it weighs beyond that, by 20 N, stops the arm when it is at rest.
         held_clearance: keep what the gripper holds away from table, arm and obstacles as well. It is taken to reach as
