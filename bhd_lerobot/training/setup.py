@@ -13,7 +13,7 @@ from accelerate import Accelerator  # type: ignore[import-untyped]
 from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
-from lerobot.processor import NormalizerProcessorStep
+from lerobot.processor import NormalizerProcessorStep, rename_stats
 from lerobot.utils.constants import ACTION
 
 from bhd_lerobot.datasets.format.identity import with_present_names
@@ -21,6 +21,7 @@ from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
+from bhd_lerobot.policies.learned.policy import check_statistics
 from bhd_lerobot.policies.trained_steps import floored
 from bhd_lerobot.stock import (
     LeRobotDatasetMetadata,
@@ -242,6 +243,8 @@ def build_processors(
 ) -> tuple[Any, Any]:
     """Return pre- and postprocessor as `lerobot-train` makes them."""
     before, after = _build_processors(config, policy, meta, device, keep_statistics=keep_statistics)
+    active: Any = config.policy
+    check_statistics(f"The policy {active.pretrained_path or active.type}", before, after)
     if hasattr(policy, "use_statistics"):  # some are part of the weights
         policy.use_statistics(next(step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)))
     return before, after
@@ -251,10 +254,11 @@ def _build_processors(
     config: BhdTrainConfig, policy: Any, meta: LeRobotDatasetMetadata, device: torch.device, *, keep_statistics: bool
 ) -> tuple[Any, Any]:
     active: Any = config.policy
+    stats: Any = {**(meta.stats or {}), **rename_stats(meta.stats or {}, config.rename_map)}
     if active.pretrained_path is None:
-        return make_pre_post_processors(active, dataset_stats=meta.stats)
-    is_ours = hasattr(policy, "use_statistics")
-    stats: Any = floored(meta.stats, active.min_std) if is_ours else meta.stats
+        return make_pre_post_processors(active, dataset_stats=stats)
+    if hasattr(policy, "use_statistics"):
+        stats = floored(stats, active.min_std)
     features = {**policy.config.input_features, **policy.config.output_features}
     norm_map = policy.config.normalization_mapping
     before: dict[str, dict[str, Any]] = {

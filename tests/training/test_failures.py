@@ -12,6 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from safetensors.torch import load_file, save_file
 
 from bhd_lerobot.cli.train import main
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
@@ -432,3 +433,18 @@ def test_what_only_lerobots_loop_does_is_refused(name: str, tmp_path: Path) -> N
         with pytest.raises(ConfigError, match=f"{option} is not for bhd-train"):
             refuse_unsupported(config)
         setattr(owner, option, before)
+
+
+@pytest.mark.parametrize("statistics", ["checkpoint", "dataset"])
+def test_a_checkpoint_whose_statistics_have_other_names_does_not_train_on_with_them(
+    data: Path, trained: Path, tmp_path: Path, statistics: str
+) -> None:
+    folder = Path(shutil.copytree(trained, tmp_path / "trained"))
+    for file in folder.rglob("*normalizer_processor.safetensors"):
+        state = load_file(file)
+        save_file({f"buffer.{key}": value for key, value in state.items()}, file)
+    arguments = options(data, tmp_path / "run", {}, fine_tune=folder, fine_tune_statistics=statistics, steps=2)
+    if statistics == "dataset":
+        run_train(arguments)
+    else:
+        refused(arguments, ConfigError, r"normalises .* statistics of: buffer\.")

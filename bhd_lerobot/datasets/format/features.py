@@ -147,8 +147,9 @@ def names_of(feature: Mapping[str, Any]) -> tuple[str, ...]:
         names = sorted(names, key=names.__getitem__)
     elif isinstance(names, Mapping):
         names = [name for part in names.values() for name in (part if isinstance(part, list | tuple) else [part])]
-    count = math.prod(feature.get("shape") or ())
-    return tuple(map(str, names)) if isinstance(names, list | tuple) and len(names) == count else ()
+    if not isinstance(names, list | tuple) or len(names) != math.prod(feature.get("shape") or (len(names),)):
+        return ()
+    return tuple(map(str, names))
 
 
 def numbered_names_of(feature: Mapping[str, Any]) -> tuple[str, ...]:

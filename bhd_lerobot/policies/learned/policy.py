@@ -10,11 +10,12 @@ from typing import Any
 
 import lerobot.policies  # noqa: F401 - registers LeRobot's own policies
 import torch
-from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.processor import RenameObservationsProcessorStep
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.processor import NormalizerProcessorStep, RenameObservationsProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import (
     ACTION,
     OBS_ENV_STATE,
+    OBS_IMAGES,
     OBS_STATE,
     POLICY_POSTPROCESSOR_DEFAULT_NAME,
     POLICY_PREPROCESSOR_DEFAULT_NAME,
@@ -88,7 +89,48 @@ def load_policy(
             )
     check_checkpoint(folder)
     policy, before, after = _load(folder, config, device)
+    check_statistics(f"The checkpoint {folder}", before, after)
     return LoadedPolicy(folder, policy, before, after, *_inputs(config, before, for_robot=for_robot))
+
+
+def check_statistics(who: str, before: Any, after: Any) -> None:
+    """Check that whatever a policy's processors normalise has statistics; LeRobot's pass it through where it has none.
+
+    Args:
+        who: the policy, as the subject of a sentence.
+        before, after: its processors.
+
+    Raises:
+        ConfigError: statistics are missing; lists the names that there are.
+    """
+    for pipeline, is_input in ((before, True), (after, False)):
+        for step in pipeline.steps:
+            if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
+                continue
+            only = step.normalize_observation_keys
+            for key, feature in step.features.items():
+                mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
+                is_action = feature.type is FeatureType.ACTION
+                is_given = is_input and (only is None or key in only) and not key.startswith(_EMPTY)
+                if not (is_action or is_given):
+                    continue
+                there = (step.stats or {}).get(key) or {}
+                if missing := [name for name in _STATISTICS.get(mode, ()) if name not in there]:
+                    known = ", ".join(sorted(step.stats or {})) or "none"
+                    raise ConfigError(
+                        f"{who} normalises {key!r} by {mode.value}, and has no {' and '.join(missing)} of it, so it "
+                        f"would be passed through in the robot's units. It has statistics of: {known}. Train it on a "
+                        "dataset that has this feature, or rename the statistics in the processors' files."
+                    )
+
+
+_EMPTY = f"{OBS_IMAGES}.empty_camera"  # inputs that no camera gives
+_STATISTICS = {
+    NormalizationMode.MEAN_STD: ("mean", "std"),
+    NormalizationMode.MIN_MAX: ("min", "max"),
+    NormalizationMode.QUANTILES: ("q01", "q99"),
+    NormalizationMode.QUANTILE10: ("q10", "q90"),
+}
 
 
 def load_perception(folder: Path, device: str = "cpu", option: str = "brain.perception.path") -> Any:

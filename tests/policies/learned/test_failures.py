@@ -221,3 +221,35 @@ def test_a_configuration_is_read_before_its_policy_is_trained(tmp_path: Path) ->
     assert robot_of_brain(later.brain) == ""
     with pytest.raises(ConfigError, match="the folder does not exist"):
         make_brain(later.brain)
+
+
+def rename_statistics(folder: Path, old: str, new: str, *files: str) -> None:
+    for file in files or [path.name for path in folder.glob("*normalizer_processor.safetensors")]:
+        state = load_file(folder / file)
+        save_file({key.replace(old, new): value for key, value in state.items()}, folder / file)
+
+
+@each_case(
+    ("old", "new", "parts"),
+    [
+        ("action.", "so100.buffer.action.", ("'action' by", "so100.buffer.action")),
+        ("observation.state.", "buffer_observation_state.", ("'observation.state' by", "buffer_observation_state")),
+        ("observation.environment_state.mean", "other.mean", ("'observation.environment_state'", "no mean of it")),
+        ("action.std", "action.deviation", ("'action' by", "no std of it")),
+    ],
+)
+def test_what_is_normalised_without_statistics_of_its_name_is_refused(
+    original: Path, tmp_path: Path, old: str, new: str, parts: tuple[str, ...]
+) -> None:
+    folder = Path(shutil.copytree(original, tmp_path / "policy"))
+    rename_statistics(folder, old, new)
+    message = refused(folder)
+    assert [part for part in parts if part not in message] == []
+
+
+def test_what_is_not_normalised_needs_no_statistics(tmp_path: Path) -> None:
+    identity = {"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}
+    folder = rig.save_policy(tmp_path / "mlp", normalization_mapping=identity)
+    for name in ("observation.state", "observation.environment_state", "action"):
+        rename_statistics(folder, f"{name}.", f"buffer.{name}.")
+    rig.make_brain(folder)
