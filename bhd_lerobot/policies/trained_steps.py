@@ -7,6 +7,7 @@ import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from bhd_lerobot.policies.trained import TrainedConfig
@@ -46,10 +47,26 @@ def make_pipelines(config: TrainedConfig, stats: Stats | None, *own: TrainedStep
 
 
 def floored(stats: Stats | None, least: float) -> Stats | None:
-    """Return features' statistics with no standard deviation below the least; those that were given are not changed."""
-    if stats is None:
-        return None
-    return {
-        key: {name: torch.as_tensor(value).clamp(min=least) if name == "std" else value for name, value in one.items()}
-        for key, one in stats.items()
-    }
+    """Return features' statistics to divide by; those that were given are not changed.
+
+    No standard deviation is below the least. A number of an observation that was constant, within the least deviation,
+    gets an infinite one, so that it has no influence: nothing says what another value of it means.
+    """
+    return None if stats is None else {key: _floored(key, one, least) for key, one in stats.items()}
+
+
+def _floored(key: str, stats: dict[str, Tensor], least: float) -> dict[str, Tensor]:
+    found = {name: torch.as_tensor(value) for name, value in stats.items()}
+    if "std" in found:
+        found["std"] = found["std"].clamp(min=least)
+    if key in (OBS_STATE, OBS_ENV_STATE) and {"min", "max", "std"} <= found.keys():
+        constant = found["max"] - found["min"] <= 2 * least
+        found["std"] = torch.where(constant, torch.inf, found["std"])
+        for low, high in (("min", "max"), ("q01", "q99"), ("q10", "q90")):
+            if low in found and high in found:
+                found[low] = torch.where(constant, found[low] - _WIDE, found[low])
+                found[high] = torch.where(constant, found[high] + _WIDE, found[high])
+    return found
+
+
+_WIDE = 1e9  # of what is normalised by a range: it becomes 0

@@ -13,7 +13,7 @@ from accelerate import Accelerator  # type: ignore[import-untyped]
 from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
-from lerobot.processor import NormalizerProcessorStep, rename_stats
+from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 
 from bhd_lerobot.datasets.format.identity import with_present_names
@@ -254,7 +254,8 @@ def _build_processors(
     config: BhdTrainConfig, policy: Any, meta: LeRobotDatasetMetadata, device: torch.device, *, keep_statistics: bool
 ) -> tuple[Any, Any]:
     active: Any = config.policy
-    stats: Any = {**(meta.stats or {}), **rename_stats(meta.stats or {}, config.rename_map)}
+    stats: Any = meta.stats or {}
+    stats = stats | {new: stats[old] for old, new in config.rename_map.items() if old in stats}
     if active.pretrained_path is None:
         return make_pre_post_processors(active, dataset_stats=stats)
     if hasattr(policy, "use_statistics"):

@@ -90,7 +90,8 @@ class MlpConfig(TrainedConfig):
         feature_clip: normalised inputs beyond ± this count as this: a number that never changed in the dataset has no
             scale; nothing turns it off.
         min_std: least standard deviation that an input or an action is divided by, in its own unit: what varies by less
-            than a millimetre or a milliradian is noise, and would be blown up to the size of everything else.
+            than a millimetre or a milliradian is noise, and would be blown up to the size of everything else. An input
+            that stays within twice of it in the whole dataset has no influence.
         loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if nothing, ``"nll"`` with `gaussian` and
             ``"l1"`` without.
         huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.

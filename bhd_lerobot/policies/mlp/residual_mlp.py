@@ -44,7 +44,8 @@ class Residual(nn.Module):
         )
         known = self._is_known
         columns, divisor = self._columns[known], std.clamp(min=self._least)[known]
-        self._scale[known] = state_std.clamp(min=self._least)[columns] / divisor
+        state_std = torch.where(state_std.isinf(), 0.0, state_std.clamp(min=self._least))  # constant: it is the mean
+        self._scale[known] = state_std[columns] / divisor
         self._offset[known] = (state_mean[columns] - mean[known]) / divisor
 
     def forward(self, state: Tensor) -> Tensor:

@@ -105,7 +105,7 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         """Set what states are given their units back by, and what actions begin at."""
         mean, std = (torch.as_tensor(stats[OBS_STATE][name], dtype=torch.float32) for name in ("mean", "std"))
         self._state_mean.copy_(mean)
-        self._state_std.copy_(std.clamp(min=self.config.min_std))
+        self._state_std.copy_(torch.where(std.isinf(), 0.0, std.clamp(min=self.config.min_std)))
         if self.residual is not None:
             self.residual.use_statistics(stats)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from scipy.spatial.transform import Rotation
@@ -143,6 +143,31 @@ def test_what_hardly_varies_is_not_blown_up(tmp_path: Path) -> None:
         processor.save_pretrained(tmp_path)
     _, again = make_pre_post_processors(made, pretrained_path=str(tmp_path))
     assert torch.equal(again(action), after(action))
+
+
+@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10"])
+@pytest.mark.parametrize("spread", [0.0, 1e-5, 1.5e-3])
+def test_what_was_constant_in_the_data_has_no_influence(tmp_path: Path, spread: float, mode: str) -> None:
+    modes = {"STATE": mode, "ENV": mode, "ACTION": mode}
+    made = config(min_std=1e-3, normalization_mapping={key: NormalizationMode[one] for key, one in modes.items()})
+
+    def statistics(size: int, constant: int) -> dict[str, Any]:
+        widths = np.full(size, 4.0)
+        widths[constant] = spread
+        low = 100 - widths / 2
+        found = {"mean": low + widths / 2, "std": widths / 4, "min": low, "max": low + widths}
+        return {**found, "q01": low, "q99": low + widths, "q10": low, "q90": low + widths}
+
+    stats = {OBS_STATE: statistics(10, 3), OBS_ENV_STATE: statistics(3, 1), ACTION: statistics(2, 0)}
+    before, after = make_pre_post_processors(made, dataset_stats=stats)
+    for one in (before, after):
+        one.save_pretrained(tmp_path)
+    again, after = make_pre_post_processors(made, pretrained_path=str(tmp_path))
+    for off in (0.0, 0.01, -1.0, 1e4):
+        done = again({OBS_STATE: torch.full((1, 10), 100 + off), OBS_ENV_STATE: torch.full((1, 3), 100 + off)})
+        assert abs(float(done[OBS_STATE][0, 3])) + abs(float(done[OBS_ENV_STATE][0, 1])) < 1e-4
+        assert float(done[OBS_STATE][0, 0]) == pytest.approx(off if mode == "MEAN_STD" else off / 2, abs=1e-3)
+    assert float(after(torch.zeros(1, 2))[0, 0]) == pytest.approx(100)  # an action is still what it was
 
 
 QUATERNIONS = [f"thing_{part}" for part in ("x", "qw", "qx", "qy", "qz")]

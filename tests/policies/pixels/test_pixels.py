@@ -204,7 +204,9 @@ def test_the_room_behind_an_instruction_does_not_matter() -> None:
 
 def save(folder: Path, policy: Any) -> Path:
     policy.save_pretrained(folder)
-    for pipeline in make_pre_post_processors(policy.config, dataset_stats={}):
+    features = {**policy.config.input_features, **policy.config.output_features}
+    stats = {key: {"mean": np.zeros(one.shape[-1]), "std": np.ones(one.shape[-1])} for key, one in features.items()}
+    for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
         pipeline.save_pretrained(folder)
     return folder
 
