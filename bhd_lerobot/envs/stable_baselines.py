@@ -21,8 +21,8 @@ class BhdSb3VecEnv(VecEnv):
 
     An episode that ended begins anew in the same step. Its last observation is in `infos[i]["terminal_observation"]`,
     and `infos[i]["TimeLimit.truncated"]` reports whether only its time was over, so that the learner adds the value of
-    what would have come. `infos[i]["episode"]` holds the task's return `r` and the length `l` [frames]; besides there
-    are `is_success`, `event` and `score`.
+    what would have come. `infos[i]["episode"]` holds the task's return `r` and the length `l` [frames]. What else is in
+    `infos` and `reset_infos` is what `BhdEnv` reports.
 
     Attributes:
         env: the environment.
@@ -51,14 +51,15 @@ class BhdSb3VecEnv(VecEnv):
         self._return = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, np.int64)
         self._actions: NDArray[np.float32] = np.zeros((env.num_envs, env.single_action_space.shape[0]), np.float32)  # type: ignore[index]
-        self._nothing: dict[str, Any] = {}
         self._seen: Any = None
         self._first: int | None = None
 
     def reset(self) -> Any:
         """Begin the next episode everywhere; return observations, each of shape (n, …)."""
-        observation, _ = self.env.reset(seed=self._first)
+        observation, info = self.env.reset(seed=self._first)
         self._first = None
+        self._reset_options()
+        self.reset_infos = [_info_of(info, sim) for sim in range(self.num_envs)]
         self._begin(self._all, observation)
         return self._observations()
 
@@ -78,27 +79,25 @@ class BhdSb3VecEnv(VecEnv):
         if len(ended):
             event[ended] = [Event[name.upper()] for name in info["event"][ended]]
         rewards = np.asarray(self._rewards(reward, event, terminated), np.float32)
-        infos = [self._nothing] * self.num_envs
+        infos = [_info_of(info, sim) for sim in range(self.num_envs)]
+        for one, is_over in zip(infos, truncated & ~terminated, strict=True):
+            one["TimeLimit.truncated"] = bool(is_over)
         if len(ended):
-            self._finish(ended, truncated, info, infos)
-            observation, _ = self.env.reset(options={"reset_mask": done})
+            self._finish(ended, infos)
+            observation, begun = self.env.reset(options={"reset_mask": done})
+            for sim in ended.tolist():
+                self.reset_infos[sim] = _info_of(begun, sim)
             self._begin(ended, observation)
         return self._observations(), rewards, done, infos
 
-    def _finish(
-        self, ended: NDArray[np.intp], truncated: NDArray[np.bool_], info: dict[str, Any], infos: list[dict[str, Any]]
-    ) -> None:
+    def _finish(self, ended: NDArray[np.intp], infos: list[dict[str, Any]]) -> None:
         last = self._observations()
         for sim in ended.tolist():
-            infos[sim] = {
+            infos[sim] |= {
                 "terminal_observation": {key: value[sim] for key, value in last.items()}
                 if isinstance(last, dict)
                 else last[sim],
-                "TimeLimit.truncated": bool(truncated[sim]),
                 "episode": {"r": float(self._return[sim]), "l": int(self._length[sim]), "t": 0.0},
-                "is_success": bool(info["is_success"][sim]),
-                "event": str(info["event"][sim]),
-                "score": float(info["score"][sim]),
             }
 
     # --- what a learner with features and rewards of its own defines -------------------------------------------------
@@ -135,19 +134,30 @@ class BhdSb3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of some environments."""
-        if attr_name == "render_mode":  # asked for before the environment is set
-            return [None] * self.num_envs
-        values = self.env.get_attr(attr_name)
-        return [values[i] for i in self._get_indices(indices)]
+        return [getattr(member, attr_name) for member in self._members(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of all environments."""
-        self.env.set_attr(attr_name, value)
+        """Set an attribute of some environments, to one value.
+
+        Raises:
+            ConfigError: there is no such attribute, or it is one of all environments together.
+        """
+        members = self._members(indices)
+        if attr_name == "render_mode" and len(members) < self.num_envs:
+            raise ConfigError("render_mode is one of all environments together; set it without indices.")
+        for member in members:
+            member.set(attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of some environments."""
-        values = self.env.call(method_name, *method_args, **method_kwargs)
-        return [values[i] for i in self._get_indices(indices)]
+        return [getattr(member, method_name)(*method_args, **method_kwargs) for member in self._members(indices)]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return each scene from outside, shape (height, width, 3); None without a render mode."""
+        return self.env_method("render")
+
+    def _members(self, indices: Any) -> list[Any]:
+        return [self.env.members[i] for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return that nothing is wrapped."""
@@ -157,3 +167,13 @@ class BhdSb3VecEnv(VecEnv):
         """Start the next `reset` with episode `seed`, and the environment behind it with the next one each."""
         self._first = seed
         return [None if seed is None else seed + i for i in range(self.num_envs)]
+
+
+def _info_of(info: dict[str, Any], sim: int) -> dict[str, Any]:
+    """Return what the vector environment reports of one environment, as plain values."""
+    found = {}
+    for key, values in info.items():
+        if not key.startswith("_") and info[f"_{key}"][sim]:
+            value = values[sim] if not isinstance(values, dict) else _info_of(values, sim)
+            found[key] = value.item() if isinstance(value, np.generic) else value
+    return found

@@ -2,7 +2,9 @@
 
 import os
 import sys
+import threading
 import weakref
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -79,14 +81,14 @@ class Pose:
 class Camera:
     """Renders images of a world's simulations.
 
-    One camera object serves all simulations and all named cameras of one image size. It must be used from the thread
-    that made it, because an OpenGL context belongs to a thread.
+    One camera object serves all simulations and all named cameras of one image size, from any thread, one at a time.
 
     Args:
         world: the simulations.
         width: image width [px].
         height: image height [px].
-        alone: nothing else uses OpenGL on this thread, so that the context need not be bound again for every image.
+        alone: nothing else uses OpenGL on this thread, and no other thread uses the camera: the OpenGL context, which
+            belongs to one thread at a time, stays bound between images.
 
     Raises:
         RenderingError: no OpenGL backend works here; the message names the remedy.
@@ -94,11 +96,16 @@ class Camera:
 
     def __init__(self, world: World, width: int = 320, height: int = 240, *, alone: bool = False) -> None:
         self._world = world
-        self._must_bind = not alone
+        self._must_bind, self._lock = not alone, threading.Lock()
         self.width, self.height = width, height
         self._gl = _make_context(width, height)
-        self._gl.make_current()
-        model = world.model
+        if alone:
+            self._gl.make_current()
+        with self._bound():
+            self._open(world)
+
+    def _open(self, world: World) -> None:
+        width, height, model = self.width, self.height, world.model
         model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(height, model.vis.global_.offheight)
         self._scene = mujoco.MjvScene(model, maxgeom=world.model.ngeom + 64)
@@ -135,8 +142,18 @@ class Camera:
         Raises:
             RenderingError: there is no such camera, or the renderer was closed.
         """
-        self._own.take(sim)
-        return self.draw(self._own, camera, out)
+        with self._lock:
+            self._own.take(sim)
+            return self.draw(self._own, camera, out)
+
+    def _bound(self) -> AbstractContextManager[None]:
+        """Bind the OpenGL context to this thread, and free it for others afterwards."""
+        if not self._must_bind:
+            return nullcontext()
+        if hasattr(self._gl, "as_current"):
+            return self._gl.as_current()
+        self._gl.make_current()  # of MuJoCo 3, whose contexts stay with the thread
+        return nullcontext()
 
     def draw(self, pose: "Pose", camera: str, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """Return the image that a named camera sees in a pose that was taken earlier; otherwise like `render`."""
@@ -153,10 +170,9 @@ class Camera:
         mujoco.mjv_updateScene(
             pose.model, pose.data, self._option, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        if self._must_bind:
-            self._gl.make_current()
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(self._flipped, None, self._rect, self._context)
+        with self._bound():
+            mujoco.mjr_render(self._rect, self._scene, self._context)
+            mujoco.mjr_readPixels(self._flipped, None, self._rect, self._context)
         image = self._flipped[::-1]
         if out is None:
             return image.copy()
