@@ -10,7 +10,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.state import load_info
-from bhd_lerobot.datasets.loader.check import beyond
+from bhd_lerobot.datasets.loader.check import beyond, fingerprint
 from bhd_lerobot.datasets.loader.loader import Loader, check, expert_stats, imagenet_stats, make_loader
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
@@ -31,6 +31,7 @@ class TrainingData:
         episodes: number of episodes that are learned from.
         held_out_episodes: those that are not, by number.
         how: how the batches are served, as text.
+        fingerprint: digest of what is learned from.
     """
 
     train: Loader
@@ -39,6 +40,7 @@ class TrainingData:
     episodes: int
     held_out_episodes: list[int]
     how: str
+    fingerprint: str
 
 
 def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
@@ -126,6 +128,7 @@ def open_data(
         frames=len(loaders.train.order.samples),
         episodes=loaders.dataset.num_episodes,
         held_out_episodes=[] if loaders.held_out is None else sorted(loaders.held_out.dataset.episodes),
+        fingerprint=fingerprint(loaders.dataset, keep),
         how=f"LeRobot's, {config.num_workers} workers" if size is None else f"in memory, {size / 2**20:.3g} MiB",
     )
 

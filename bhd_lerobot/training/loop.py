@@ -36,6 +36,7 @@ class LoopOptions:
         env_eval_freq: steps from one evaluation in an environment to the next.
         seed: of the noise in the held-out loss.
         held_out: numbers of the episodes that are not learned from.
+        fingerprint: digest of what is learned from.
     """
 
     steps: int
@@ -47,6 +48,7 @@ class LoopOptions:
     env_eval_freq: int = 0
     seed: int = 0
     held_out: Sequence[int] = ()
+    fingerprint: str = ""
 
 
 @dataclass
@@ -120,6 +122,7 @@ class TrainingLoop:
         return {
             "frames": self.options.frames,
             "held_out": list(self.options.held_out),
+            "fingerprint": self.options.fingerprint,
             "loader": self.loader.state_dict(),
             "window": self._window.numbers(),
         }
@@ -137,6 +140,12 @@ class TrainingLoop:
             raise BhdError(
                 f"The run was started with {_listed(before)} held out, and now it would be {_listed(now)}. Leave "
                 "dataset.eval_split and selection.hold_out as they were, or start a new run."
+            )
+        if state.get("fingerprint", self.options.fingerprint) != self.options.fingerprint:
+            raise BhdError(
+                f"The run was started on other data: as many frames ({self.options.frames}) with other numbers, "
+                "episodes, instructions or images. Restore that dataset, or learn from this one in a new run with "
+                "--fine_tune=CHECKPOINT."
             )
         self.step = self._saved = step
         self._window = Window(before=list(state.get("window", [])))

@@ -170,6 +170,7 @@ def _loop_options(config: BhdTrainConfig, data: TrainingData, processes: int) ->
         env_eval_freq=config.env_eval_freq,
         seed=config.seed or 0,
         held_out=data.held_out_episodes,
+        fingerprint=data.fingerprint,
     )
 
 

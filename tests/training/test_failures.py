@@ -15,6 +15,9 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from bhd_lerobot.cli.train import main
+from bhd_lerobot.datasets.loader.check import fingerprint
+from bhd_lerobot.datasets.loader.config import LoaderConfig
+from bhd_lerobot.datasets.loader.loader import make_loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.training import output
@@ -448,3 +451,28 @@ def test_a_checkpoint_whose_statistics_have_other_names_does_not_train_on_with_t
         run_train(arguments)
     else:
         refused(arguments, ConfigError, r"normalises .* statistics of: buffer\.")
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_a_run_goes_on_with_its_own_data_only_wherever_they_lie(tmp_path: Path, camera: bool) -> None:
+    root, run = make_dataset(tmp_path / "set", camera=camera), tmp_path / "run"
+    run_train(options(root, run, MLP, steps=4))
+    again = [f"--config_path={run}", "--resume=true"]
+    other = make_dataset(tmp_path / "other", shift=0.01, camera=camera)  # as many frames
+    renamed = make_dataset(tmp_path / "renamed", instructions=2, camera=camera)
+    for wrong in (other, renamed):
+        with pytest.raises(BhdError, match=r"was started on other data: as many frames \(120\).*--fine_tune"):
+            run_train([*again, "--steps=6", f"--dataset.root={wrong}"])
+    shutil.move(root, tmp_path / "moved")
+    result, _ = run_train([*again, "--steps=6", f"--dataset.root={tmp_path / 'moved'}"])
+    assert result.step == 6
+
+
+def test_a_fingerprint_is_the_same_however_the_data_are_served(data: Path) -> None:
+    meta = LeRobotDatasetMetadata("t/t", root=data)
+    keys = ["observation.state", "action"]
+    served = [
+        make_loader("t/t", LoaderConfig(batch_size=4, budget_gib=budget), meta=meta).dataset for budget in (None, 1e-9)
+    ]
+    assert len({type(dataset) for dataset in served}) == 2
+    assert len({fingerprint(dataset, keys) for dataset in served}) == 1

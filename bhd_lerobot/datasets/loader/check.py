@@ -1,14 +1,18 @@
 """Whether a policy can learn from a dataset, checked before training."""
 
 import difflib
+import hashlib
+import json
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
+import numpy as np
 import torch
 
 from bhd_lerobot.datasets.format.features import names_of
 from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, quoted
+from bhd_lerobot.stock import load_stats
 
 
 def check(dataset: Any, keys: Collection[str]) -> None:
@@ -47,6 +51,27 @@ def beyond(dataset: Any, key: str, low: str, high: str) -> float:
     for _, values, _ in _columns(dataset, [key]):
         shares += ((values < least) | (values > most)).float().mean(0).tolist()
     return max(shares)
+
+
+def fingerprint(dataset: Any, keys: Collection[str]) -> str:
+    """Return a digest of what a dataset serves: numbers, episodes and instructions; of images, their statistics.
+
+    It is the same for each loader, wherever the dataset lies and however its files are divided.
+    """
+    meta = dataset.meta
+    code = hashlib.blake2b(digest_size=16)
+    for key, values, _ in _columns(dataset, sorted(keys)):
+        code.update(f"{key} {tuple(values.shape)}".encode() + values.contiguous().numpy().tobytes())
+    episodes = range(meta.total_episodes) if dataset.episodes is None else dataset.episodes
+    about = [[int(meta.episodes["length"][i]), list(meta.episodes["tasks"][i])] for i in episodes]
+    stored = load_stats(meta.root) or {}  # not those of ImageNet
+    images = {
+        key: np.round(stored[key]["mean"], 6).ravel().tolist()
+        for key in sorted(keys)
+        if key in meta.camera_keys and key in stored
+    }
+    code.update(json.dumps([about, images]).encode())
+    return code.hexdigest()
 
 
 def _columns(dataset: Any, keys: Collection[str]) -> Iterator[tuple[str, torch.Tensor, Callable[[int], str]]]:
