@@ -580,3 +580,21 @@ def test_an_arm_is_not_read_as_a_base(ur5, arm, tmp_path, capsys):
     assert "seems to be of an arm: /joint_states has the joints shoulder_pan_joint" in error
     assert "is for bags of a TurtleBot3" in error
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("fps", [15, 24, 30, 60])
+@pytest.mark.parametrize("names", [["x.vel", "theta.vel"], {"motors": ["a", "b"]}], ids=["twist", "dictionary"])
+def test_frames_at_any_rate_come_back_with_their_own_action(tmp_path, fps, names):
+    root, frames = tmp_path / "d", 40
+    vector = {"dtype": "float32", "shape": (2,), "names": names}
+    features = {"observation.state": vector, "action": vector}
+    with DatasetRecorder.create("t/t", fps, features, robot_type="toy", root=root) as recorder:
+        for episode in range(3):
+            writer, number = recorder.begin_episode(), episode + np.arange(frames, dtype=np.float32)[:, None] / 100
+            writer.set_columns({"observation.state": number * (0.1, 0.2), "action": number * (0.3, 0.4)})
+            recorder.save(writer, task="count", metadata={})
+    back(export(root, tmp_path / "bags"), tmp_path / "back")
+    for episode in range(3):
+        ours, theirs = (read_episode(one, episode) for one in (root, tmp_path / "back"))
+        for key in features:
+            np.testing.assert_array_equal(ours[key], theirs[key])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, newest
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, frame_times, newest, newest_before
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track
 from bhd_lerobot.ros2.messages.base import ODOMETRY, TWIST
 from bhd_lerobot.tasks.task import OUTCOMES, Event
@@ -118,9 +118,14 @@ def unanswered(options: ImportOptions, tracks: Sequence[Track], times: Times) ->
     Args:
         times: of the frames [ns], shape (n,).
     """
-    ends = times + round(NANO / options.fps)
+    ends = _ends(times, options.fps)
     waits = [track for track in tracks if track.is_action and not all(name.endswith(".vel") for name in track.names)]
-    return max((int((newest(track.times, ends - 1) < 0).sum()) for track in waits), default=0)
+    return max((int((newest_before(track.times, ends) < 0).sum()) for track in waits), default=0)
+
+
+def _ends(times: Times, fps: int) -> Times:
+    """Return when frames at a fixed rate end [ns]: each with the beginning of the next, shape (n,)."""
+    return frame_times(int(times[0]), len(times) + 1, fps)[1:]
 
 
 def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> tuple[Array, Times]:
@@ -129,13 +134,13 @@ def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> 
     An action is the command over the frame that an observation begins. What answers the observation comes after
     it: the command in force when the observation was taken is the answer to the one before.
     """
-    ends = times + round(NANO / options.fps)
+    ends = _ends(times, options.fps)
     age = np.zeros_like(ends)
     columns: dict[str, Array] = {}
     for track in tracks:
         if not track.is_action:
             continue
-        place = newest(track.times, ends - 1)
+        place = newest_before(track.times, ends)
         since = np.where(place < 0, -1, ends - track.times[place]) if len(track.times) else np.full(len(ends), -1)
         if np.isfinite(options.command_timeout_s):
             since = np.where(since > round(options.command_timeout_s * NANO), -1, since)

@@ -15,6 +15,8 @@ Times = NDArray[np.int64]
 NANO = 1_000_000_000
 STEP_BACK_NS = NANO // 2  # stamps that go back further are of a clock that has jumped; what is less is sorted
 CLOCK_STEP_NS = NANO // 20  # the same of the recorder's own clock, which nothing but a jump lets go back
+ROUNDING_NS = 1000
+"""Times that lie closer to each other are the same: who writes stamps rounds them, from seconds as floats, too."""
 _NEARLY_ALL = 0.99
 
 
@@ -98,11 +100,23 @@ def clock_jumps(times: Sequence[Times], order: Sequence[Times], step_ns: int = S
 def newest(times: Times, at: Times) -> NDArray[np.intp]:
     """Return the place of the newest message at or before each time, shape (frames,); -1 where there is none.
 
+    Times that differ by `ROUNDING_NS` or less are the same.
+
     Args:
         times: of the messages, ascending.
         at: of the frames.
     """
-    return np.searchsorted(times, at, side="right") - 1
+    return np.searchsorted(times, at + ROUNDING_NS, side="right") - 1
+
+
+def newest_before(times: Times, at: Times) -> NDArray[np.intp]:
+    """Return the place of the newest message before each time, and not at it; otherwise like `newest`."""
+    return np.searchsorted(times, at - ROUNDING_NS, side="left") - 1
+
+
+def frame_times(first: int, count: int, fps: float) -> Times:
+    """Return when frames begin at a fixed rate [ns], shape (count,); each is rounded for itself."""
+    return first + np.round(np.arange(count) * (NANO / fps)).astype(np.int64)
 
 
 def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: int, why: str = "start") -> list[Grid]:
@@ -120,10 +134,9 @@ def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: 
     result = []
     for first, until in _common([_covered(times, max_gap_ns) for times in sensors]):
         end = min(until, last)
-        count = int((end - first) * fps / NANO) + 1
-        at = first + np.round(np.arange(count) * (NANO / fps)).astype(np.int64)
-        at = at[at <= end]
-        ages = np.stack([at - times[newest(times, at)] for times in sensors])
+        at = frame_times(first, int((end - first) * fps / NANO) + 2, fps)
+        at = at[at <= end + ROUNDING_NS]
+        ages = np.stack([np.maximum(at - times[newest(times, at)], 0) for times in sensors])
         fresh = np.flatnonzero(ages.max(axis=0) <= max_age_ns)
         if len(fresh):
             stop = int(fresh[-1]) + 1

@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.bag.importer.resample import NANO, apart, clock_jumps, grids, message_times, newest
+from bhd_lerobot.ros2.bag.importer.resample import (
+    NANO,
+    ROUNDING_NS,
+    apart,
+    clock_jumps,
+    frame_times,
+    grids,
+    message_times,
+    newest,
+    newest_before,
+)
 from bhd_lerobot.ros2.messages.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
 
 MS = 10**6
@@ -47,10 +57,10 @@ def test_what_comes_after_t_changes_nothing_until_t(a, b, c, data):
     others = []
     for one in tracks:
         before = one[one <= t]
-        later = data.draw(st.lists(st.integers(t + 1, t + 5000 * MS), max_size=8))
+        later = data.draw(st.lists(st.integers(t + ROUNDING_NS + 1, t + 5000 * MS), max_size=8))
         others.append(np.array([*before, *sorted(later)], np.int64))
     # the recording goes on after t in both; what is at its end is another question
-    others[0] = np.append(others[0], max(int(others[0][-1]) if len(others[0]) else 0, t) + 1)
+    others[0] = np.append(others[0], max(int(others[0][-1]) if len(others[0]) else 0, t) + ROUNDING_NS + 1)
     first = {time: seen for time, seen in frames(tracks[:2], tracks[2]).items() if time <= t}
     second = {time: seen for time, seen in frames(others[:2], others[2]).items() if time <= t}
     for time in first.keys() & second.keys():
@@ -72,6 +82,27 @@ def test_a_frame_has_the_newest_message_until_then(a, b):
         for times, ages in zip(sensors, grid.ages, strict=True):
             for time, age in zip(grid.times, ages, strict=True):
                 assert age == time - times[times <= time].max()
+
+
+@pytest.mark.parametrize("fps", [1, 3, 7, 10, 15, 24, 25, 29, 30, 48, 50, 60, 90, 120, 125, 333, 500, 1000])
+@pytest.mark.parametrize("offset_s", [0.0, 1 / 3, 0.123456789])
+@pytest.mark.parametrize("writer", ["rounded", "floored", "float seconds", "sums of periods"])
+def test_messages_at_a_fixed_rate_are_one_a_frame_however_their_times_were_rounded(fps, offset_s, writer):
+    n = 700
+    begin = START + round(offset_s * NANO)
+    number = np.arange(n)
+    times = {
+        "rounded": lambda: begin + np.round(number / fps * NANO).astype(np.int64),
+        "floored": lambda: begin + number * NANO // fps,
+        "float seconds": lambda: np.round((begin / NANO + number / fps) * NANO).astype(np.int64),
+        "sums of periods": lambda: begin + number * round(NANO / fps),  # drifts by half a nanosecond a frame
+    }[writer]()
+    [grid] = grids([times, times + 3], fps, max_age_ns=5 * NANO, max_gap_ns=5 * NANO)
+    assert len(grid.times) == n
+    ends = frame_times(int(grid.times[0]), n + 1, fps)[1:]
+    assert newest(times, grid.times).tolist() == number.tolist()
+    assert newest_before(times, ends).tolist() == number.tolist()
+    assert (grid.ages >= 0).all()
 
 
 def test_a_gap_begins_another_episode_and_a_short_one_makes_frames_late():
