@@ -472,7 +472,7 @@ def test_a_fingerprint_is_the_same_however_the_data_are_served(data: Path) -> No
     meta = LeRobotDatasetMetadata("t/t", root=data)
     keys = ["observation.state", "action"]
     served = [
-        make_loader("t/t", LoaderConfig(batch_size=4, budget_gib=budget), meta=meta).dataset for budget in (None, 1e-9)
+        make_loader("t/t", LoaderConfig(batch_size=4, budget_gib=budget), meta=meta).dataset for budget in (1.0, 1e-9)
     ]
     assert len({type(dataset) for dataset in served}) == 2
     assert len({fingerprint(dataset, keys) for dataset in served}) == 1
