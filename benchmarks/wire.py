@@ -51,10 +51,9 @@ ROUNDING = 1.021  # a trajectory ends inside a tick
 # [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6; an
 # arm that is found to be blocked for 50 ms goes on meanwhile.
 NEEDED = {"joints": dict.fromkeys(LIES, 0.35), "wheels": dict.fromkeys(LIES, 0.6)}
-SLOW, FASTER = (
-    (0.5, 0.25),
-    1.2,
-)  # [rad/s, m/s] of joints and tool, or as fast as it was times this: never faster by a stop
+# [rad/s, m/s] of joint and tool: a stop makes an arm no faster than this, or than it was, times what the servos of an
+# arm that is speeding up lag behind.
+SLOW, FASTER = (0.5, 0.25), 1.3
 
 
 class Judge:
@@ -468,7 +467,7 @@ def main(arguments: list[str] | None = None) -> int:
     for space in NEEDED:
         for lie in LIES:
             one = deceive(space, lie, options.streams, options.frames, options.seed)
-            unsafe += one.unsafe + (one.moved > NEEDED[space][lie]) + (one.faster > FASTER)
+            unsafe += one.unsafe + (one.moved > NEEDED[space][lie]) + (space == "joints" and one.faster > FASTER)
             numbers = (f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}")
             lies.add_row(space, lie, *numbers, f"{one.moved:.3f} rad", f"{one.faster:.2f}")
     console.print(lies)

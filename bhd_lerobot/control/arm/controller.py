@@ -320,12 +320,12 @@ class ArmController(Controller):
     def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
         """Follow no setpoints any more; what comes next starts without speeding up.
 
-        Goals and brakes change their acceleration gradually, setpoints do not: one that went on from the acceleration
+        Goals and brakes change their acceleration more gradually than setpoints: one that went on from the acceleration
         of a setpoint near the limit of speed would exceed it.
         """
         left = mask & self.setpoints.active
         if left.any():
-            np.copyto(self.acceleration, 0.0, where=left[:, None] & (self.acceleration * self.velocity > 0))
+            self.goals.leave_setpoints(left)
             self.setpoints.drop(left)
 
     def at_rest(self) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
 from bhd_lerobot.control.motion.supervision import Supervisor
-from bhd_lerobot.control.motion.trajectory import PlanFailure, State
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State, Trajectory, eased
 
 Array = NDArray[np.float64]
 Reference = tuple[Array, Array, Array]
@@ -64,6 +64,7 @@ class GoalManager:
         self._judged = np.flatnonzero(self._is_judged)  # simulations whose goal is followed
         self._braking = self._judged  # simulations that a brake is played for
         self._idle = True
+        self._left, self._setpoint_jerk = np.zeros(n, np.bool_), np.asarray(arm.limits.setpoint_jerk)
 
     # --- requests of a brain -----------------------------------------------------------------------------------------
 
@@ -129,6 +130,10 @@ class GoalManager:
                 self._brake(sim, reference, wanted)
             self._changed(sim)
 
+    def leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
+        """Go on from setpoints in this tick, which change accelerations faster than goals; `mask` has shape (n,)."""
+        self._left |= mask
+
     def end_all(self, mask: NDArray[np.bool_], code: ResultCode, message: str) -> None:
         """End all goals of some arms, and let the owner have the reference, which stays as it is.
 
@@ -182,6 +187,7 @@ class GoalManager:
             for sim in sorted(self._waiting):
                 if self._serve(sim, reference):
                     self._changed(sim)
+        self._left[:] = False
         self._player.tick(*reference)
 
     # --- the state machine -------------------------------------------------------------------------------------------
@@ -205,14 +211,14 @@ class GoalManager:
     def _prepare(self, sim: int, book: GoalBook, reference: Reference) -> bool:
         """Have the next goal planned, and start it; return whether it was started or has failed."""
         self.phase[sim] = GoalPhase.CONVERTING
-        now = State(*(array[sim] for array in reference))
+        before, now = self._begin(sim, reference)
         if self._orders.deferred and self._motion[sim] == _Motion.NONE and now.moving:
             # It has followed setpoints. Where it is going to be is known only after a stop.
             self._brake(sim, reference, _Motion.BRAKE)
             self._changed(sim)
 
         def ahead(ticks: int) -> State:
-            return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*(array[sim] for array in reference))
+            return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*vars(now).values())
 
         command = book.waiting[0]
         plan = self._orders.ask(sim, command, now, ahead, self._opening[sim], self._held[sim])
@@ -227,7 +233,7 @@ class GoalManager:
         self._planned[sim] = plan.trajectory.ticks
         self._opening[sim] = float(plan.target[self._dof])
         if plan.rows is None:
-            self._player.start(sim, plan.trajectory)
+            self._player.start(sim, plan.trajectory if before is None else before.then(plan.trajectory))
         else:
             self._player.borrow(plan.rows)
         self._supervisor.begin(sim, command, plan.target)
@@ -238,10 +244,16 @@ class GoalManager:
     def _brake(self, sim: int, reference: Reference, motion: _Motion) -> None:
         """Brake an arm; one that is at rest stays there."""
         self._rest(sim)
-        state = State.of(*(array[sim] for array in reference))
+        before, state = self._begin(sim, reference)
         if state.moving:
-            self._player.start(sim, self.planner.brake(state, hard=motion == _Motion.HARD_BRAKE))
+            brake = self.planner.brake(state, hard=motion == _Motion.HARD_BRAKE)
+            self._player.start(sim, brake if before is None else before.then(brake))
             self._motion[sim] = motion
+
+    def _begin(self, sim: int, reference: Reference) -> tuple[Trajectory | None, State]:
+        """Return from where a motion of an arm begins, and what has to be played before."""
+        state = State.of(*(array[sim] for array in reference))
+        return eased(state, self._setpoint_jerk, self._hz) if self._left[sim] else (None, state)
 
     def _rest(self, sim: int) -> None:
         self._player.stop(sim)

@@ -218,6 +218,32 @@ def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFai
     return Trajectory(both.position[:, columns], both.velocity[:, columns], both.acceleration[:, columns])
 
 
+def eased(start: State, jerk: Array, hz: int) -> tuple[Trajectory | None, State]:
+    """Return how what speeds a motion up falls to nothing as fast as it rose, and where that ends.
+
+    Args:
+        start: as setpoints left it: a command that went the last tick at one speed.
+        jerk: largest change of an acceleration [rad/s^3 or m/s^3], shape (dof,).
+        hz: ticks a second [Hz].
+    """
+    rows, state, step = [], start, jerk / hz
+    half = 0.5 / hz  # [s] a trajectory's speed is that at the end of a tick
+    while (np.abs(state.acceleration) > step)[state.acceleration * state.velocity > 0].any():
+        state = State(state.position, state.velocity, _less(state, step))
+        velocity = state.velocity + state.acceleration / hz
+        state = State(state.position + velocity / hz, velocity, state.acceleration)
+        rows.append((state.position, velocity + state.acceleration * half, state.acceleration))
+    rest = _less(state, step)
+    before = Trajectory(*np.array(rows).swapaxes(0, 1)) if rows else None
+    return before, State(state.position, state.velocity + rest * half, rest)
+
+
+def _less(state: State, step: Array) -> Array:
+    """Return accelerations of which those that speed up are less by a step."""
+    change = np.where(state.acceleration * state.velocity > 0, np.minimum(np.abs(state.acceleration), step), 0.0)
+    return np.asarray(state.acceleration - np.copysign(change, state.acceleration))
+
+
 def at_once(position: ArrayLike) -> Trajectory:
     """Return the trajectory of one tick that stands still at a position, shape (dof,)."""
     row = np.array(position, np.float64)[None]

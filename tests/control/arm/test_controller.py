@@ -50,6 +50,47 @@ def test_a_moving_arm_is_where_it_is_commanded() -> None:
     rig.check()
 
 
+def leave(rig: Rig, how: str, rng: np.random.Generator) -> None:
+    if how == "emergency stop":
+        rig.cerebellum.estop.press()
+    elif how == "goal":
+        rig.go(joint_target=posture(j0=float(rng.uniform(-1, 1))))
+    elif how == "deactivation":
+        rig.request(Request.DEACTIVATE)
+    elif how == "not finite":
+        rig.cerebellum.fifo.push(10**6, rig.now, np.full((1, 7), np.nan), np.ones(1, np.bool_))
+    elif how != "silence":
+        rig.cerebellum.interrupt(Watchdog.BRAIN, Mode.STOPPING)
+        rig.tick(int(rng.integers(1, 30)))
+        rig.send(HOME)
+
+
+@pytest.mark.parametrize(
+    "how", ["silence", "emergency stop", "goal", "deactivation", "not finite", "a stop and setpoints again"]
+)
+def test_whatever_ends_a_stream_of_setpoints_bends_the_reference_no_more_than_the_stream(how: str) -> None:
+    for seed in range(30):
+        rng, rig = np.random.default_rng(seed), Rig()
+        values, rate = HOME.copy(), rng.uniform(0.1, 1.0)
+        for frame in range(int(rng.integers(3, 25))):
+            if seed % 3 == 0 and frame % 4 == 0:
+                values = HOME + rng.uniform(-1, 1, 7) * (1, 1, 1, 1, 1, 1, 0.03)
+            elif seed % 3 == 1:
+                values = values + rng.uniform(0, 0.13, 7) * (1, 1, 1, 1, 1, 1, 0.01)
+            elif seed % 3 == 2:
+                values = HOME + np.array([1, 0.5, 0.5, 1, 1, 1, -0.02]) * np.sin(frame * rate)
+            rig.send(values)
+            rig.tick(FRAME)
+        rig.send(values + np.array([0.05] * 6 + [-0.005]))
+        rig.tick(int(rng.integers(0, FRAME)))
+        leave(rig, how, rng)
+        rig.tick(60)
+        rows = np.array(rig.rows)[:, 0]
+        jerk = np.abs(np.diff(rows, n=3, axis=0)) * HZ**3
+        assert (jerk <= np.array(LIMITS.setpoint_jerk) * 1.05).all(), seed
+        assert (np.abs(np.diff(rows, axis=0)) * HZ <= np.array(LIMITS.velocity) * 1.001).all(), seed
+
+
 def test_without_setpoints_the_arm_stops_at_the_time_out_and_holds() -> None:
     rig = Rig()
     values = HOME.copy()
