@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.guard import Guard
+from bhd_lerobot.control.kernels import largest_change
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.realtime.block import LiveBlock
 
+_GENTLE = 0.1  # of the difference that two changes may have: by so much may catching up speed up, or slow down
+_ROUNDING = 1e-9
 _COMMANDS = 8  # capacity of the ring; only the newest counts
 _START_TICKS = 4  # a first command may be so many ticks' largest change away from where the robot is
 
@@ -208,7 +211,7 @@ class CommandGuard:
         stopped_ns: when it last did [ns].
         number: number of the newest command.
         stamp_ns: when that was written [ns].
-        actuators: the commands in force, shape (1, joints).
+        actuators: what is to be written: the commands in force, or what leads to them gradually, shape (1, joints).
         mode: the robot's `Mode` when they were written, shape (1,).
 
     Args:
@@ -222,7 +225,8 @@ class CommandGuard:
         self._commands, self._timeout_ns, self._wire, self._period_ns = link.commands, timeout_ns, wire, period_ns
         self.phase = PlantPhase.WAITING
         self.stops = self.stopped_ns = self.number = self.stamp_ns = 0
-        self.actuators: NDArray[np.float64] = wire.written  # the same array
+        self.actuators: NDArray[np.float64] = wire.written.copy()
+        self._catches_up, self._extra = False, np.zeros_like(self.actuators)
         self.mode = np.zeros(1, np.int8)
         self._begun = self._acknowledged = self._seen = self._taken_ns = 0
         self._checked_ns: int | None = None
@@ -259,6 +263,8 @@ class CommandGuard:
                 self.stopped_ns = now_ns
         elif good and (self.phase == PlantPhase.WAITING or self._acknowledged >= self.stops):
             self.phase = PlantPhase.DRIVEN
+        if self.phase == PlantPhase.DRIVEN:
+            self.follow()
         return self.phase
 
     def _take(self, now_ns: int, position: NDArray[np.float64]) -> None:
@@ -273,8 +279,30 @@ class CommandGuard:
         ticks = min(int(command["number"]) - self.number, (now_ns - self._taken_ns) // self._period_ns + 1)
         if self.phase != PlantPhase.DRIVEN:
             self._wire.start(command["actuators"], position)
+            self.actuators[:], self._extra[:] = self._wire.written, 0.0
             ticks = _START_TICKS
         self.number, self.stamp_ns = int(command["number"]), int(command["stamp_ns"])
         self._acknowledged, self._taken_ns = int(command["acknowledged"]), now_ns
         self.mode[0] = command["mode"]
         self._is_safe = self._wire.check(command["actuators"], position, ticks) is None
+        near = np.abs(self._wire.written - self.actuators) <= self._wire.limits.change
+        self._catches_up |= ticks > 1 and (self.phase == PlantPhase.DRIVEN or not near.all())
+
+    def follow(self) -> None:
+        """Let `actuators` follow the commands by one tick; `check` has done it for its own.
+
+        Of commands that were missed no more is made up in one write than a tick may change, and gradually: the rest
+        follows in the next ones.
+        """
+        wire, now, extra = self._wire, self.actuators, self._extra
+        if not self._catches_up:
+            now[:] = wire.written
+            return
+        behind, limits = wire.written - now, wire.limits
+        late = behind - wire.rate  # beyond the change of the newest command
+        bend = np.where(np.isfinite(limits.bend), _GENTLE * limits.bend, limits.change)
+        most = np.minimum(largest_change(np.abs(late) / bend) * bend, np.maximum(extra * np.sign(late), 0.0) + bend)
+        extra[:] = np.copysign(np.minimum(most, np.abs(late)), late)
+        step = np.minimum(np.maximum(wire.rate + extra, -limits.change), limits.change) * np.sign(behind)
+        now += np.copysign(np.minimum(np.maximum(step, 0.0), np.abs(behind)), behind)
+        self._catches_up = bool((np.abs(wire.written - now) > _ROUNDING).any())

@@ -1,5 +1,6 @@
 """A cerebellum and a plant in two processes: the plant judges commands by their age, and stops are latched."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
@@ -268,3 +270,30 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
         process.kill()
     assert seen > 0
     assert remote.refresh()["command"] == COUNT
+
+
+@pytest.mark.parametrize("misses", [0.02, 0.1, 0.3])
+def test_a_plant_that_misses_commands_makes_them_up_gradually(misses: float) -> None:
+    """An arm that sways near its largest speed; the plant does not look in some of the ticks."""
+    arm, period = ur5(), 2 * MS
+    limits = WireLimits.of(arm, 500)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        link, clock = PlantLink(replace(SHAPE, joints=7)), [1000 * MS]
+        remote = RemotePlant(link, lambda clock=clock: clock[0])  # type: ignore[misc]
+        guard = CommandGuard(link, 10 * TIMEOUT, Guard(limits, 1), period)
+        guard.begin()
+        where, written = np.array(arm.home)[None], []
+        for tick in range(1200):
+            command = np.array(arm.home)
+            command[:6] += np.array([1, 0.5, -0.7, 1, 1, -1]) * (1 - np.cos(3.0 * min(tick, 1047) / 500))
+            remote.write(command[None])
+            clock[0] += period
+            if rng.random() > misses:
+                assert guard.check(clock[0], where) == PlantPhase.DRIVEN
+                where = guard.actuators.copy()
+                written.append(where[0])
+        change = np.diff(np.array(written), axis=0)
+        assert (np.abs(change) <= limits.change + 1e-12).all()
+        assert (np.abs(np.diff(change, axis=0)) <= limits.bend + 1e-12).all()
+        np.testing.assert_array_equal(written[-1], command)

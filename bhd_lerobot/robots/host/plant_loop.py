@@ -126,8 +126,10 @@ class PlantLoop:
             self.stop.begin(self._actuators)
         if phase != PlantPhase.WAITING:
             world.set_mode(guard.mode if phase == PlantPhase.DRIVEN else _OWN_STOP)
-            for _ in range(1 + min(slot.skipped, self._most_catch_up)):
+            for number in range(1 + min(slot.skipped, self._most_catch_up)):
                 if phase == PlantPhase.DRIVEN:
+                    if number:
+                        guard.follow()
                     actuators: NDArray[np.float64] = guard.actuators
                 else:
                     world.read(reading)

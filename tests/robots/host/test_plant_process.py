@@ -352,8 +352,6 @@ def test_after_a_stop_and_a_reset_the_arm_goes_on_from_where_it_is() -> None:
         parts.tick()
         assert cerebellum.mode[0] == Mode.FAULT
         assert parts.guard.phase == PlantPhase.STOPPED
-    away = np.abs(cerebellum.command - cerebellum.reading.position)[0, :6].max()
-    assert away < 5e-3  # the reference came to rest elsewhere, and gave way to where the plant stopped the arm
     opening = cerebellum.command[0, -1]
     before = cerebellum.reading.position.copy()
     assert cerebellum.request(Request.RESET).accepted.all()
