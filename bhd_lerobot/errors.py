@@ -121,8 +121,9 @@ def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
         choices: the valid names.
     """
     names = sorted(choices)
-    near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.6)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    by_lower_case = {name.lower(): name for name in names}
+    near = difflib.get_close_matches(str(value).lower(), by_lower_case, n=1, cutoff=0.6)
+    hint = f" Did you mean {by_lower_case[near[0]]!r}?" if near else ""
     return f"Unknown {kind} {value!r}.{hint} Valid: {', '.join(names) if names else '(none)'}."
 
 

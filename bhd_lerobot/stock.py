@@ -7,8 +7,12 @@ first asked for.
 
 import inspect
 import json
+import sys
+import threading
 from importlib import import_module
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 _MODULES = {
@@ -41,6 +45,37 @@ _MODULES = {
     "lerobot.utils.utils": ("has_method",),
 }
 _WHERE = {name: module for module, names in _MODULES.items() for name in names}
+
+
+_DEFERRED = ("cameras", "configs", "envs", "policies", "processor", "robots", "teleoperators", "utils")
+_LOCK = threading.RLock()
+
+
+class _DeferredPackage(ModuleType):
+    """A package whose modules can be imported, and whose own code runs when the first of its names is asked for."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name != "__all__":
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        with _LOCK:
+            if not self.__dict__.setdefault("_is_executed", False):
+                self._is_executed = True
+                assert self.__spec__ is not None
+                assert self.__spec__.loader is not None
+                self.__spec__.loader.exec_module(self)
+            if name in self.__dict__:
+                return self.__dict__[name]
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+
+
+def defer_packages() -> None:
+    """Let programs import LeRobot's configurations without what its packages import beside them: PyTorch and pandas."""
+    for name in (f"lerobot.{package}" for package in _DEFERRED):
+        if name not in sys.modules and (spec := find_spec(name)) is not None:
+            package = module_from_spec(spec)
+            package.__class__ = _DeferredPackage
+            sys.modules[name] = package
+            setattr(sys.modules["lerobot"], name.removeprefix("lerobot."), package)
 
 
 def __getattr__(name: str) -> Any:

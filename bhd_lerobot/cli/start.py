@@ -16,6 +16,7 @@ from types import FrameType
 
 from bhd_lerobot import __version__
 from bhd_lerobot.options.command import INTERRUPTED, exit_status
+from bhd_lerobot.stock import defer_packages
 from bhd_lerobot.versions import check_version
 
 _WITHOUT_LEROBOT = ("bhd_lerobot.cli.doctor", "bhd_lerobot.cli.monitor")
@@ -61,6 +62,7 @@ def run(module: str) -> int:
         with leaving_on_interrupt():
             if module not in _WITHOUT_LEROBOT:
                 check_version("lerobot")
+                defer_packages()
             main = importlib.import_module(module).main
         return main()
 

@@ -1,7 +1,7 @@
 """`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and videos."""
 
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -20,7 +20,7 @@ from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError, counted
 from bhd_lerobot.evaluation.config import YARDSTICKS, Comparison, EvalConfig
-from bhd_lerobot.evaluation.operator import Operator, random_order
+from bhd_lerobot.evaluation.operator import Operator, drawn_orders
 from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import (
     RESULTS_NAME,
@@ -46,8 +46,28 @@ from bhd_lerobot.tasks.task import outcomes_of
 
 
 def print_summary(console: Console, config: Comparison, result: "EvalResult") -> None:
-    """Print the results, and where they are."""
+    """Print the results, and where they are; of a blinded evaluation that goes on later only that it does."""
     results = result.results
+    if not (result.is_blinded and results.is_partial and config.record.repo_id):
+        _print_results(console, config, results)
+    if result.estop is not None:
+        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was started.")
+    if result.fault is not None:
+        console.print(
+            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was started."
+        )
+    if results.is_partial:
+        by = f" by {result.stopped_by.name}" if result.stopped_by else " by the key q" if result.has_quit else ""
+        again = " The same command runs the missing episodes" if config.record.repo_id else ""
+        again += ", and shows the results at the end." if result.is_blinded and again else "." * bool(again)
+        console.print(f"Stopped{by}: the results are partial, with all finished episodes.{again}")
+    for label in result.missed:
+        low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
+        console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
+    console.print(f"Report: {escape(str(result.report))}", soft_wrap=True)
+
+
+def _print_results(console: Console, config: Comparison, results: EvalResults) -> None:
     baseline = config.reference
     table = Table(
         title=config.heading,
@@ -80,20 +100,6 @@ def print_summary(console: Console, config: Comparison, result: "EvalResult") ->
             console.print(escape(f"{label}: {perception_sentence(one.perception)}"), soft_wrap=True)
     if config.sequential:
         console.print(escape(sequential_sentence(results)), soft_wrap=True, highlight=False)
-    if result.estop is not None:
-        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was started.")
-    if result.fault is not None:
-        console.print(
-            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was started."
-        )
-    if results.is_partial:
-        by = f" by {result.stopped_by.name}" if result.stopped_by else " by the key q" if result.has_quit else ""
-        again = " The same command runs the missing episodes." if config.record.repo_id else ""
-        console.print(f"Stopped{by}: the results are partial, with all finished episodes.{again}")
-    for label in result.missed:
-        low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
-        console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
-    console.print(f"Report: {escape(str(result.report))}", soft_wrap=True)
 
 
 def _marks(one: BrainSummary, baseline: str, count: int) -> list[str]:
@@ -124,6 +130,7 @@ class EvalResult:
         fault: why a real robot's fault ended the run, as text; None if none did.
         estop: what pressed the emergency stop that ended the run, as text; None if there was none.
         has_quit: whether a person ended the run.
+        is_blinded: whether a person judges, who is not to know which brain ran.
     """
 
     output_dir: Path
@@ -135,6 +142,7 @@ class EvalResult:
     estop: str | None = None
     fault: str | None = None
     has_quit: bool = False
+    is_blinded: bool = False
 
     @property
     def exit_status(self) -> int:
@@ -150,6 +158,7 @@ class EvalResult:
 
 def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     """Run every brain on the same episodes, write results and report."""
+    printed = console or Console()
     console = console or Console(stderr=True)
     refuse_results(config)
     n = 1 if config.is_live else min(config.n_envs, len(config.indices))
@@ -164,7 +173,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         for label in config.chosen:
             runs.append(prepare(config, label, robots, pool))
             opened.callback(runs[-1].close)
-        print_notes(robots, console)
+        print_notes(console, robots, runs[0].loop.task)
         if (
             pool is None
             and robots.camera_shapes
@@ -175,14 +184,15 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
             _add_keys(config, pressed, person, console)
         preview, no_videos = _make_preview(config, robots, console)
         with run_folder(config, "eval") as output_dir:
-            facts = _facts(config, robots, runs)
+            orders = drawn_orders(output_dir, list(config.chosen), config.indices) if config.by_person else {}
+            facts = _facts(config, robots, runs, orders)
             for one in runs:
                 opened.enter_context(open_dataset(config, one))
 
         def summary() -> EvalResults:
             return _summary(config, facts, runs)
 
-        for _ in _run(config, runs, person, lambda: bool(stop) or person.has_quit, console):
+        for _ in _run(config, runs, orders, person, lambda: bool(stop) or person.has_quit, console=console):
             if config.sequential and summary().is_decided:
                 break
         for one in (one for one in runs if one.recorded):
@@ -203,8 +213,8 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         "brains": {brain_run.label: brain_run.timing() for brain_run in runs if brain_run.loop.act_times},
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
-    result.fault, result.has_quit = fault, person.has_quit
-    finish(console, config, result, lambda: _report_input(config, result, runs, preview, no_videos))
+    result.fault, result.has_quit, result.is_blinded = fault, person.has_quit, config.by_person
+    finish(printed, config, result, lambda: _report_input(config, result, runs, preview, no_videos))
     return result
 
 
@@ -245,7 +255,13 @@ def _add_keys(config: EvalConfig, pressed: EstopInputs, person: Operator, consol
 
 
 def _run(
-    config: EvalConfig, runs: Sequence[BrainRun], person: Operator, stop: Callable[[], bool], console: Console
+    config: EvalConfig,
+    runs: Sequence[BrainRun],
+    orders: Mapping[str, Sequence[str]],
+    person: Operator,
+    stop: Callable[[], bool],
+    *,
+    console: Console,
 ) -> Iterator[None]:
     """Run the episodes, and yield where a sequential test may end the run: all brains have run the same ones."""
     robots, number = runs[0].loop.robots, 0
@@ -260,7 +276,7 @@ def _run(
         for name, shared in shown:
             bar = progress.add_task(name, total=len(shared) * len(config.indices), success="")
             bars |= {one.label: _shower(progress, bar, shared) for one in shared}
-        for together in _rounds(config, runs, robots.n):
+        for together in _rounds(config, runs, orders, robots.n):
             for one, specs in together:
                 if config.by_person:
                     number, task = number + 1, one.loop.task
@@ -274,16 +290,16 @@ def _run(
 
 
 def _rounds(
-    config: EvalConfig, runs: Sequence[BrainRun], n: int
+    config: EvalConfig, runs: Sequence[BrainRun], orders: Mapping[str, Sequence[str]], n: int
 ) -> Iterator[list[tuple[BrainRun, Sequence[EpisodeSpec]]]]:
     """Yield the brains with episodes that they all run before any runs others, in the order in which they do.
 
-    With a person, that is one episode, in an order at random; with a sequential test n of them; otherwise all.
+    With a person, that is one episode, in the order drawn for it; with a sequential test n of them; otherwise all.
     """
     specs, by_label = specs_of(config), {one.label: one for one in runs}
     if config.by_person:
         for spec in specs:
-            yield [(by_label[label], [spec]) for label in random_order(list(by_label), spec.index, config.seed)]
+            yield [(by_label[label], [spec]) for label in orders[str(spec.index)]]
         return
     size = n if config.sequential else len(specs)
     for first in range(0, len(specs), size):
@@ -311,7 +327,9 @@ def _summary(config: EvalConfig, facts: dict[str, Any], runs: Sequence[BrainRun]
     )
 
 
-def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict[str, Any]:
+def _facts(
+    config: EvalConfig, robots: Robots, runs: Sequence[BrainRun], orders: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
     """Return what decides the numbers, as plain values; how many run side by side does not."""
     return {
         "robot": describe(robots.config),
@@ -325,14 +343,9 @@ def _facts(config: EvalConfig, robots: Robots, runs: Sequence[BrainRun]) -> dict
         "jerk": jerk_of(robots).what,
         "jerk_unit": jerk_of(robots).unit,
         **({"sequential": True} if config.sequential else {}),
-        **({"order": _orders(config)} if config.by_person else {}),
+        **({"order": dict(orders)} if orders else {}),
         **({"gate": asdict(config.gate)} if robots.body is None else {}),
     }
-
-
-def _orders(config: EvalConfig) -> dict[str, list[str]]:
-    """Return in which order the brains run each episode, by its number."""
-    return {str(index): random_order(list(config.chosen), index, config.seed) for index in config.indices}
 
 
 def measured_with() -> dict[str, str]:

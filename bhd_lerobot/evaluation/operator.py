@@ -1,25 +1,40 @@
 """A person beside a real robot who sets up scenes and judges, and the order in which the brains run."""
 
+import json
+import random
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
+from bhd_lerobot.evaluation.results import write_json
 from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.types import EpisodeSpec
 
-_ORDER_STREAM = 3  # beside the scenes' and the brains' random numbers
 _POLL_S = 0.05
 _JUDGING = tuple(key for key in KEYS if key.meaning in ("success", "failure"))
 
 
-def random_order(labels: Sequence[str], index: int, seed: int) -> list[str]:
-    """Return in which order the brains run an episode: at random, by the run's seed and the episode's number."""
-    rng = np.random.default_rng(np.random.SeedSequence([_ORDER_STREAM, seed, index]))
-    return [labels[place] for place in rng.permutation(len(labels))]
+def drawn_orders(folder: Path, labels: Sequence[str], indices: Sequence[int]) -> dict[str, list[str]]:
+    """Return in which order the brains run each episode, by its number, as drawn when the evaluation began.
+
+    An order that followed from the seed would be the same in every evaluation, and a person would come to know it.
+
+    Args:
+        folder: the evaluation's, which keeps the order for when it is continued.
+        labels: of the brains.
+        indices: of the episodes.
+    """
+    path, chance = folder / "order.json", random.SystemRandom()
+    if path.is_file():
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    orders = {str(index): chance.sample(labels, len(labels)) for index in indices}
+    write_json(path, orders)
+    return orders
 
 
 class Operator(Marks):

@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bhd_lerobot.options.parse import choices_of, entries_of, options_of
+from bhd_lerobot.options.parse import choices_of, entries_of, options_of, valid_names
 
 _INDENT = 26  # [characters] where meanings begin
 # What LeRobot's own classes say nowhere; where a class says it, that counts.
@@ -49,7 +49,9 @@ _TYPES = {"str": "TEXT", "Path": "PATH", "bool": "true|false", "int": "N", "floa
 
 
 def summary_of(config_class: type) -> str:
-    """Return the first paragraph of a class's docstring."""
+    """Return the first paragraph of a class's docstring; empty if it has the one that `dataclass` makes."""
+    if (config_class.__doc__ or "").startswith(f"{config_class.__name__}("):
+        return ""
     return inspect.cleandoc(config_class.__doc__ or "").partition("\n\n")[0].replace("``", "`")
 
 
@@ -130,13 +132,21 @@ def _lines(config_class: type, prefix: str, title: str, chosen: Mapping[str, str
         if choices := choices_of(entry or kind):
             option = f"{key}.NAME.type" if entry else f"{key}.type"
             picked = {given: type_name for given, type_name in chosen.items() if _is(given, option)}
-            valid = ", ".join(sorted(choices))
+            valid = ", ".join(valid_names(entry or kind))
+            if set(picked.values()) - choices.keys():
+                choices = choices_of(entry or kind, of_lerobot=True)
             known = {given: type_name for given, type_name in picked.items() if type_name in choices}
             more = "" if known else f" Its options: --{option}=TYPE --help"
             yield from _entry(f"--{option}=TYPE", f"{meaning} Valid: {valid}.{more}".strip(), width)
             for given, type_name in known.items():
                 group = choices[type_name]
-                inner.append((group, f"{given.removesuffix('type')}", f"{given}={type_name}: {summary_of(group)}"))
+                inner.append(
+                    (
+                        group,
+                        f"{given.removesuffix('type')}",
+                        f"{given}={type_name}: {summary_of(group)}".removesuffix(" "),
+                    )
+                )
         elif dataclasses.is_dataclass(kind):
             group = typing.cast(type, kind)
             inner.append((group, f"{key}.", f"{key}: {meaning or summary_of(group)}"))
@@ -152,7 +162,7 @@ def _is(given: str, option: str) -> bool:
 
 
 def _short(value: Any) -> str:
-    plain = {None: "nothing", True: "true", False: "false", "": "nothing"}
+    plain = {None: "none", True: "true", False: "false", "": "not set"}
     text = plain.get(value, str(value)) if isinstance(value, str | bool | None) else str(value)
     return text if len(text) <= 40 else f"{text[:37]}…"
 

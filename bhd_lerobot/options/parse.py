@@ -21,11 +21,24 @@ import draccus
 import yaml
 
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
-from bhd_lerobot.options.plugins import load_lerobot
+from bhd_lerobot.options.plugins import load_lerobot, names_of_lerobot
 
 CONFIG_PATH = "config_path"
 RUN_CONFIG = "config.yaml"
 """What the configuration of a run is called in its folder."""
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a key that a mapping has twice, of which YAML would take the last without a word."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in (key for key in keys if isinstance(key, str) and keys.count(key) > 1):
+            place = f"line {node.start_mark.line + 1}"
+            raise yaml.YAMLError(
+                f"the key {key!r} occurs twice in the mapping that begins in {place}; leave one of them"
+            )
+        return dict(super().construct_mapping(node, deep))
 
 
 @dataclasses.dataclass
@@ -140,7 +153,8 @@ def read_file(path: Path) -> dict[str, Any]:
     """Return what a YAML or JSON file holds."""
     try:
         text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)  # JSON's 1e-05 is text in YAML
+        # JSON's 1e-05 is text in YAML.
+        values = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)
     except OSError as error:
         raise ConfigError(
             f"The configuration {str(path)!r} cannot be read: {error.strerror}. Give --config_path a YAML or JSON file."
@@ -161,6 +175,8 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
         if old in values and new not in values:
             values[new] = values.pop(old)
     for key, value in values.items():
+        if key not in fields and (ours := getattr(config_class, "of_lerobot", {}).get(key)):
+            raise ConfigError(f"{prefix}{key} is an option of LeRobot's command. Here: {ours}.")
         if key not in fields:
             valid = [f"{prefix}{name}" for name in (*others, *fields)] + ([] if prefix else [CONFIG_PATH])
             raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
@@ -172,7 +188,7 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not choices_of(kind):
                 _check_keys(typing.cast(type, kind), {}, f"{prefix}{name}.")  # names what is missing in it
-            choice = f".type, one of {', '.join(sorted(choices_of(kind)))}" if choices_of(kind) else ""
+            choice = f".type, one of {', '.join(valid_names(kind))}" if choices_of(kind) else ""
             raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
 
 
@@ -190,7 +206,7 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
         chosen = value.get("type")
         if chosen is None:
             given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
-            raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(sorted(choices))}.")
+            raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(valid_names(kind))}.")
         if chosen not in choices:
             choices = choices_of(kind, of_lerobot=True)
         if chosen not in choices:
@@ -291,8 +307,7 @@ def choices_of(kind: Any, *, of_lerobot: bool = False) -> dict[str, type]:
         of_lerobot: import what LeRobot itself has to choose from, robots, teleoperators or cameras, which takes a
             moment; of a type without any choice that is always done.
     """
-    if _allows_none(kind) and len(typing.get_args(kind)) == 2:
-        kind = typing.get_args(kind)[0]
+    kind = _without_none(kind)
     if not (isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry)):
         return {}
     known = kind.get_known_choices()
@@ -300,6 +315,21 @@ def choices_of(kind: Any, *, of_lerobot: bool = False) -> dict[str, type]:
         load_lerobot(getattr(kind, "lerobot_package", kind.__module__))
         known = kind.get_known_choices()
     return known
+
+
+def types_of(config: Any) -> str:
+    """Return the names that a registered configuration may be chosen by, as text: LeRobot has several for some."""
+    return " or ".join(repr(name) for name, kind in config.get_known_choices().items() if kind is type(config))
+
+
+def valid_names(kind: Any) -> list[str]:
+    """Return what may be chosen of a choice type, LeRobot's own included, which are not imported."""
+    kind = _without_none(kind)
+    return sorted({*choices_of(kind), *names_of_lerobot(getattr(kind, "lerobot_package", kind.__module__))})
+
+
+def _without_none(kind: Any) -> Any:
+    return typing.get_args(kind)[0] if _allows_none(kind) and len(typing.get_args(kind)) == 2 else kind
 
 
 def _cause(error: BaseException) -> BaseException:

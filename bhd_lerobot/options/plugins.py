@@ -8,10 +8,12 @@ one with an entry point of the group `ENTRY_POINTS`, or a module that a command 
 import contextlib
 import importlib
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ ENTRY_POINTS = "bhd_lerobot.plugins"
 PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
 """How the names of distributions begin that LeRobot imports."""
 
+_CHOICES = ("lerobot.robots", "lerobot.teleoperators", "lerobot.cameras")
 _OPTION = "discover_packages_path"
 # This distribution, for LeRobot's commands. Ours register what they need; our environments take seconds to import.
 _OURS = "lerobot_robot_bhd"
@@ -61,12 +64,24 @@ def load_lerobot(module: str) -> None:
             done for others.
     """
     package = ".".join(module.split(".")[:2])
-    if package not in ("lerobot.robots", "lerobot.teleoperators", "lerobot.cameras"):
+    if package not in _CHOICES:
         return
     for found in pkgutil.iter_modules(importlib.import_module(package).__path__, f"{package}."):
         if found.ispkg:
             with contextlib.suppress(Exception):  # whatever a driver raises while it is imported
                 importlib.import_module(found.name)
+
+
+def names_of_lerobot(module: str) -> list[str]:
+    """Return the types that `load_lerobot` would register, without importing them."""
+    package = ".".join(module.split(".")[:2])
+    if package not in _CHOICES:
+        return []
+    spec = find_spec(package)
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    files = (path for folder in folders for path in Path(folder).glob("*/config*.py"))
+    texts = (path.read_text(encoding="utf-8") for path in files)
+    return sorted({name for text in texts for name in re.findall(r"register_subclass\(\s*\"(\w+)\"", text)})
 
 
 def misnamed() -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """Configuration of `bhd-record`."""
 
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 from lerobot.robots.config import RobotConfig
 
@@ -45,6 +45,25 @@ class DatasetConfig:
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.
     """
+
+    of_lerobot: ClassVar[dict[str, str]] = {
+        "single_task": "--task.type=free --task.instruction='…'",
+        "video": "--robot.camera=true or false; images of other robots are those of --robot.cameras",
+        "no_stamp": "leave it out; a folder is named as it is given",
+        **dict.fromkeys(
+            (
+                "num_image_writer_processes",
+                "num_image_writer_threads_per_camera",
+                "video_encoding_batch_size",
+                "streaming_encoding",
+                "encoder_queue_maxsize",
+                "encoder_threads",
+                "rgb_encoder",
+                "depth_encoder",
+            ),
+            "leave it out; images are encoded while the robot runs, by a process of its own",
+        ),
+    }
 
     repo_id: str = ""
     root: str | None = None
@@ -96,6 +115,12 @@ class RecordConfig:
             to, by default 8765.
         display_compressed_images: send images as JPEG; always on for a viewer on another machine.
     """
+
+    of_lerobot: ClassVar[dict[str, str]] = {
+        "policy": "--brain.type=learned --brain.path=CHECKPOINT",
+        "play_sounds": "leave it out; a terminal's bell takes their place",
+        "interpolation_multiplier": "leave it out; setpoints are interpolated at robot.control_hz",
+    }
 
     robot: RobotConfig
     task: TaskConfig = field(default_factory=FreeConfig)

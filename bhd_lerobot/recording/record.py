@@ -73,7 +73,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         if robots.clock is not None and robots.world is None:
             seconds = config.dataset.reset_time_s
             loop.before_start = ResetPhase(robots, brain, marks, seconds, stop=lambda: bool(stop), console=console)
-        print_notes(robots, console)
+        print_notes(console, robots, task)
         preview = _make_preview(config, robots, console)
         if robots.camera_shapes and is_here:
             robots.start_rendering()  # a machine without OpenGL fails here, before a dataset exists

@@ -1,5 +1,7 @@
 """What every run of episodes shows in the terminal, and its exit status."""
 
+from typing import Any
+
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -21,7 +23,7 @@ def progress_bars(console: Console, *fields: str) -> Progress:
     )
 
 
-def print_notes(robots: Robots, console: Console) -> None:
-    """Print what has to be known of the robots before they move."""
-    for note in robots.notes:
+def print_notes(console: Console, robots: Robots, task: Any = None) -> None:
+    """Print what has to be known of robots and task before they begin."""
+    for note in (*robots.notes, *getattr(task, "notes", ())):
         console.print(note, soft_wrap=True, highlight=False)

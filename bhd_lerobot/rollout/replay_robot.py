@@ -79,7 +79,7 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
                 f"gate.max_change does not limit {', '.join(free)}: there the robot would jump from where it is to "
                 "where the episode began. Set one number for all positions, or one for each."
             )
-        print_notes(robots, console)
+        print_notes(console, robots)
         pressed.add_signal(estop_signal("SIGUSR1"))
         key = "space or e, or " if pressed.add_key() else ""
         console.print(f"Emergency stop: {key}kill -USR1 {os.getpid()}")

@@ -82,6 +82,12 @@ class AvoidTask(BaseTask):
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
+        if body is not None and (longest := body.limits.velocity[0] * config.duration_s) < config.min_path_m:
+            self.notes = (
+                f"warning: no episode can succeed: in task.duration_s = {config.duration_s:g} s the robot drives "
+                f"{longest:.2g} m at the most, and task.min_path_m is {config.min_path_m:g}. Set a longer duration or "
+                "a shorter path.",
+            )
         self._sensing = Sensing(config.sensing, n, fps, slice(2))
         self._window = self.in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.

@@ -178,6 +178,7 @@ class ConfiguredTask:
         duration_s: longest duration of an episode [s].
         max_frames: the same [frames].
         frame: frames of each episode so far, shape (n,); `begin` sets them to 0, `count_frame` counts.
+        notes: what a person has to know before the episodes begin.
 
     Args:
         config: the parameters, with a `duration_s`.
@@ -190,6 +191,7 @@ class ConfiguredTask:
     environment_names: tuple[str, ...] = ()
     lasts = False
     needs: frozenset[str] | None = None
+    notes: tuple[str, ...] = ()
     never: ClassVar[tuple[Event, ...]] = ()
     """Events that cannot happen in this task."""
 

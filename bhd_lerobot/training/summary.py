@@ -71,8 +71,7 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
         if result.checkpoint is not None:
             lines.append(f"  {resume_command(result.checkpoint)}")
     elif result.checkpoint is not None:
-        kind = "" if config.policy is None else config.policy.type
-        lines += how_to_evaluate(result.contract, str(result.checkpoint), kind)
+        lines += how_to_evaluate(result.contract, str(result.checkpoint), config.policy)
     for line in lines:
         console.print(escape(line), soft_wrap=True, highlight=False)
 
@@ -91,8 +90,8 @@ def _course(losses: Sequence[float]) -> str:
     return f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end"
 
 
-def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -> list[str]:
-    """Return a line and a command that evaluate a checkpoint of a type of policy on held-out episodes of its task.
+def how_to_evaluate(contract: PolicyContract, checkpoint: str, policy: Any = None) -> list[str]:
+    """Return a line and a command that evaluate a checkpoint of a policy on held-out episodes of its task.
 
     The command names the options of robot and task that are not at their defaults: with others the observations or
     actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
@@ -100,7 +99,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = robot_configs()
     found: Any = with_present_names({"task": contract.task or {}})["task"]
-    task, module = found.get("type"), ""
+    kind, task, module = "" if policy is None else policy.type, found.get("type"), ""
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}
     if contract.robot_type not in kinds:
@@ -125,6 +124,8 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -
         text = f"Its task {task!r} is of a plug-in that is not installed. Evaluate it, with the plug-in's module, with:"
         usual = dict.fromkeys(key for key in found if key != "type")
         module = " --task.discover_packages_path=MODULE"
+    if policy is not None and (name := module_to_name(type(policy))) is not None:
+        module += f" --brain.discover_packages_path={'MODULE' if name == '__main__' else name}"
     brain = "type=language --brain.perception.path" if kind == "bhd_perception" else "path"
     robot, default = contract.robot or {}, vars(kinds[contract.robot_type]())
     off = {name: False for name in LEFT_OUT_IF_OFF if robot and name not in robot and default.get(name) is True}

@@ -12,7 +12,7 @@ import pytest
 
 from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.validate.dataset import check_dataset
-from bhd_lerobot.evaluation.operator import random_order
+from bhd_lerobot.evaluation.operator import drawn_orders
 from tests.forks import Fork
 from tests.waiting import until
 
@@ -86,24 +86,32 @@ def outcomes(folder: Path) -> dict[str, list[str]]:
     return {label: [one["outcome"] for one in episodes if one["brain"] == label] for label in LABELS}
 
 
-def expected(keys: str, seed: int = 5) -> dict[str, list[str]]:
+def orders(folder: Path) -> dict[str, list[str]]:
+    """Return the order in which the brains run each episode."""
+    return dict(json.loads((folder / "e" / "order.json").read_text()))
+
+
+def expected(folder: Path, keys: str) -> dict[str, list[str]]:
     """Return what keys mean, that come in the order in which the brains run."""
     found: dict[str, list[str]] = {label: [] for label in LABELS}
     for index in range(-(-len(keys) // 2)):
-        for label, key in zip(random_order(LABELS, index, seed), keys[2 * index : 2 * index + 2], strict=False):
+        for label, key in zip(orders(folder)[str(index)], keys[2 * index : 2 * index + 2], strict=False):
             found[label].append({"s": "success", "f": "failure"}[key])
     return found
 
 
-def test_the_order_is_a_permutation_for_each_episode_that_follows_from_the_seed():
+def test_the_order_is_a_permutation_for_each_episode_that_is_drawn_once_for_each_evaluation(tmp_path):
     labels = ["a", "b", "c"]
-    orders = [random_order(labels, index, seed=1) for index in range(600)]
-    assert all(sorted(order) == labels for order in orders)
-    assert orders == [random_order(labels, index, seed=1) for index in range(600)]
-    assert orders != [random_order(labels, index, seed=2) for index in range(600)]
-    # Each brain is as often the first as any other: 200 of 600, with a standard deviation of 11.5.
-    assert all(abs(sum(order[0] == label for order in orders) - 200) < 46 for label in labels)
-    assert np.unique([", ".join(order) for order in orders]).size == 6
+    folders = tmp_path / "one", tmp_path / "other"
+    for folder in folders:
+        folder.mkdir()
+    one, other = (drawn_orders(folder, labels, range(6000)) for folder in folders)
+    assert all(sorted(order) == labels for order in one.values())
+    assert one != other
+    assert one == drawn_orders(folders[0], labels, range(6000))
+    # Each brain is as often the first as any other: 2000 of 6000, with a standard deviation of 37.
+    assert all(abs(sum(order[0] == label for order in one.values()) - 2000) < 8 * 37 for label in labels)
+    assert np.unique([", ".join(order) for order in one.values()]).size == 6
 
 
 def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tmp_path):
@@ -118,10 +126,10 @@ def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tm
     for label in LABELS:
         assert label not in before
         assert label in after
-    assert outcomes(tmp_path) == expected(keys)
+    assert outcomes(tmp_path) == expected(tmp_path, keys)
     written = json.loads((tmp_path / "e" / "results.json").read_text())
     assert written["partial"] is False
-    assert written["config"]["order"] == {str(index): random_order(LABELS, index, 5) for index in range(3)}
+    assert written["config"]["order"] == orders(tmp_path)
     assert all(one["path_m"] is None for one in written["episodes"])  # nobody knows where the tool was
     page = (tmp_path / "e" / "report.html").read_text(encoding="utf-8")
     assert "no prompt said which one ran" in page
@@ -142,8 +150,10 @@ def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_p
         run.process.send_signal(end)
     assert run.end() == {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 128 + signal.SIGTERM, "q": 0}[end]
     if end != signal.SIGKILL:
-        assert "The same command runs the missing episodes." in " ".join(run.text().split())
-        assert outcomes(tmp_path) == expected(keys[:3])
+        text = " ".join(run.text().split())
+        assert "The same command runs the missing episodes, and shows the results at the end." in text
+        assert not any(label in text for label in LABELS)  # nobody is told how they are doing
+        assert outcomes(tmp_path) == expected(tmp_path, keys[:3])
     prompt = run.prompted(4)
 
     run = Judged(tmp_path, **recorded)
@@ -151,7 +161,7 @@ def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_p
     assert "Episode 3 of" not in run.text()
     run.judge(keys[3:], first=4)
     assert run.end() == 0, run.text()
-    assert outcomes(tmp_path) == expected(keys)
+    assert outcomes(tmp_path) == expected(tmp_path, keys)
     assert all(check_dataset(tmp_path / "data" / label).is_valid for label in LABELS)
 
 
@@ -185,7 +195,9 @@ def test_a_fault_of_the_robot_ends_the_run_and_what_was_judged_is_kept(tmp_path)
 def test_a_sequential_test_ends_a_real_run(tmp_path):
     """The key after each prompt is for one brain, whichever runs: it wins all of 8 pairs."""
     run = Judged(tmp_path, n_episodes=30, sequential="true")
-    keys = "".join("s" if label == "zeppelin" else "f" for i in range(8) for label in random_order(LABELS, i, 5))
+    run.prompted(1)
+    drawn = orders(tmp_path)
+    keys = "".join("s" if label == "zeppelin" else "f" for i in range(8) for label in drawn[str(i)])
     run.judge(keys)
     assert run.end() == 0, run.text()
     assert "The sequential test ended the run after 8 of 30 pairs of episodes" in " ".join(run.text().split())

@@ -1,6 +1,7 @@
 """The help of the programs: every option with a meaning, short until a type is chosen."""
 
 import dataclasses
+import re
 
 import lerobot.policies  # noqa: F401  registers LeRobot's policies
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.help import help_of, meanings_of
 from bhd_lerobot.options.parse import choices_of, options_of
+from bhd_lerobot.options.plugins import load_lerobot
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.training.config import BhdTrainConfig
@@ -60,3 +62,14 @@ def test_brains_by_name() -> None:
 
 def test_a_type_that_is_not_there_is_left_to_the_parser() -> None:
     assert help_of(RecordConfig, {"robot.type": "nobody"}) == help_of(RecordConfig, {})
+
+
+def test_lerobots_robots_and_teleoperators_are_listed_with_their_options() -> None:
+    from lerobot.robots.config import RobotConfig
+
+    text = help_of(RecordConfig, {})
+    load_lerobot("lerobot.robots")
+    robots, _, rest = text.partition("--task.type")
+    assert set(RobotConfig.get_known_choices()) - set(re.findall(r"\w+", robots)) <= {"mock_arm"}
+    assert "so101_leader" in rest
+    assert "--robot.port=TEXT" in help_of(RecordConfig, {"robot.type": "so101_follower"})

@@ -1,11 +1,15 @@
 """Configuration files and command lines: precedence, types, near misses, round trip."""
 
+import dataclasses
+import re
+import typing
+
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import encode, parse
-from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
 from bhd_lerobot.training.rl.config import RlConfig
 from tests.cases import each_case
 
@@ -99,6 +103,12 @@ def test_help_is_that_of_what_the_command_line_chooses_whatever_else_is_wrong_wi
         ("a.yaml", b"", "found nothing"),
         ("a.yaml", b"- x\n", "found list"),
         ("a.yaml", b"a: [1\nb: {", "is not a YAML file"),
+        (
+            "a.yaml",
+            b"seed: 1\nrobot: {type: ur5}\nseed: 2\n",
+            "'seed' occurs twice in the mapping that begins in line 1",
+        ),
+        ("a.yaml", b"robot:\n  type: ur5\n  type: turtlebot3\n", "'type' occurs twice.* line 2"),
         ("a.yaml", b"\xff\xfe\x00", "is not a YAML file"),
         ("a.yaml", b"\x00", "is not a YAML file"),
         ("a.json", b"{", "is not a JSON file"),
@@ -119,3 +129,30 @@ def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
 
     assert run(Program(RecordConfig, stopped), REQUIRED) == 130
     assert capsys.readouterr().err == "Stopped.\n"
+
+
+@each_case(
+    ("option", "message"),
+    [
+        ("--dataset.single_task=x", "option of LeRobot's command. Here: --task.type=free --task.instruction"),
+        ("--play_sounds=false", "leave it out"),
+        ("--policy.path=x", "--brain.type=learned --brain.path=CHECKPOINT"),
+        ("--dataset.streaming_encoding=true", "leave it out"),
+        ("--robot.type=UR5", "Did you mean 'ur5'"),
+        ("--robot.type=SO101_Follower", "Did you mean 'so101_follower'"),
+        ("--brain.type=Avoidence", "Did you mean 'avoidance'"),
+    ],
+)
+def test_names_of_lerobots_commands_and_other_spellings_lead_to_ours(option, message):
+    others = [one for one in REQUIRED if one.partition("=")[0] != option.partition("=")[0]]
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        parse(RecordConfig, [*others, option])
+
+
+def test_every_option_of_lerobots_recorder_is_ours_or_has_an_answer():
+    from lerobot.scripts.lerobot_record import RecordConfig as Stock
+
+    for ours, stock in ((RecordConfig, Stock), (DatasetConfig, typing.get_type_hints(Stock)["dataset"])):
+        names = {field.name for field in dataclasses.fields(ours)}
+        assert {field.name for field in dataclasses.fields(stock)} <= names | ours.of_lerobot.keys()
+        assert not names & ours.of_lerobot.keys()

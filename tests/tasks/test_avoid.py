@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.bodies.truth import BaseTruth
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.tasks.avoid import TRAIL, AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
@@ -251,3 +252,10 @@ def test_a_new_episode_has_no_trail() -> None:
     seen = trail(run.task, np.array([EMPTY.start, EMPTY.start], float))
     assert seen[0].sum() <= 3  # its own cell, on whose edge it stands
     assert seen[1].sum() > 5
+
+
+def test_a_duration_in_which_no_episode_can_succeed_is_noted() -> None:
+    body = turtlebot3_burger()
+    for duration_s, notes in ((10.0, 1), (13.0, 1), (14.0, 0), (60.0, 0)):  # 3 m at 0.22 m/s take 13.6 s
+        assert len(AvoidTask(AvoidConfig(duration_s=duration_s), 1, 10, body).notes) == notes
+    assert not AvoidTask(AvoidConfig(duration_s=10.0, min_path_m=2.0), 1, 10, body).notes

@@ -5,11 +5,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
+from lerobot.configs import PreTrainedConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import is_for, robot_of_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
@@ -100,9 +103,9 @@ def test_the_command_after_every_recipe_evaluates_whole_episodes_of_its_task(rec
     config = parse(RecordConfig, [f"--config_path={recipe}"])
     task = {"type": TaskConfig.get_choice_name(type(config.task)), **asdict(config.task)}
     contract = PolicyContract(robot_type=config.robot.type, task=task, robot=describe(config.robot))
-    kind = "bhd_perception" if config.brain.get_choice_name(type(config.brain)) == "noop" else "bhd_mlp"
-    _, command = how_to_evaluate(contract, "c", kind)
-    brain = ["--brain.type=learned"] if kind == "bhd_mlp" else []
+    policy = PerceptionConfig() if config.brain.get_choice_name(type(config.brain)) == "noop" else MlpConfig()
+    _, command = how_to_evaluate(contract, "c", policy)
+    brain = ["--brain.type=learned"] if isinstance(policy, MlpConfig) else []
     evaluation = parse(EvalConfig, [*shlex.split(command)[1:], *brain])
     assert describe(evaluation.robot) == describe(config.robot)
     assert evaluation.task.duration_s >= 1.0
@@ -114,3 +117,16 @@ def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robo
     assert "does not record its task" in said
     config = parse(EvalConfig, [*shlex.split(command)[1:], "--brain.type=learned"])
     assert is_for(robot_of_task(config.task), robot.type)
+
+
+def test_the_command_names_the_module_of_a_policy_that_nothing_else_imports() -> None:
+    @PreTrainedConfig.register_subclass("own_policy")
+    @dataclass
+    class OwnConfig(MlpConfig):
+        pass
+
+    OwnConfig.__module__ = "my_policy.configuration_own"
+    _, command = how_to_evaluate(PolicyContract(robot_type="turtlebot3"), "c", OwnConfig())
+    assert "--brain.discover_packages_path=my_policy.configuration_own" in shlex.split(command)
+    _, command = how_to_evaluate(PolicyContract(robot_type="turtlebot3"), "c", MlpConfig())
+    assert "discover_packages_path" not in command

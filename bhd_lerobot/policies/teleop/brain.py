@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_text
 from bhd_lerobot.options.dotted import flattened
+from bhd_lerobot.options.parse import types_of
 from bhd_lerobot.options.units import other_units
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
@@ -172,7 +173,7 @@ def _made(config: Any) -> Any:
         return make_teleoperator_from_config(config)
     except Exception as error:  # of another package's code
         raise ConfigError(
-            f"teleop.type is {config.type!r}, which cannot be made: {as_text(error.__cause__ or error)}."
+            f"teleop.type is {types_of(config)}, which cannot be made: {as_text(error.__cause__ or error)}."
         ) from error
 
 

@@ -4,6 +4,7 @@ import contextlib
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
+from bhd_lerobot.options.parse import types_of
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.host import LeRobotHost
 from bhd_lerobot.robots.external.lock import RobotLock
@@ -22,7 +23,7 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         robot = make_robot_from_config(config)
     except Exception as error:  # of another package's code
         raise ConfigError(
-            f"robot.type is {config.type!r}, which cannot be made: {as_text(error.__cause__ or error)}."
+            f"robot.type is {types_of(config)}, which cannot be made: {as_text(error.__cause__ or error)}."
         ) from error
     lock = RobotLock(config)
     try:
