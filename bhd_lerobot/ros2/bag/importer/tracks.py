@@ -14,7 +14,7 @@ from bhd_lerobot.ros2.bag.importer.resample import Times, apart, message_times, 
 from bhd_lerobot.ros2.bag.importer.sources import Reading, Source
 from bhd_lerobot.ros2.bag.importer.topics import other_form, publisher_notes, wanted_topics
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
-from bhd_lerobot.ros2.messages.mapping import has_header
+from bhd_lerobot.ros2.messages.mapping import JOINTS, has_header
 from bhd_lerobot.ros2.messages.parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.ros2.messages.scan import static_frames, static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
@@ -26,6 +26,7 @@ MOST_LOST = 0.1
 
 _HEADER_BYTES = 12  # of a message: what it is serialised as, and the stamp
 _UNSET = "the orientation 0, 0, 0, 0, which is no rotation"
+_LEAP, _OFTEN = 0.05, 3  # of at least two joints [rad, m]; a posture that is not 0 leaps so often at the least
 _APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
 
 
@@ -102,7 +103,7 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> list[Trac
         except DatasetError as error:
             raise DatasetError(f"{bag.path}: {error}") from error
         track = Track(source, topic.name, topic.msgtype, times, found.order, values, stamps, source.names)
-        tracks += [_finite(bag, one, notes) for one in _complete(track)]
+        tracks += [_of_the_robot(_finite(bag, one, notes), notes) for one in _complete(track)]
     notes += pace_warnings(paces)
     _check_one_time(bag, wanted[0][1].name, clocks)
     return tracks
@@ -143,6 +144,40 @@ def _finite(bag: Bag, track: Track, notes: list[str]) -> Track:
     if not finite.any():
         raise DatasetError(f"{bag.path}: no message of {track.topic} has finite values.")
     return replace(track, values=values).rows(np.flatnonzero(finite))
+
+
+def _of_the_robot(track: Track, notes: list[str]) -> Track:
+    """Return a track of joints without the one posture that comes between the robot's again and again; note how often.
+
+    So it is where joint_state_publisher runs beside a robot's driver: it has all joints at 0 as long as nobody moves
+    its sliders.
+    """
+    positions = [column for column, name in enumerate(track.names) if name.endswith(".pos")]
+    if track.msgtype != JOINTS or track.is_action or len(positions) < 2 or not len(track.values):
+        return track
+    values = track.values[:, positions]
+    postures, which, counts = np.unique(values, axis=0, return_inverse=True, return_counts=True)
+    which = which.reshape(-1)
+    zero = np.flatnonzero(~postures.any(axis=1)).tolist()
+    kept = np.ones(len(values), np.bool_)
+    for posture in {*zero, int(counts.argmax())}:
+        changes = np.diff(which == posture, prepend=False, append=False)
+        begins, ends = np.flatnonzero(changes).reshape(-1, 2).T
+        inner = (begins > 0) & (ends < len(values))
+        begins, ends = begins[inner], ends[inner]
+        before, after = values[begins - 1], values[ends]
+        away = np.abs(before - postures[posture])
+        leaps = ((away > _LEAP).sum(axis=1) >= 2) & (np.abs(after - before).max(axis=1) < away.max(axis=1) / 2)
+        if int(leaps.sum()) < (1 if posture in zero else _OFTEN):
+            continue
+        for begin, end in zip(begins[leaps].tolist(), ends[leaps].tolist(), strict=True):
+            kept[begin:end] = False
+        where = "0" if posture in zero else np.array2string(postures[posture], precision=3, separator=", ")
+        notes.append(
+            f"{track.topic}: {int((which[~kept] == posture).sum())} of {len(kept)} messages have all joints at {where} "
+            "between others, as of a joint_state_publisher beside the robot's driver; left out"
+        )
+    return track.rows(np.flatnonzero(kept))
 
 
 def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:

@@ -363,3 +363,66 @@ def test_the_manuals_example_is_a_mapping():
     ]
     assert len(topics_of(mapping.observation, mapping.types)) == 2
     assert mapping.images["wrist"].topic == "/wrist/image_raw/compressed"
+
+
+ARM = [f"j{number}" for number in range(4)]
+ARM_MAP = "observation:\n" + "".join(
+    f'  {name}.pos: {{topic: /joint_states, type: {JOINTS}, field: "position[name={name}]"}}\n' for name in ARM
+)
+ARM_MAP += f'action:\n  j0.pos: {{topic: /commands, type: {NUMBERS}, field: "data[0]"}}\n'
+
+
+def arm_bag(path, others=(), *, posture=lambda t: 0.3 * np.arange(1, 5) + 0.2 * np.sin(t), seconds=6.0):
+    """Write an arm's joints at 50 Hz and commands; and other messages of its joints: pairs of a time [s] and values."""
+    joints = [(k / 50, posture(k / 50)) for k in range(int(50 * seconds))]
+    found = [
+        ("/joint_states", START + round(t * NANO), T[JOINTS](
+            bags.header(START + round(t * NANO), ""), ARM, np.asarray(values, np.float64), np.zeros(0), np.zeros(0)))
+        for t, values in (*joints, *others)
+    ]  # fmt: skip
+    layout = T["std_msgs/msg/MultiArrayLayout"]([], 0)
+    found += [
+        ("/commands", START + round(k / 20 * NANO) + 1000, T[NUMBERS](layout, np.array([k / 100])))
+        for k in range(int(20 * seconds))
+    ]
+    return write(path, sorted(found, key=lambda one: one[1]), "sqlite3")
+
+
+def arm_states(tmp_path, name, bag):
+    (tmp_path / "arm.yaml").write_text(ARM_MAP)
+    imported(bag, tmp_path / name, f"--map={tmp_path / 'arm.yaml'}", "--fps=20")
+    return np.stack(read_episode(tmp_path / name, 0)["observation.state"])
+
+
+@each_case(
+    ("others", "where"),
+    [
+        ([(0.11 + k / 10, np.zeros(4)) for k in range(55)], "at 0"),
+        ([(1.001 + k / 1000, np.zeros(4)) for k in range(15)], "at 0"),  # once, a burst
+        ([(1.001 + k / 100, np.zeros(4)) for k in range(100)], "at 0"),  # a second of them, beside the driver's
+        ([(0.11 + k / 7, np.array([1.5, 0.0, -1.5, 0.7])) for k in range(35)], r"at [ 1.5"),
+    ],
+)
+def test_a_second_publisher_of_one_posture_is_named_and_left_out(tmp_path, capsys, others, where):
+    clean = arm_states(tmp_path, "clean", arm_bag(tmp_path / "clean_bag"))
+    capsys.readouterr()
+    states = arm_states(tmp_path, "mixed", arm_bag(tmp_path / "mixed_bag", others))
+    np.testing.assert_array_equal(states, clean)
+    printed = " ".join("".join(capsys.readouterr()).split())
+    assert f"{len(others)} of {300 + len(others)} messages have all joints {where}" in printed
+
+
+def stops(t):
+    """Stand at 0, go to a posture and back, without a leap, several times; the last two joints are a hand's."""
+    way = np.clip(np.sin(2 * t), 0.0, 0.5)
+    return np.array([way, -way, 0.04 * (t % 1 > 0.5), 0.0])
+
+
+@each_case(
+    "posture", [stops, lambda t: np.zeros(4), lambda t: np.full(4, 0.7), lambda t: np.array([0, 0, 0, t % 1 > 0.5])]
+)
+def test_what_a_robot_does_itself_is_kept(tmp_path, capsys, posture):
+    states = arm_states(tmp_path, "d", arm_bag(tmp_path / "bag", posture=posture))
+    expected = [posture(number / 50) for number in np.arange(len(states)) * 50 // 20]
+    np.testing.assert_allclose(states, expected, atol=1e-6)
+    assert "joint_state_publisher" not in "".join(capsys.readouterr())
