@@ -160,6 +160,28 @@ class Graph:
         everyone = self.endpoints()
         return [text for one in everyone if one.is_own for text in _mismatches(one, everyone)]
 
+    def doubles(self) -> list[str]:
+        """Return which other nodes are the same robot as this one, in sentences.
+
+        They subscribe to a topic that this node subscribes to, and publish one that it publishes: both obey.
+        """
+        everyone = self.endpoints()
+        own = {(one.topic, one.is_publisher) for one in everyone if one.is_own and one.topic not in _SHARED}
+        shared: dict[str, dict[bool, set[str]]] = {}
+        for one in everyone:
+            if not one.is_own and one.node and (one.topic, one.is_publisher) in own:
+                shared.setdefault(one.node, {True: set(), False: set()})[one.is_publisher].add(one.topic)
+        return [
+            f"Another node, {node}, subscribes to {', '.join(sorted(found[False]))} and publishes "
+            f"{', '.join(sorted(found[True])[:3])}, too: both robots obey the same commands. Give one of them another "
+            "--network.domain. A node that was killed is there for up to 20 s more."
+            for node, found in sorted(shared.items())
+            if found[True] and found[False]
+        ]
+
+
+_SHARED = ("/tf", "/tf_static", "/diagnostics", "/clock", "/rosout", "/parameter_events")  # of any number of publishers
+
 
 def _mismatches(ours: Endpoint, everyone: list[Endpoint]) -> list[str]:
     kinds = ("publisher", "subscription") if ours.is_publisher else ("subscription", "publisher")

@@ -1,5 +1,7 @@
 """A ROS 2 node: publishers and subscriptions on serialised messages."""
 
+import os
+import socket
 import time
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -12,6 +14,7 @@ from bhd_lerobot.ros2.live.topic_types import raw, topic_type
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.types import type_store
 
+_PORT, _PORTS = 7400, 250  # DDS: of domain 0, and from one domain to the next
 MOST_TAKEN = 1000  # messages that are taken at once
 
 
@@ -121,6 +124,8 @@ class Node:
         self.name, self.namespace, self.network = name, "/" + namespace.strip("/"), network
         try:
             self._domain = Domain(network.domain_number, network.cyclonedds_xml())
+            if network.is_local:
+                _keep_local(network.domain_number)
             self._participant = DomainParticipant(network.domain_number, DdsQos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise RealtimeError(
@@ -201,6 +206,23 @@ class Node:
     ) -> None:
         """Leave the network."""
         self.close()
+
+
+def _keep_local(domain: int) -> None:
+    """Have the sockets of a domain receive from the loopback device only: Cyclone DDS binds them to all addresses."""
+    if not hasattr(socket, "SO_BINDTODEVICE"):  # Linux has it, since 5.7 for every user
+        return
+    first = _PORT + _PORTS * domain
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            if not os.readlink(f"/proc/self/fd/{number}").startswith("socket:"):
+                continue
+            with socket.socket(fileno=os.dup(int(number))) as one:
+                is_of_domain = one.type == socket.SOCK_DGRAM and one.family == socket.AF_INET
+                if is_of_domain and first <= one.getsockname()[1] < first + _PORTS:
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+        except OSError:  # closed meanwhile, or not permitted
+            continue
 
 
 def _type_hash(msgtype: str) -> bytes:

@@ -180,7 +180,7 @@ class Server:
                     if more := count - reported.get((what, reason), 0):
                         report(f"{what} {more}: {reason}")
                 reported = found
-                apart = set(self._node.graph.all_mismatches())
+                apart = {*self._node.graph.all_mismatches(), *self._node.graph.doubles()}
                 for text in sorted(apart - mismatches):
                     report(text)
                 mismatches |= apart

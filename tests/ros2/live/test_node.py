@@ -1,6 +1,10 @@
 """Nodes beside real ones of ROS 2, and what does not fit together."""
 
+import contextlib
+import os
+import socket
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ import pytest
 from bhd_lerobot.ros2.live.network import SENSOR_DATA, NetworkConfig, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.serialize import encode
+from tests.forks import Fork
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
 
@@ -71,3 +76,60 @@ def test_an_unknown_type_is_named(domain: int) -> None:
         pytest.raises(ValueError, match="Unknown ROS 2 type 'my_msgs/msg/Foo'"),
     ):
         node.publisher("/foo", "my_msgs/msg/Foo")
+
+
+@pytest.mark.skipif(not hasattr(socket, "SO_BINDTODEVICE"), reason="of Linux")
+def test_what_is_local_receives_from_the_loopback_device_only(domain: int) -> None:
+    def devices() -> dict[int, bytes]:
+        """Return the device of each UDP socket of this process that is bound to all addresses, by its port."""
+        found = {}
+        for number in os.listdir("/proc/self/fd"):
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(number))) as one:
+                if one.type == socket.SOCK_DGRAM and one.getsockname()[0] == "0.0.0.0":
+                    name = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+                    found[one.getsockname()[1]] = name.rstrip(b"\0")
+        return found
+
+    before = devices()
+    with Node("robot", NetworkConfig(domain)):
+        opened = {port: name for port, name in devices().items() if port not in before}
+    assert opened
+    assert set(opened.values()) == {b"lo"}
+
+
+TWIST, DIAGNOSTICS = "geometry_msgs/msg/Twist", "diagnostic_msgs/msg/DiagnosticArray"
+TYPES = {"/cmd_vel": TWIST, "/odom": ODOMETRY, "/diagnostics": DIAGNOSTICS}
+ROBOT = (("/cmd_vel",), ("/odom", "/diagnostics"))
+
+
+def stand(domain: int, name: str, subscribed: tuple[str, ...], published: tuple[str, ...]) -> int:
+    """Be a node, until killed."""
+    with Node(name, NetworkConfig(domain)) as node:
+        kept = [node.subscription(topic, TYPES[topic]) for topic in subscribed]
+        kept += [node.publisher(topic, TYPES[topic]) for topic in published]  # type: ignore[misc]
+        while kept:
+            time.sleep(0.05)
+    return 0
+
+
+def test_another_robot_of_the_same_topics_is_named_and_a_recorder_or_a_brain_is_not(
+    domain: int, tmp_path: Path
+) -> None:
+    with contextlib.ExitStack() as others, Node("robot", NetworkConfig(domain)) as node:
+
+        def add(name: str, subscribed: tuple[str, ...], published: tuple[str, ...]) -> None:
+            fork = Fork(stand, domain, name, subscribed, published, output=tmp_path / name)
+            others.callback(fork.kill)
+
+        kept = [node.subscription("/cmd_vel", TWIST), *(node.publisher(topic, TYPES[topic]) for topic in ROBOT[1])]
+        add("brain", ("/odom",), ("/cmd_vel",))
+        add("recorder", ("/cmd_vel", "/odom"), ("/diagnostics",))
+        until(lambda: {"/brain", "/recorder"} <= {one.node for one in node.graph.endpoints()}, "they are found")
+        time.sleep(0.5)
+        assert node.graph.doubles() == []
+        add("robot", *ROBOT)
+        [text] = until(node.graph.doubles, "it is named")
+        assert text.startswith(
+            "Another node, /robot, subscribes to /cmd_vel and publishes /odom, too: both robots obey"
+        )
+        assert kept

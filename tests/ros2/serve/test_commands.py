@@ -186,3 +186,10 @@ def test_what_the_limits_cut_is_printed_and_published(arm: Side) -> None:
     until(lambda: "limit of clearance" in str(arm.newest(arm.diagnostics)), "it is published")
     trajectory(arm, home)
     is_at(arm, home)
+
+
+def test_a_second_robot_in_the_domain_is_named(base: Side, tmp_path: Path) -> None:
+    domain = base.node.network.domain_number
+    with Served("turtlebot3", "--robot.arena=empty", domain=domain, log=tmp_path / "log") as second:
+        for robot in (second, base.served):
+            robot.wait_for("Another node, /turtlebot3, subscribes to /brain/command, /cmd_vel, /emergency_stop")
