@@ -103,7 +103,9 @@ class EvalResults:
         config: what decides the numbers: robot, task, brains, episodes and seeds.
         versions: of the programs that made them.
         requested: how many episodes of each brain were requested.
-        paired: the brains beside the baseline.
+        episodes: what was measured in each episode.
+        brains: of each brain, by its label.
+        paired: of each brain compared with the baseline, by its label.
     """
 
     config: dict[str, Any]

@@ -18,7 +18,12 @@ _FLAT = 1e-12  # of the values' size: a spread that is less is rounding
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with the lower and upper end of its interval; NaN where it is not defined."""
+    """A number with its interval.
+
+    Attributes:
+        value: the number; NaN where it is not defined.
+        low, high: lower and upper end of the interval.
+    """
 
     value: float
     low: float
