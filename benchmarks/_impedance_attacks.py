@@ -23,7 +23,7 @@ WALL = (2e4, 100.0)  # [N/m, N s/m]
 _SOFT = Compliance((0.0,) * 6, max_force=120.0, max_moment=20.0)
 _STIFF = Compliance((5000.0,) * 3 + (300.0,) * 3, max_force=120.0, max_moment=20.0)
 # Largest speed of a tool [m/s]: 0.25 is the equilibrium's. What drifts moves the tool by its own speed as well.
-MOST_SPEED = dict.fromkeys(ATTACKS, 0.4) | {"late": 0.7, "drifting": 0.7} | dict.fromkeys(SURROUNDINGS, 0.3)
+MOST_SPEED = dict.fromkeys(ATTACKS, 0.45) | {"late": 0.7, "drifting": 0.7} | dict.fromkeys(SURROUNDINGS, 0.3)
 MOST_FORCE = 130.0  # [N] on a wall; what remains of it half a second after a stop is less than 20 N
 MOST_MOTION = 0.1  # [rad] of a joint after a stop
 
