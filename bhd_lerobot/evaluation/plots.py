@@ -179,7 +179,7 @@ def notable_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown
     numbers = sorted({number for ran in trajectories.values() for number in ran})
     unusual = dict.fromkeys(numbers, 0)
     for ran in trajectories.values():
-        mostly = 2 * sum(run.success for run in ran.values()) >= len(ran)
+        mostly = 2 * sum(run.success is True for run in ran.values()) >= len(ran)
         for number, one in ran.items():
             unusual[number] += one.success != mostly
     ranked = [n for n in sorted(numbers, key=lambda n: (-unusual[n], n)) if unusual[n]][: (shown + 1) // 2]

@@ -48,6 +48,7 @@ class NoopBrain(ConfiguredBrain):
     name = "noop"
     robot_kind = ANY_ROBOT
     uses_privileged_state = False
+    attempts = False
 
     def __init__(self, config: BrainConfig | None = None) -> None:
         self.config = config or NoopConfig()

@@ -199,6 +199,8 @@ class ConfiguredBrain:
     uses_privileged_state: bool = True
     """Of a brain that does not say, it is taken for granted that it uses what the task reports, if that is anything."""
     has_plan = False
+    attempts = True
+    """Whether it attempts the task: of one that does not, no episode has an outcome that means anything."""
 
     def __init__(self, config: Any) -> None:
         self.config = config

@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.format.features import (
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
+from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError, counted
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.recording.config import RecordConfig
@@ -82,7 +82,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
                 # A view that cannot be started fails before a dataset exists.
                 loop.observer = opened.enter_context(live_view(config, robots, console))
                 recorder = opened.enter_context(open_recorder(_recording(config, root), robots, task, brain))
-            result = RecordResult(root, output_dir, stopped_by=stop)
+            result = RecordResult(root, output_dir, attempts=getattr(brain, "attempts", True), stopped_by=stop)
             if recorder.repair_report:
                 console.print(f"Repaired before resuming: {recorder.repair_report}")
             album, first = _run(config, recorder, loop, result, console)
@@ -91,7 +91,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         if loop.emergency_stop:
             result.estop = pressed.cause(robots.estop_pressed)
     if album.added:
-        heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
+        heading = f"{task.name}, {brain.name}: {result.succeeded or counted(result.recorded, 'episode')}"
         album.draw(output_dir / "trajectories.png", heading)
     if first is not None and preview is not None:
         states = first.columns[PHYSICS_STATE]
@@ -139,13 +139,13 @@ def _run(
             save_episode(recorder, episode, metadata)
             result.count(episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
-            if (trajectory := _trajectory(episode, loop.robots)) is not None:
+            if (trajectory := _trajectory(episode, loop.robots, result.attempts)) is not None:
                 album.add(trajectory)
             first = first or episode
             progress.update(
                 bar,
                 advance=1,
-                success=f"{result.successes}/{result.recorded} succeeded",
+                success=result.succeeded,
                 speed=f"{result.real_time_factor:.0f}x real time",
             )
     result.episodes = recorder.num_episodes
@@ -239,13 +239,13 @@ def _keep_to(root: Path, robot: Any, console: Console) -> None:
         console.print("The dataset was recorded without jerk limits: it continues with robot.jerk_limits=false.")
 
 
-def _trajectory(episode: Episode, robots: Robots) -> Trajectory | None:
+def _trajectory(episode: Episode, robots: Robots, attempts: bool) -> Trajectory | None:
     outcome = episode.outcome
-    title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
+    title = str(episode.spec.index) + f": {outcome.event.cause}, score {outcome.score:.2f}" * attempts
     track = track_of(robots, episode.columns)
     if not len(track):
         return None
-    return Trajectory(title, episode.scene, track[:, :2], outcome.success, episode.instruction)
+    return Trajectory(title, episode.scene, track[:, :2], outcome.success if attempts else None, episode.instruction)
 
 
 def _make_preview(config: RecordConfig, robots: Robots, console: Console) -> Preview | None:

@@ -27,6 +27,7 @@ class RecordResult:
         output_dir: the run folder.
         episodes: episodes that the dataset holds.
         recorded: episodes that this run added.
+        attempts: whether the brain attempts the task; otherwise outcomes mean nothing, and are not shown.
         successes: how many of them were a success.
         outcomes: how many ended how.
         scores: their scores.
@@ -44,6 +45,7 @@ class RecordResult:
     output_dir: Path
     episodes: int = 0
     recorded: int = 0
+    attempts: bool = True
     successes: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     scores: list[float] = field(default_factory=list)
@@ -55,6 +57,11 @@ class RecordResult:
     estop: str | None = None
     fault: str | None = None
     kept_fps: float | None = None
+
+    @property
+    def succeeded(self) -> str:
+        """How many episodes succeeded, as text; empty if none was attempted."""
+        return f"{self.successes} of {self.recorded} succeeded" if self.attempts else ""
 
     @property
     def exit_status(self) -> int:
@@ -95,12 +102,13 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         f"{counted(result.recorded, 'episode')}, {counted(result.frames, 'frame')}, {result.simulated_s:.0f} s"
         f"{' simulated' if not config.is_live else ''}",
     )
-    if result.recorded:
+    if result.recorded and result.attempts:
         table.add_row("success", f"{result.successes} of {result.recorded}")
         table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
         for problem, count in result.problems.most_common(3):
             table.add_row("gave up" if count == 1 else f"gave up {count} times", escape(problem))
         table.add_row("mean score", f"{np.mean(result.scores):.3f}")
+    if result.recorded:
         table.add_row(
             "speed",
             f"{result.real_time_factor:.{0 if result.real_time_factor > 9 else 2}f} x real time, {_clock(config)}",

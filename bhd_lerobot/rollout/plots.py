@@ -19,7 +19,8 @@ from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
 SHOWN = 40  # episodes of a run that are drawn: a panel takes 0.1 s, and more are no longer looked at one by one
 
-_FREE, _WALL, _GOOD, _BAD = "#f4f1ea", "#8a8478", "#1b7f4d", "#c0392b"
+_FREE, _WALL = "#f4f1ea", "#8a8478"
+_COLOURS = {True: "#1b7f4d", False: "#c0392b", None: "#3b4a5a"}
 
 
 @dataclass(frozen=True)
@@ -30,14 +31,14 @@ class Trajectory:
         title: what stands above the panel.
         scene: the obstacles, or the objects on the table.
         xy: positions in the world frame [m], shape (frames, 2).
-        success: whether the episode succeeded.
+        success: whether the episode succeeded; None if nothing was attempted.
         instruction: what the arm was asked to do; shown above a table.
     """
 
     title: str
     scene: Arena | TableScene
     xy: NDArray[np.float64]
-    success: bool
+    success: bool | None
     instruction: str = ""
 
 
@@ -50,7 +51,7 @@ class TrajectoryAlbum:
 
     def add(self, trajectory: Trajectory) -> None:
         """Add the next episode; of failures, and of successes, the first `SHOWN` are drawn."""
-        drawn = self._drawn[trajectory.success]
+        drawn = self._drawn[trajectory.success is not False]
         if len(drawn) < SHOWN:
             drawn.append((self.added, trajectory))
         self.added += 1
@@ -66,7 +67,7 @@ class TrajectoryAlbum:
         """Draw what is shown; the heading says so if that is not all."""
         shown = self.shown
         if len(shown) < self.added:
-            heading += f"; {len(shown)} of them, failures before others"
+            heading += f"; {len(shown)} of them{', failures before others' * has_outcomes(shown)}"
         draw_trajectories(shown, path, heading)
 
 
@@ -82,8 +83,13 @@ def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: s
             axes.set_axis_off()
         else:
             _draw_panel(axes, trajectory)
-    figure.supxlabel("circle: start, square: end, cross: failure", fontsize=7.5)
+    figure.supxlabel(f"circle: start, square: end{', cross: failure' * has_outcomes(trajectories)}", fontsize=7.5)
     figure.savefig(path, dpi=110)
+
+
+def has_outcomes(trajectories: Sequence[Trajectory]) -> bool:
+    """Return whether any of them was an attempt."""
+    return any(trajectory.success is not None for trajectory in trajectories)
 
 
 def _grid(count: int) -> tuple[int, int]:
@@ -96,10 +102,10 @@ def _grid(count: int) -> tuple[int, int]:
 
 def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     draw_scene(axes, trajectory.scene)
-    color = _GOOD if trajectory.success else _BAD
+    color = _COLOURS[trajectory.success]
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
-    marker, size, width = ("s", 5, 1.2) if trajectory.success else ("x", 7, 2.0)
+    marker, size, width = ("s", 5, 1.2) if trajectory.success is not False else ("x", 7, 2.0)
     axes.plot(*trajectory.xy[-1], color=color, markerfacecolor="none", markeredgewidth=width, marker=marker, ms=size)
     title = trajectory.title
     # The font has no Chinese characters.
@@ -212,18 +218,19 @@ def draw_divergence(
     left, rows = above.subplots(), differences.subplots(len(curves), 1, squeeze=False)[:, 0]
     draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
-    left.plot(replayed[:, 0], replayed[:, 1], color=_BAD, linewidth=1.1, label="replayed")
+    left.plot(replayed[:, 0], replayed[:, 1], color=_COLOURS[False], linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False, fontsize=9)
     differences.supylabel("largest difference between replay and recording", fontsize=9)
     for row, (label, values) in enumerate(curves.items()):
         axes = rows[row]
-        axes.plot(time, values, color=_BAD, linewidth=1.3)
+        axes.plot(time, values, color=_COLOURS[False], linewidth=1.3)
         axes.set_title(label, fontsize=9, loc="left")
         axes.grid(alpha=0.3)
         axes.tick_params(labelbottom=row == len(curves) - 1)
         if not np.any(values):
             axes.set_yticks([0.0])
-            axes.text(0.5, 0.7, "identical, to the last bit", transform=axes.transAxes, ha="center", color=_GOOD)
+            where = {"transform": axes.transAxes, "ha": "center", "color": _COLOURS[True]}
+            axes.text(0.5, 0.7, "identical, to the last bit", **where)
     axes.set_xlabel("time [s]")
     figure.savefig(path, dpi=110)

@@ -17,6 +17,8 @@ from rich.console import Console
 
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.validate.findings import Severity
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetExistsError, DatasetMismatchError, RenderingError
 from bhd_lerobot.hub.card import CardOptions, make_card
 from bhd_lerobot.options.parse import encode, parse
@@ -405,3 +407,15 @@ def test_a_policy_is_recorded_as_what_it_is_and_not_where_it_lies(tmp_path, monk
     (root / "meta/bhd.json").write_text(json.dumps(identity))
     with pytest.raises(DatasetMismatchError, match=r"brain\.learner\.weights"):
         run_record(root, **brain, brain__learner__path=moved, dataset__num_episodes=7, resume="true")
+
+
+def test_what_attempts_nothing_has_no_outcomes(tmp_path: Path) -> None:
+    """Single looks at tables: none is a failure, in the terminal, in the picture, or when the data are checked."""
+    printed = io.StringIO()
+    looks = ARM | {"brain__type": "noop", "dataset__episode_time_s": 0.04}
+    config = parse(RecordConfig, options(tmp_path / "d", **looks))
+    result = record_module.record(config, Console(file=printed, width=100))
+    assert result.recorded == 3
+    assert result.succeeded == ""
+    assert not any(word in printed.getvalue() for word in ("succe", "fail", "timeout", "score"))
+    assert not [one for one in check_dataset(tmp_path / "d").findings if one.severity > Severity.NOTE]
