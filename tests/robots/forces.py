@@ -36,7 +36,7 @@ class Wall:
 
     Args:
         simulation: the arms.
-        direction: in which it pushes, world frame, shape (3,).
+        direction: in which it pushes, world frame, shape (3,) or (n, 3).
         speed: with which it comes [m/s].
         seconds: for which it comes; then it stays where it is.
         stiffness: of what it is made of [N/m].
@@ -49,7 +49,7 @@ class Wall:
         self, simulation: UR5Simulation, direction: Array, speed: float, seconds: float, stiffness: float = 2e4
     ) -> None:
         world, self._hz = simulation.world, simulation.rates.control_hz
-        self._direction = np.asarray(direction) / np.linalg.norm(direction)
+        self._direction = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
         self._speed, self._seconds, self._stiffness = speed, seconds, stiffness
         self._external, self._centre = world._batch.bind("xfrc_applied"), world.derived("xipos")
         self._body, self._tool = world.model.body("gripper").id, world.site("tool").position
@@ -67,8 +67,9 @@ class Wall:
         self._tick += 1
         time, tool = self._tick / self._hz, self._tool
         comes = self._speed * min(time, self._seconds) - 0.003
-        depth = comes - (tool - self._start) @ self._direction
-        speed = self._speed * (time < self._seconds) - (tool - self._last) @ self._direction * self._hz
+        depth = comes - ((tool - self._start) * self._direction).sum(axis=1)
+        speed = self._speed * (time < self._seconds)
+        speed = speed - ((tool - self._last) * self._direction).sum(axis=1) * self._hz
         self._last = tool.copy()
         self.force = np.where(depth > 0.0, np.maximum(self._stiffness * depth + 50.0 * speed, 0.0), 0.0)
         force = self.force[:, None] * self._direction

@@ -9,6 +9,7 @@ import pytest
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import CommandRefusedError, ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -325,3 +326,22 @@ def test_an_arm_that_is_pressed_is_neither_reset_nor_activated_and_the_message_n
         robot.activate()
     finally:
         robot.disconnect()
+
+
+def test_the_limit_of_force_holds_in_random_postures_and_directions() -> None:
+    """Walls that come slowly: the true force, when the arm is stopped."""
+    rng, body = np.random.default_rng(2), UR5Config().body()
+    postures = np.array(body.home)[:6] + rng.uniform(-1.2, 1.2, (200, 6))  # type: ignore[union-attr]
+    far = np.min(ArmKinematics(body.chain, body.limits).collision.distances(postures), axis=0) > 0.02  # type: ignore[union-attr]
+    scenes = [TableScene("empty", (), (*posture, 0.04)) for posture in postures[far][:32]]
+    arm = UR5Simulation(UR5Config(), len(scenes))
+    arm.reset(np.arange(len(scenes)), scenes, range(len(scenes)))
+    directions = rng.normal(size=(len(scenes), 3))
+    wall, most = Wall(arm, directions, 0.02, 10.0), np.zeros(len(scenes))
+    for _ in range(60):
+        arm.step(None)
+        np.maximum(most, wall.force, out=most, where=arm.modes == Mode.HOLD)
+    stopped = arm.modes == Mode.FAULT
+    assert stopped.mean() > 0.9
+    assert np.median(most[stopped]) < 170.0
+    assert np.quantile(most[stopped], 0.9) < 200.0

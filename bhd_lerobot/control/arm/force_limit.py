@@ -22,17 +22,21 @@ _LOAD_N, _LOAD_S = 20.0, 0.3
 _DOWN = 0.9  # the least cosine between that force and the vertical
 _STILL = 0.02  # [rad/s]
 _GRAVITY = 9.81  # [m/s^2]
+# A force alone, without a moment, is found in more directions: in those in which the strongest motors feel it with a
+# lever of less than 0.1 m, by less than half.
+_FORCE_DAMPING = 0.1
 _LEAST_TORQUE = 4.0  # [N m] where no joint feels more, nothing is estimated: 10 N with a lever of 0.4 m
 
 
 class ForceLimit:
     """Estimates the forces on the tools of n arms, and states which are too large.
 
-    The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs. A force
-    elsewhere on the arm counts with the force on the tool that would load the joints alike: half-way to the tool, about
-    half of it is felt. What is not modelled counts too: friction, and the weight of a load that was not declared. Of
-    that no more than 20 N is permitted: an arm at rest whose tool is pulled down by more has another load than its
-    motions were planned with.
+    The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs, and explained
+    by a force on the tool, and by a force with a moment; the larger force counts. Of a force on the tool 98 % are found
+    in the median, and 71 % in 99 of 100 postures and directions. A force elsewhere on the arm counts with the force on
+    the tool that would load the joints alike: half-way to the tool, about half of it is felt. What is not modelled
+    counts too: friction, and the weight of a load that was not declared. Of that no more than 20 N is permitted: an arm
+    at rest whose tool is pulled down by more has another load than its motions were planned with.
 
     Attributes:
         force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
@@ -59,6 +63,8 @@ class ForceLimit:
         self._pull = np.zeros(n)
         self._dynamics, self._forward = ArmDynamics(arm), ForwardKinematics(arm.chain)
         self._dof = dof = self._dynamics.dof
+        effort = np.asarray(arm.limits.effort[:dof])
+        self._certain = effort.max() / effort  # weights: torques are as wrong as their motors are large
         self._period = max(1, round(_PERIOD_S * control_hz))
         self._hz = control_hz / self._period
         self._sum, self._ticks = np.zeros((n, dof)), 0
@@ -104,8 +110,10 @@ class ForceLimit:
             return False
         # Products of matrices that lie otherwise in memory round otherwise: with it the number of arms would count.
         jacobian = np.ascontiguousarray(self._forward.jacobian(position[felt]))
-        force = tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3]
-        self.force[felt] = np.linalg.norm(force, axis=1)
+        both = tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3], self._tool_force(jacobian, torque[felt])
+        sizes = [np.linalg.norm(force, axis=1) for force in both]
+        force = np.where((sizes[0] > sizes[1])[:, None], *both)
+        self.force[felt] = np.maximum(*sizes)
         np.greater(self.force, self.largest, out=self.exceeded)
         self._pull[felt] = force[:, 2]  # the tool pulls it up
         hangs = (self._pull > _LOAD_N) & (self._pull > _DOWN * self.force) & (np.abs(velocity) < _STILL).all(axis=1)
@@ -113,6 +121,12 @@ class ForceLimit:
         self._hung *= hangs
         self.exceeded |= self._hung >= self._most_hung
         return bool(np.count_nonzero(self.exceeded))
+
+    def _tool_force(self, jacobian: Array, torque: Array) -> Array:
+        """Return the forces on the tools alone, without moments, that torques amount to [N], shape (k, 3)."""
+        lever = jacobian[:, :3] * self._certain
+        square = lever @ np.swapaxes(lever, 1, 2) + _FORCE_DAMPING**2 * np.eye(3)
+        return np.asarray(np.linalg.solve(square, lever @ (torque * self._certain)[..., None])[..., 0])
 
     def explain(self) -> str:
         """Return as text which force was too large."""
