@@ -23,6 +23,7 @@ class Controller(ABC):
         actuators: what goes to the plant, shape (n, joints).
         busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
             nothing about it.
+        cause: why the last stop of its own was, as text.
         protective_stop: the `Watchdog` flag of each robot that has just begun a stop of its own, shape (n,); 0 for the
             others.
         contact_wrench: what the surroundings put on the tools, estimated from the motors' efforts, in the base frame:
@@ -35,6 +36,7 @@ class Controller(ABC):
     command: NDArray[np.float64]
     actuators: NDArray[np.float64]
     busy: NDArray[np.bool_]
+    cause: str = ""
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]

@@ -71,10 +71,14 @@ class Plant(Protocol):
     Attributes:
         n: number of robots.
         takes: what `write` gets: ``"actuators"``, or of a base ``"twist"``.
+        latency_s: time from a command until the readings show it [s]; a robot that follows so late is not blocked.
+        hint: where commands go and what else to check if the robot does not follow, as text.
     """
 
     n: int
     takes: str = "actuators"
+    latency_s: float = 0.0
+    hint: str = ""
 
     def open(self) -> None:
         """Connect to the robot. Raises whatever reports why that is impossible."""

@@ -100,6 +100,7 @@ class ArmHost(Host):
             self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks, config.max_force)
         else:
             self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
+            self.controller.set_latency(np.arange(plant.n), plant.latency_s)
             if not config.held_clearance:
                 self.controller.held = None
             if body.mjcf:  # without inertias it is not known what torques a motion needs

@@ -50,7 +50,7 @@ class BaseHost(Host):
             monitor = CollisionMonitor(body, body.lidar, plant.n, config.control_hz, config.beams)
         gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
         self._controller = BaseController(
-            body, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes
+            body, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
         )
         super().__init__(
             config,

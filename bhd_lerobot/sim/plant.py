@@ -39,6 +39,7 @@ class SimulatedPlant:
     """
 
     takes = "actuators"
+    latency_s, hint = 0.0, ""
 
     def __init__(self, world: World) -> None:
         self.n = world.n

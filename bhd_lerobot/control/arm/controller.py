@@ -35,6 +35,8 @@ _GIVES = 0.5  # the least share of its largest torque that the servo of a blocke
 _ARRIVED_RAD = 2e-4  # [rad]
 _SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 _TINY = 1e-9
+_STANDS = 0.01  # [rad, m] a joint that moved by less has not moved
+_DEAF = "The arm has not moved since it was activated: it takes no commands, its brakes are on, or something holds it."
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -116,6 +118,8 @@ class ArmController(Controller):
         self._speed = np.asarray(limits.velocity)
         self._bend = 0.9 * WireLimits.of(arm, control_hz).bend[:-1]
         self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
+        self._stamp_ns, self._silent_ticks, self._late_s = 0, 0, np.zeros(n)
+        self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (
             f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
@@ -143,7 +147,16 @@ class ArmController(Controller):
 
         An arm that is behind by so much is not blocked. Commands are not led by it.
         """
+        self._late_s[ids] = latency_s
         self.goals.limit.set_latency(ids, latency_s)
+
+    def _wait_for_readings(self, stamp_ns: int) -> None:
+        """Count for how long nothing has been read: an arm that follows is behind what is read by so much more."""
+        silent, self._silent_ticks = self._silent_ticks, 0 if stamp_ns != self._stamp_ns else self._silent_ticks + 1
+        self._stamp_ns = stamp_ns
+        if silent or self._silent_ticks:
+            late = self._late_s + 2 * self._half_tick * self._silent_ticks
+            self.goals.limit.set_latency(np.arange(len(late)), late)
 
     # --- motion ------------------------------------------------------------------------------------------------------
 
@@ -200,6 +213,8 @@ class ArmController(Controller):
             self.goals.hold(sim, held)
             if self.setpoints.clearance is not None:
                 self.setpoints.clearance.hold(sim, held)
+        if reading.stamp_ns is not None:
+            self._wait_for_readings(int(reading.stamp_ns[0]))
         reference = self.command, self.velocity, self.acceleration
         if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
@@ -250,7 +265,9 @@ class ArmController(Controller):
             wrong = blocked & ((away > limit) & self._misread_joints(reading)).any(axis=1)
             self._protect(wrong, reading, Watchdog.BLOCKED, self._misread, follows=True)
             blocked &= ~wrong
-        self._protect(blocked, reading, Watchdog.BLOCKED, self._blocked)
+        deaf = blocked & (np.abs(reading.position - self._first) < _STANDS).all(axis=1)
+        self._protect(deaf, reading, Watchdog.BLOCKED, _DEAF)
+        self._protect(blocked & ~deaf, reading, Watchdog.BLOCKED, self._blocked)
 
     def _misread_joints(self, reading: PlantReading) -> NDArray[np.bool_]:
         """Return the joints that are far from where they are commanded to, and not pulled there, shape (n, dof).
@@ -271,7 +288,7 @@ class ArmController(Controller):
         if not mask.any():
             return
         self.protective_stop[mask] = int(cause)
-        self._any_stopped = True
+        self._any_stopped, self.cause = True, message
         self._off_ticks[mask] = 0
         self._stopped |= mask
         self._leave_setpoints(mask)
@@ -343,7 +360,7 @@ class ArmController(Controller):
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
         self.command[ids] = np.minimum(np.maximum(reading.position[ids], self._lower), self._upper)
-        self.actuators[ids] = self.command[ids]
+        self.actuators[ids], self._first[ids] = self.command[ids], reading.position[ids]
         self.velocity[ids] = self.acceleration[ids] = 0.0
 
     def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:

@@ -1,5 +1,7 @@
 """The controller of bases with two driven wheels."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from bhd_lerobot.errors import ConfigError
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
 _LOOKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
 _LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
+_STANDS_RAD = 0.02  # a wheel that turned less has not moved
 _LEAST_TURN = 0.3  # [rad/s] by which wheels and gyroscope may differ: several times what a cheap one drifts
 _BLOCKED, _IMPLAUSIBLE, _EFFORT = int(Watchdog.BLOCKED), int(Watchdog.PLANT), int(Limit.EFFORT)
 
@@ -25,8 +28,8 @@ Counts = NDArray[np.int64]
 
 
 @kernel(
-    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[::1], i8[::1], i8[::1], f8[::1], i8, i8, "
-    "f8[:,::1], f8[:,::1], f8[:,::1], i8)"
+    "void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[:,::1], i8[:,::1], f8[:,:,::1], i8[::1], i8[::1], "
+    "f8[::1], i8, i8, f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8)"
 )
 def drive_wheels(  # noqa: PLR0917
     command: Array,
@@ -36,6 +39,7 @@ def drive_wheels(  # noqa: PLR0917
     turned: Array,
     looks: Counts,
     look_at: Counts,
+    late: Array,
     limits: Counts,
     protective_stop: Counts,
     numbers: Array,
@@ -44,15 +48,18 @@ def drive_wheels(  # noqa: PLR0917
     position: Array,
     velocity: Array,
     sensors: Array,
+    stamp_ns: Counts,
     ticks: int,
 ) -> None:
     """Go from commands to wheel speeds, and each `period` compare how the wheels turned with them and a gyroscope.
 
-    `looks` counts, of the two wheels and the gyroscope, the looks that found them wrong, shape (n, 3).
+    `looks` counts, of the two wheels and the gyroscope, the looks that found them wrong, shape (n, 3). `look_at` is the
+    tick of the next look, that of the last one, and the stamp of the reading then, shape (n, 3). `late` are the speeds
+    that were commanded from one look to the next, as far back as the robot's latency, shape (n, 2, looks).
     """
     per_speed, per_yaw, yaw_per_turn, largest_error, hz = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     wheels_from_twist(command, per_speed, per_yaw, wheels)
-    dt, least_way = 1.0 / hz, _LEAST_SPEED * period / hz
+    dt = 1.0 / hz
     for sim in range(len(command)):
         protective_stop[sim] = 0
         for k in range(2):
@@ -62,12 +69,21 @@ def drive_wheels(  # noqa: PLR0917
             asked[sim, k] += wheels[sim, k]
         if gyro >= 0:
             turned[sim] += sensors[sim, gyro]
-        if look_at[sim] != ticks:
-            continue
+        if ticks < look_at[sim, 0] or stamp_ns[sim] == look_at[sim, 2]:
+            continue  # what has not been read again says nothing
         # A wheel that does not turn as it is commanded to: it is blocked, or its encoder lies.
+        passed = ticks - look_at[sim, 1]
         for k in range(2):
-            way, done = asked[sim, k] * dt, position[sim, k] - start[sim, k]
-            is_slow = abs(way) > least_way and (done if way > 0.0 else -done) < 0.5 * abs(way)
+            for j in range(late.shape[2] - 1, 0, -1):
+                late[sim, k, j] = late[sim, k, j - 1]
+            late[sim, k, 0] = asked[sim, k] / passed
+            # By all that was commanded within the latency it is to turn so fast at the least.
+            least = late[sim, k, 0]
+            for j in range(1, late.shape[2]):
+                same = late[sim, k, j] * least > 0.0
+                least = math.copysign(min(abs(late[sim, k, j]), abs(least)), least) if same else 0.0
+            done = (position[sim, k] - start[sim, k]) / (passed * dt)
+            is_slow = abs(least) > _LEAST_SPEED and (done if least > 0.0 else -done) < 0.5 * abs(least)
             looks[sim, k] = looks[sim, k] + 1 if is_slow else 0
         if max(looks[sim, 0], looks[sim, 1]) >= _LOOKS:
             protective_stop[sim], looks[sim, 0], looks[sim, 1] = _BLOCKED, 0, 0
@@ -75,11 +91,12 @@ def drive_wheels(  # noqa: PLR0917
             # Wheels and gyroscope that do not agree about how far the base turned: one of them lies, or slips.
             yaw = ((position[sim, 1] - start[sim, 1]) - (position[sim, 0] - start[sim, 0])) * yaw_per_turn
             apart, largest = abs(yaw - turned[sim] * dt), max(abs(yaw), abs(turned[sim] * dt))
-            is_apart = apart > _LEAST_TURN * period * dt and apart > 0.5 * largest
+            is_apart = apart > _LEAST_TURN * passed * dt and apart > 0.5 * largest
             looks[sim, 2] = looks[sim, 2] + 1 if is_apart else 0
             if looks[sim, 2] >= _LOOKS:
                 protective_stop[sim], looks[sim, 2] = _IMPLAUSIBLE, 0
-        turned[sim], look_at[sim] = 0.0, ticks + period
+        turned[sim] = 0.0
+        look_at[sim, 0], look_at[sim, 1], look_at[sim, 2] = ticks + period, ticks, stamp_ns[sim]
         for k in range(2):
             asked[sim, k], start[sim, k] = 0.0, position[sim, k]
 
@@ -97,6 +114,7 @@ class BaseController(Controller):
         monitor: what keeps them from driving into what their scans show, the first values of the reading's sensors.
         gyro: which of the reading's sensors is the yaw rate of a gyroscope [rad/s]; None if there is none.
         takes: what the plant takes, see `Plant.takes`.
+        latency_s: time from a command until the readings show it [s].
 
     Raises:
         ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
@@ -113,6 +131,7 @@ class BaseController(Controller):
         monitor: CollisionMonitor | None = None,
         gyro: int | None = None,
         takes: str = "actuators",
+        latency_s: float = 0.0,
     ) -> None:
         limits, drive = body.limits, body.drive
         self._monitor, self._gyro = monitor, gyro
@@ -142,7 +161,10 @@ class BaseController(Controller):
         # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
         self._ticks, self._dt = 0, 1 / control_hz
         self._period = max(1, round(body.stalled_s / _LOOKS * control_hz))
-        self._look_at = np.full(n, self._period)
+        self._look_at = np.tile([self._period, 0, -1], (n, 1))
+        self._late = np.zeros((n, self.joints, 1 + math.ceil(latency_s * control_hz / self._period - 1e-9)))
+        self._stamp_ns, self._first = np.zeros(n, np.int64), np.zeros((n, self.joints))
+        self._patience_s, self._latency_s = body.stalled_s + latency_s, latency_s
         wheels = 1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed
         turn, error = drive.wheel_radius / drive.wheel_separation, drive.max_torque / drive.servo_gain
         change = np.array([limits.acceleration, limits.stop_deceleration]) / control_hz
@@ -150,9 +172,10 @@ class BaseController(Controller):
         largest = np.asarray(limits.velocity, float), change[0], np.tile(change[1], (n, 1)), jerk, np.array(wheels)
         state = self._target, self.command, self._before, self._rate, self._hard, self.limits
         self._limit = limit_command.bind(*state, *largest)
-        looks = self._start, self._asked, self._turned, self._looks, self._look_at, self.limits, self.protective_stop
+        looks = self._start, self._asked, self._turned, self._looks, self._look_at, self._late
         numbers = np.array([*wheels[:2], turn, error, control_hz]), self._period, -1 if gyro is None else gyro
-        self._drive_wheels = drive_wheels.bind(self.command, self._wheel_speeds, *looks, *numbers)
+        flags = self.limits, self.protective_stop
+        self._drive_wheels = drive_wheels.bind(self.command, self._wheel_speeds, *looks, *flags, *numbers)
 
     def set_setpoint(self, values: Array, mask: Mask) -> None:
         """Head for new twists, with the normal accelerations."""
@@ -184,7 +207,24 @@ class BaseController(Controller):
                 self.limits[near.any(axis=1)] |= Limit.CLEARANCE
                 self._rate[near] = 0.0  # the next change starts anew: such a large one could not end in time
         self._ticks += 1
-        self._drive_wheels(reading.position, reading.velocity, reading.sensors, self._ticks)
+        # Readings without stamps are those of the tick.
+        self._stamp_ns[:] = self._ticks if reading.stamp_ns is None else reading.stamp_ns
+        self._drive_wheels(reading.position, reading.velocity, reading.sensors, self._stamp_ns, self._ticks)
+        if np.count_nonzero(self.protective_stop):
+            self.cause = self._explain(int(np.flatnonzero(self.protective_stop)[0]), reading)
+
+    def _explain(self, sim: int, reading: PlantReading) -> str:
+        if self.protective_stop[sim] == _IMPLAUSIBLE:
+            return "Wheels and gyroscope do not agree about how far the base turned: one of them is wrong, or it slips."
+        wanted, found = (
+            ", ".join(f"{speed:.1f}" for speed in row[sim]) for row in (self._wheel_speeds, reading.velocity)
+        )
+        late = f", of which {self._latency_s:g} s are its latency" if self._latency_s else ""
+        if np.abs(reading.position[sim] - self._first[sim]).max() < _STANDS_RAD:
+            why = "They have not turned at all: its motors are off, or it does not take the commands."
+        else:
+            why = "Something blocks one, its encoder is wrong, or the base follows later than that."
+        return f"The wheels read {found} rad/s and not {wanted} for {self._patience_s:.2g} s{late}. {why}"
 
     def _watch(self, reading: PlantReading, monitor: CollisionMonitor) -> None:
         """Show the monitor the newest scans, from where the bases were when they took them."""
@@ -205,7 +245,8 @@ class BaseController(Controller):
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start odometry here."""
         self._asked[ids], self._turned[ids], self._start[ids] = 0.0, 0.0, reading.position[ids]
-        self._looks[ids], self._look_at[ids] = 0, self._ticks + self._period
+        self._looks[ids], self._late[ids], self._first[ids] = 0, 0.0, reading.position[ids]
+        self._look_at[ids] = self._ticks + self._period, self._ticks, -1
         self.drive.reset_odometry(ids, reading.position[ids])
         if self._monitor is not None:
             self._monitor.forget(ids)  # what it remembers is where odometry was before

@@ -85,6 +85,7 @@ class CheckedPlant(Plant):
         self.takes = getattr(plant, "takes", Plant.takes)
         if self.takes not in ("actuators", "twist"):
             raise ConfigError(f"The plant {name} takes {self.takes!r}; what a plant takes is 'actuators' or 'twist'.")
+        self.latency_s, self.hint = float(getattr(plant, "latency_s", 0.0)), str(getattr(plant, "hint", ""))
         self._plant, self._name, self._oldest_ns, self._clock, self._sleep = plant, name, oldest_ns, clock, sleep
         self._stamp_ns = np.zeros(1, np.int64)
         self.problem = ""

@@ -198,7 +198,8 @@ class LiveProcess:
         if cerebellum.mode[0] != Mode.FAULT:
             return ""
         named = cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
-        return named or cerebellum.readings.silence
+        cause = cerebellum.controller.cause
+        return named or cerebellum.readings.silence or f"{cause} {plant.hint if cause and plant else ''}".rstrip(" .")
 
     def _serve(self, now_ns: int) -> None:
         self._serve_bridge(now_ns)

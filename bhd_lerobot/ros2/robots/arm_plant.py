@@ -82,6 +82,7 @@ class ArmPlant(Ros2Plant):
     """
 
     command_hz = 125.0
+    usual_latency_s = 0.1
 
     def __init__(self, config: Any, body: Arm) -> None:
         joints = tuple(f"{joint}_joint" for joint in body.chain.joints)
@@ -99,6 +100,7 @@ class ArmPlant(Ros2Plant):
             OutputSpec(ur.GRIPPER_TOPIC, ur.FLOATS, FloatsWriter(1), Qos(1), is_required=False),
         )
         super().__init__(body.name, config, inputs, outputs)
+        self.hint += " A controller that is not active takes none (ros2 control list_controllers)."
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the joints and the driver's status into `out`."""

@@ -86,6 +86,7 @@ class BasePlant(Ros2Plant):
 
     takes = "twist"
     command_hz = 50.0
+    usual_latency_s = 0.3
 
     def __init__(self, config: Any, body: MobileBase) -> None:
         if body.lidar is None:

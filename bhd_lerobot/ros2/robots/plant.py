@@ -33,6 +33,7 @@ class Ros2Plant(Plant):
 
     n = 1
     command_hz: float
+    usual_latency_s: float
 
     def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
         network = config.ros2
@@ -48,6 +49,9 @@ class Ros2Plant(Plant):
         self.link = NodeLink(spec)
         self._parts = spec.columns
         self._silence_s = network.silent_s
+        self.latency_s = self.usual_latency_s if network.latency_s is None else network.latency_s
+        sent = ", ".join(one.topic for one in spec.outputs if one.is_required)
+        self.hint = f"Commands go to {sent}. A robot that follows later needs a larger robot.ros2.latency_s."
         self._enabled = False
 
     def open(self) -> None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Request, Watchdog
+from bhd_lerobot.control.plant import PlantReading
 from tests.control.arm_rig import FRAME, HOME, HZ, LIMITS, SWEEP, TICK_NS, TIMEOUT_TICKS, Rig, off, posture
 
 
@@ -366,3 +367,40 @@ def test_random_histories_have_no_jump_and_one_result_per_goal(script: list) -> 
     rig.check()
     assert np.array_equal(rig.rows[-1], rig.rows[-2])
     assert sorted(name for name, _ in results) == sorted(str(k) for k in range(1, rig.names + 1))
+
+
+@pytest.mark.parametrize("silence", [0.1, 0.35, 0.45])
+def test_while_nothing_is_read_a_moving_arm_is_not_blocked(silence: float) -> None:
+    """The readings stand for a while, with their stamps; the arm moves on, and then reads where it is."""
+    rig = Rig()
+    rig.cerebellum.readings.oldest_ns = NANOSECONDS
+    stamp, read = np.ones(1, np.int64), rig.plant.read
+    kept: list[np.ndarray] = []
+
+    def stale(out: PlantReading) -> None:
+        read(out)
+        out.stamp_ns = stamp
+        if rig.now % NANOSECONDS < silence * NANOSECONDS and kept:
+            out.position[:], out.velocity[:] = kept[-2:]
+        else:
+            kept[:] = out.position.copy(), out.velocity.copy()
+            stamp[0] = rig.now + 1
+
+    rig.plant.read = stale  # type: ignore[method-assign]
+    rig.go(joint_target=posture(j0=2.0))
+    rig.tick(4 * HZ)
+    assert max(mode for [mode] in rig.modes) < Mode.ESTOP
+    rig.check()
+
+
+@pytest.mark.parametrize(("moved", "cause"), [(False, "has not moved since"), (True, "something is in its way")])
+def test_an_arm_that_never_moved_is_named_otherwise_than_one_that_is_blocked(moved: bool, cause: str) -> None:
+    rig = Rig()
+    if moved:
+        rig.go(joint_target=posture(j0=0.3))
+        rig.tick(3 * HZ)
+    rig.plant.stuck[:] = True
+    rig.go(joint_target=posture(j0=2.0))
+    rig.tick(3 * HZ)
+    assert rig.cerebellum.mode[0] == Mode.FAULT
+    assert cause in rig.controller.cause
