@@ -20,7 +20,7 @@ class RealtimeConfig:
         freeze_collector: run it without Python's garbage collector.
         affinity: the processors that it may run on; all if empty.
         brain_timeout_s: after so long without a sign of life of the brain's process the robot decelerates and holds
-            [s].
+            [s]. With `plant = "ros2"` the default is `ros2.timeout_s`.
         recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.

@@ -27,7 +27,7 @@ import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body, Rates
 from bhd_lerobot.control.kernels import compile_at_once
-from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
@@ -205,8 +205,10 @@ class LiveProcess:
         self._serve_bridge(now_ns)
         if os.getppid() == self._parent:
             return
-        # The brain's process has ended: come to rest (its watchdog sees to that), then end.
+        # The brain's process has ended: come to rest (its watchdog sees to that, a real robot stops at once), then end.
         self._orphan_ticks += 1
+        if self._plant is not None:
+            self._host.cerebellum.interrupt(Watchdog.BRAIN, Mode.FAULT)
         moving = self._host.cerebellum.mode[0] in (Mode.TRACKING, Mode.STOPPING)
         if not moving or self._orphan_ticks > self._most_orphan_ticks:
             self._words[Word.END] = 1

@@ -90,7 +90,8 @@ class Ros2Config(NetworkConfig):
     Attributes:
         command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
             base, 125 Hz to an arm.
-        timeout_s: without a command of the cerebellum for so long the robot is stopped by its node [s].
+        timeout_s: without a sign of life of the brain's process for so long the robot brakes, without a command of the
+            cerebellum it is stopped by its node [s].
         silence_s: a topic that sends nothing for so long is a fault [s]; by default 0.5, and 1 of scans. The robot type
             ``ros2`` has `robot.topic_timeout_s` for it.
         synchronised: the clocks of the robot and of this machine are synchronised (NTP, PTP), so that a reading's age

@@ -19,7 +19,7 @@ WORDS = {
     "step": "shoulder_lift reads a change of 0.300 rad",
     "wrapped": "its angles are wrapped",
     "from the future": "a stamp is 10.000 s ahead of now: of another clock",
-    "frozen": "watchdog: blocked",
+    "frozen": "The arm stayed more than 0.1 rad from its reference",
 }
 
 

@@ -5,13 +5,16 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.messages.scan import ScanReader
 from bhd_lerobot.ros2.robots.base_plant import BasePlant
@@ -188,3 +191,31 @@ def test_a_network_with_nobody_is_named(domain: int) -> None:
     with pytest.raises(RealtimeError, match=r"Nobody publishes /joint_states .*No node publishes anything"):
         plant.link.open(patience_s=2.0)
     plant.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "brain_s", "plant_s"),
+    [
+        ({}, 0.2, 0.5),
+        ({"ros2": Ros2Config(timeout_s=0.4, silence_s=1.0)}, 0.4, 1.0),
+        ({"realtime": RealtimeConfig(brain_timeout_s=20.0)}, 20.0, 0.5),
+    ],
+)
+def test_the_brain_of_a_ros_robot_is_waited_for_as_long_as_its_commands(
+    options: dict[str, Any], brain_s: float, plant_s: float
+) -> None:
+    realtime = TurtleBot3Config(plant="ros2", **options).realtime
+    assert (realtime.brain_timeout_s, realtime.plant_timeout_s) == (brain_s, plant_s)
+
+
+@pytest.mark.parametrize(("options", "latency_s"), [({}, 0.3), ({"latency_s": 0.0}, 0.0), ({"latency_s": 0.7}, 0.7)])
+def test_how_late_a_base_follows_is_an_option(options: dict[str, float], latency_s: float) -> None:
+    plant = make(1, **options)
+    assert plant.latency_s == latency_s
+    assert "/cmd_vel" in plant.hint
+
+
+@pytest.mark.parametrize("options", [{"latency_s": -0.1}, {"latency_s": 3.0}, {"scan_yaw": np.nan}, {"silence_s": 0.0}])
+def test_options_that_cannot_be_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(options))):
+        Ros2Config(**options)  # type: ignore[arg-type]
