@@ -598,3 +598,29 @@ def test_frames_at_any_rate_come_back_with_their_own_action(tmp_path, fps, names
         ours, theirs = (read_episode(one, episode) for one in (root, tmp_path / "back"))
         for key in features:
             np.testing.assert_array_equal(ours[key], theirs[key])
+
+
+@pytest.mark.parametrize("jitter", ["late", "early and late", "frames left out"])
+def test_frames_of_a_robot_on_the_wall_clock_come_back_one_for_one_with_their_times(tmp_path, jitter):
+    """They were taken a little beside the grid of the rate, and some were left out."""
+    root, frames, fps = tmp_path / "d", 60, 30
+    rng, vector = np.random.default_rng(0), {"dtype": "float32", "shape": (2,), "names": ["x.vel", "theta.vel"]}
+    features = {"observation.state": vector, "action": vector}
+    features["control.time"] = {"dtype": "float64", "shape": (1,), "names": None}
+    low = 0.0 if jitter == "late" else -0.012
+    number = np.cumsum(1 + (rng.random(frames) < 0.1)) - 1 if jitter == "frames left out" else np.arange(frames)
+    with DatasetRecorder.create("t/t", fps, features, robot_type="ros2", root=root) as recorder:
+        for episode in range(2):
+            times = 0.0005 + (number - number[0]) / fps + rng.uniform(low, 0.012, frames) * (number > number[0])
+            writer, values = recorder.begin_episode(), episode + np.arange(frames, dtype=np.float32)[:, None] / 100
+            writer.set_columns(
+                {"observation.state": values * (0.1, 0.2), "action": values * (0.3, 0.4), "control.time": times}
+            )
+            recorder.save(writer, task="count", metadata={"outcome": "success"})
+    back(export(root, tmp_path / "bags"), tmp_path / "back")
+    assert len(load_state(tmp_path / "back").rows) == 2
+    for episode in range(2):
+        ours, theirs = (read_episode(one, episode) for one in (root, tmp_path / "back"))
+        for key in ("observation.state", "action"):
+            np.testing.assert_array_equal(ours[key], theirs[key])
+        np.testing.assert_allclose(ours["control.time"], theirs["control.time"], rtol=0, atol=1e-9)

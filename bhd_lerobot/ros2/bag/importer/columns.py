@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, frame_times, newest, newest_before
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, newest, newest_before
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track
 from bhd_lerobot.ros2.messages.base import ODOMETRY, TWIST
 from bhd_lerobot.tasks.task import OUTCOMES, Event
@@ -124,8 +124,8 @@ def unanswered(options: ImportOptions, tracks: Sequence[Track], times: Times) ->
 
 
 def _ends(times: Times, fps: int) -> Times:
-    """Return when frames at a fixed rate end [ns]: each with the beginning of the next, shape (n,)."""
-    return frame_times(int(times[0]), len(times) + 1, fps)[1:]
+    """Return when frames end [ns]: each with the beginning of the next, shape (n,)."""
+    return np.append(times[1:], times[-1] + round(NANO / fps))
 
 
 def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> tuple[Array, Times]:

@@ -25,7 +25,7 @@ from bhd_lerobot.ros2.bag.importer.columns import (
 )
 from bhd_lerobot.ros2.bag.importer.exported import ExportedEpisode
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids, recorded_grid
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
 from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.ros2.bag.importer.video import CameraImages
@@ -232,12 +232,20 @@ class _RobotBag:
             tracks = [track.part((of_commands if track.is_action else part).mask(track)) for track in self._tracks]
             sensors = [track for track in tracks if not track.is_action]
             self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
-            for found in grids(
-                [track.times for track in sensors],
-                options.fps,
-                max_age_ns=round(options.max_age_s * NANO),
-                max_gap_ns=round(options.max_gap_s * NANO),
-                why=part.why,
+            times = [track.times for track in sensors]
+            recorded = (
+                recorded_grid(times, begun[-1].frames, part.why) if begun and begun[-1].fps == options.fps else None
+            )
+            for found in (
+                [recorded]
+                if recorded
+                else grids(
+                    times,
+                    options.fps,
+                    max_age_ns=round(options.max_age_s * NANO),
+                    max_gap_ns=round(options.max_gap_s * NANO),
+                    why=part.why,
+                )
             ):
                 if (grid := self._answered(found, tracks)) is None:
                     continue
@@ -300,6 +308,7 @@ class _RobotBag:
                 ages = np.maximum(ages, times - shown)
             task, metadata = self._described(episode)
             columns = frame_columns(self._options, episode.tracks, times, ages, metadata.get("outcome"))
+            columns[keys.TIME] = (times - self._begin_of(episode)) / NANO
             self._recording.refuse_again(self._bag.path, int(times[0]), columns)
             writer.set_columns(columns)
             recorder.save(writer, task=task, metadata={**metadata, "source": self._source(episode, columns)})
@@ -323,6 +332,12 @@ class _RobotBag:
                 "be decoded"
             )
         return replace(episode, grid=grid.since(blind))
+
+    def _begin_of(self, episode: _Episode) -> int:
+        """Return when an episode began [ns]: with its first frame, or as its export states, shortly before."""
+        first, exported = int(episode.grid.times[0]), episode.exported
+        start = first if exported is None else exported.start[self._options.stamps == "header"]
+        return start if 0 <= first - start < NANO // self._options.fps else first
 
     def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
         """Return the task of an episode, and its metadata: those of the user have precedence over those of the bag."""

@@ -29,7 +29,8 @@ class ExportedEpisode:
     Attributes:
         place: of its description among all messages of the bag; those of the episode come after it.
         start: the first frame [ns]: by the reception of its description, and by its stamp.
-        duration: of all of its frames [ns].
+        frames: how many it has.
+        duration: of all of them [ns].
         robot_type, fps, features: of its dataset.
         task: the instruction.
         metadata: of the episode in the dataset, without the prefix ``bhd/``; the same keys in all episodes.
@@ -39,6 +40,7 @@ class ExportedEpisode:
 
     place: int
     start: tuple[int, int]
+    frames: int
     duration: int
     robot_type: str
     fps: int
@@ -108,6 +110,7 @@ def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:
     episode = ExportedEpisode(
         place=place,
         start=(received, found.stamp.sec * NANO + found.stamp.nanosec),
+        frames=found.frames,
         duration=found.frames * NANO // found.fps,
         robot_type=found.robot_type,
         fps=found.fps,
