@@ -2,14 +2,16 @@
 
 import json
 import math
+import time
 from collections.abc import Mapping, Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from bhd_lerobot.datasets.storage.disk import Disk
 
@@ -109,6 +111,7 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str, loss: str) -> None:
     figure.savefig(path, dpi=110)
 
 
+_LONG_S = 2 * 3600.0  # [s] more is worth a line of its own
 _PART_COLOURS = ("#2980b9", "#8e9a3b", "#8e44ad", "#d68910")
 
 
@@ -119,24 +122,31 @@ def _parts(rows: Sequence[Row]) -> list[str]:
 
 
 class RunProgress:
-    """A bar in a terminal; elsewhere, one line for each row of metrics."""
+    """A bar in a terminal, elsewhere one line for each row of metrics; with the time left, from the first step on.
 
-    def __init__(self, console: Console, description: str, total: float, completed: int = 0) -> None:
-        self._console = console
+    Args:
+        slow: what is printed after the first step if several hours are left.
+    """
+
+    def __init__(self, console: Console, description: str, total: float, completed: int = 0, *, slow: str = "") -> None:
+        self._console, self._slow = console, slow
+        self._total, self._first, self._started = total, completed, time.monotonic()
+        self._left = ""
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
             TextColumn("{task.fields[numbers]}"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=console,
             transient=True,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task(description, total=total, completed=completed, numbers="")
+        self._task = self._bar.add_task(description, total=total, completed=completed, numbers="", left="")
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()
+        self._started = time.monotonic()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -144,14 +154,20 @@ class RunProgress:
 
     def advance(self, completed: float) -> None:
         """Move the bar."""
-        self._bar.update(self._task, completed=completed)
+        done, is_first = completed - self._first, not self._left
+        if done > 0:
+            left_s = (self._total - completed) / done * (time.monotonic() - self._started)
+            self._left = f"{timedelta(seconds=round(left_s))} left"
+            if is_first and left_s > _LONG_S:
+                self._console.print(f"{self._left}, by the first step. {self._slow}".rstrip(), soft_wrap=True)
+        self._bar.update(self._task, completed=completed, left=self._left)
 
     def log(self, prefix: str, numbers: str) -> None:
         """Print a row: its numbers beside the bar, or with a prefix on a line of its own."""
         if self._console.is_terminal:
             self._bar.update(self._task, numbers=numbers)
         elif prefix:
-            self._console.print(f"{prefix}  {numbers}")
+            self._console.print(f"{prefix}  {numbers}  {self._left}".rstrip())
 
 
 def format_numbers(row: Mapping[str, Any], labels: Sequence[tuple[str, str]]) -> str:

@@ -185,7 +185,8 @@ def _follow(
 ) -> None:
     """Run the loop, show and write what comes of it, and keep the result up to date, also when it fails."""
     started = time.perf_counter()
-    with RunProgress(console, "training", config.steps, loop.step) as progress, stop_on_signals() as stop:
+    slow = _ON_CPU if accelerator.device.type == "cpu" else ""
+    with RunProgress(console, "training", config.steps, loop.step, slow=slow) as progress, stop_on_signals() as stop:
 
         def log(row: Row) -> None:
             output.log(row)
@@ -205,6 +206,12 @@ def _follow(
             result.step, result.wall_s = loop.step, time.perf_counter() - started
             result.checkpoint, result.rows = output.checkpoint, output.rows
             output.draw(loop.step)
+
+
+_ON_CPU = (
+    "The device is a CPU. The configurations in configs/train without _gpu in their names are small enough for one; an "
+    "ACT with --policy.dim_model=128 --policy.dim_feedforward=512 and a smaller --batch_size is many times as fast."
+)
 
 
 def _agreement(stop: StopRequest, accelerator: Any) -> Any:

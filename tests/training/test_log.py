@@ -1,10 +1,12 @@
+import io
 from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 
 from bhd_lerobot.training import log
-from bhd_lerobot.training.log import MetricsFile, draw_loss, read_metrics
+from bhd_lerobot.training.log import MetricsFile, RunProgress, draw_loss, read_metrics
 
 pytestmark = pytest.mark.figures
 
@@ -62,3 +64,21 @@ def test_a_negative_log_likelihood_has_a_linear_scale(tmp_path: Path, monkeypatc
 
 def test_no_row_at_all_can_be_drawn(tmp_path: Path, monkeypatch) -> None:
     assert drawn([], tmp_path / "loss.png", monkeypatch).axes[0].lines[:] == []
+
+
+@pytest.mark.parametrize(("completed", "said"), [(0, "15:00:00 left, by the first step. Take less."), (90, "")])
+def test_the_time_left_is_printed_from_the_first_step_on(
+    completed: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("bhd_lerobot.training.log.time.monotonic", lambda: now[0])
+    printed = io.StringIO()
+    total = 100 if completed else 10_801
+    with RunProgress(Console(file=printed, width=100), "training", total, completed, slow="Take less.") as progress:
+        for step in range(completed + 1, completed + 3):
+            now[0] += 5.0
+            progress.advance(step)
+        progress.log("step 2/100", "loss 1")
+    lines = printed.getvalue().splitlines()
+    assert lines[:-1] == ([said] if said else [])
+    assert lines[-1] == f"step 2/100  loss 1  {'14:59:55' if not completed else '0:00:40'} left"
