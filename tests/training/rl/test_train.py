@@ -353,7 +353,9 @@ def test_a_checkpoint_of_another_architecture_is_refused(finished: RlResult, tmp
     }
     act.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
     ACTPolicy(act).save_pretrained(tmp_path)
-    for one in make_pre_post_processors(act, dataset_stats={}):
+    sizes = {"observation.state": 38, "observation.environment_state": 2, "action": 2}
+    stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in sizes.items()}
+    for one in make_pre_post_processors(act, dataset_stats=stats):
         one.save_pretrained(tmp_path)
     with pytest.raises(ConfigError, match="'act'; PPO starts from a 'bhd_mlp'"):
         run(tmp_path / "run", start_from=tmp_path)
