@@ -14,9 +14,10 @@ PAGE = ROOT / "docs" / "how_to" / "own_policy.md"
 
 
 def run(folder: Path) -> int:
-    """Train and evaluate the page's policy in a folder where its files are."""
+    """Record, and train and evaluate the page's policy, in a folder where its files are."""
     os.chdir(folder)
     sys.path.insert(0, str(folder))  # PYTHONPATH=. of an interpreter that has started already
+    run_record(folder / "data" / "avoid", robot__beams=36, dataset__num_episodes=2, dataset__episode_time_s=1)
     text = PAGE.read_text(encoding="utf-8").replace("\\\n", " ")
     commands = dict(re.findall(r"^(bhd-\w+) (.*) …$", text, re.MULTILINE))
     shorter = {
@@ -37,7 +38,6 @@ def test_its_files_train_and_drive(tmp_path: Path) -> None:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(text)
-    run_record(tmp_path / "data" / "avoid", robot__beams=36, dataset__num_episodes=2, dataset__episode_time_s=1)
     process = Fork(run, tmp_path, output=tmp_path / "log")
     assert process.wait() == 0, (tmp_path / "log").read_text()[-3000:]
     assert (tmp_path / "outputs/linear/checkpoints/last/pretrained_model/config.json").is_file()
