@@ -67,7 +67,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.storage": (),
     "datasets.format": ("datasets.storage",),
     "datasets.assembly": _DATASETS,
-    "datasets.edit": (*_DATASETS, "datasets.assembly", "bodies", "tasks"),
+    "datasets.edit": ("options", *_DATASETS, "datasets.assembly", "bodies", "tasks"),
     "datasets.validate": (*_DATASETS, "control.geometry"),
     "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
     "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),

@@ -27,7 +27,8 @@ from bhd_lerobot.datasets.storage.atomic import (
     uninterrupted,
 )
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, counted, quoted
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, DatasetMismatchError, counted, quoted
+from bhd_lerobot.options.units import other_units
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,18 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
         picks = [Pick(state, row) for state in states for row in state.rows]
         sizes = [{"root": state.root.name, "episodes": len(state.rows)} for state in states]
         recordings = [with_present_names((state.identity or {}).get("recording", {})) for state in states]
+        _check_units(paths, recordings)
         return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, _common(recordings))
+
+
+def _check_units(paths: Sequence[Path], recordings: Sequence[Mapping[str, Any]]) -> None:
+    """Check that the numbers of all datasets mean the same to the robot."""
+    for path, recording in zip(paths, recordings, strict=True):
+        for name, first, here in other_units(recordings[0].get("robot", {}), recording.get("robot", {})):
+            raise DatasetMismatchError(
+                f"{paths[0]} was recorded with robot.{name} = {first} and {path} with {here}: the same numbers mean "
+                "something else in both, and a policy would learn them as one. Convert one of them first."
+            )
 
 
 def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:

@@ -158,7 +158,12 @@ class Graph:
     def all_mismatches(self) -> list[str]:
         """Return the same for all topics of this process."""
         everyone = self.endpoints()
-        return [text for one in everyone if one.is_own for text in _mismatches(one, everyone)]
+        texts: list[str] = []
+        for other in everyone:
+            # A topic may have several subscriptions here, one of which fits.
+            found = [_mismatches(one, [other]) for one in everyone if one.is_own and _meets(one, other)]
+            texts += found[0] if found and all(found) else []
+        return texts
 
     def doubles(self) -> list[str]:
         """Return which other nodes are the same robot as this one, in sentences.
@@ -183,11 +188,15 @@ class Graph:
 _SHARED = ("/tf", "/tf_static", "/diagnostics", "/clock", "/rosout", "/parameter_events")  # of any number of publishers
 
 
+def _meets(ours: Endpoint, other: Endpoint) -> bool:
+    return not other.is_own and other.topic == ours.topic and other.is_publisher != ours.is_publisher
+
+
 def _mismatches(ours: Endpoint, everyone: list[Endpoint]) -> list[str]:
     kinds = ("publisher", "subscription") if ours.is_publisher else ("subscription", "publisher")
     found = []
     for one in everyone:
-        if one.is_own or one.topic != ours.topic or one.is_publisher == ours.is_publisher:
+        if not _meets(ours, one):
             continue
         who = f"The {kinds[1]} of {one.topic} in {one.node or 'an unnamed node'}"
         if one.msgtype != ours.msgtype:

@@ -19,6 +19,7 @@ from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
 COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
 ESTOP_TOPIC, RESET_TOPIC = "/emergency_stop", "/emergency_stop/reset"
+BOOL, LOSSY = "std_msgs/msg/Bool", Qos(0, reliable=False)
 DIAGNOSTICS_TOPIC, DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 _RESULTS_HZ, _DIAGNOSTICS_HZ = 50, 1
 _CUTS = Limit.NON_FINITE | Limit.VELOCITY | Limit.POSITION | Limit.POSTURE | Limit.CLEARANCE  # others are of every day
@@ -54,10 +55,11 @@ class InterfaceTopics:
         self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
         self._limits, self._reported = host.bridge.latest["limits"].copy(), counts.all()
         self._results: deque[CommandResult] = deque()
-        # The stop comes after the reset: of two that arrive together the arm stays stopped.
+        # The stop comes after the reset: of two that arrive together the robot stays stopped. A publisher that is best
+        # effort presses, too.
         self._inputs = [
             Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
-            Input(node.subscription(ESTOP_TOPIC, "std_msgs/msg/Bool", EVERY), self._stop, "different"),
+            *(Input(node.subscription(ESTOP_TOPIC, BOOL, qos), self._stop, "different") for qos in (EVERY, LOSSY)),
             Input(node.subscription(COMMAND_TOPIC, COMMAND, EVERY), self._submit, "each"),
         ]
 

@@ -165,6 +165,23 @@ def test_episodes_of_another_shape_do_not_merge(plain: Path, tmp_path: Path) -> 
     assert not (tmp_path / "all").exists()
 
 
+def test_recordings_in_other_units_do_not_merge(plain: Path, tmp_path: Path) -> None:
+    def recorded(name: str, **options: object) -> Path:
+        root = Path(shutil.copytree(plain, tmp_path / name))
+        path = root / layout.IDENTITY
+        identity = json.loads(path.read_text())
+        identity["recording"]["robot"] = {"type": "mock_arm", **options}
+        path.write_text(json.dumps(identity))
+        return root
+
+    first, same = recorded("a", use_degrees=True, log="x"), recorded("b", use_degrees=True, log="y")
+    with pytest.raises(DatasetMismatchError, match=r"robot.use_degrees = true and .*c with false"):
+        merge([first, same, recorded("c", use_degrees=False)], tmp_path / "wrong")
+    assert not (tmp_path / "wrong").exists()
+    merge([first, same], tmp_path / "all")
+    assert_valid(tmp_path / "all")
+
+
 def test_metadata_of_some_episodes_is_empty_in_the_others(plain: Path, tmp_path: Path) -> None:
     recorder = support.create(tmp_path / "other")
     recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata={"outcome": "stuck", "extra": 3})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig
+from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig, Qos
 from bhd_lerobot.ros2.live.node import Node, Publisher, Subscription
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -86,17 +86,24 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Side]:
 
 
 @pytest.mark.parametrize(
-    "values",
-    [[True] + [False] * 11, [False] * 500 + [True] + [False] * 3000, [True] * 20 + [False] * 20],
-    ids=["followed", "inside", "many"],
+    ("values", "qos"),
+    [
+        ([True] + [False] * 11, EVERY),
+        ([False] * 500 + [True] + [False] * 3000, EVERY),
+        ([True] * 20 + [False] * 20, Qos()),
+        ([True], Qos(1, reliable=False)),
+    ],
+    ids=["followed", "inside", "many", "best effort"],
 )
-def test_a_press_among_any_number_of_messages_presses(values: list[bool], base: Side) -> None:
-    publisher = base.publisher(ESTOP_TOPIC, BOOL)
+def test_a_press_among_any_number_of_messages_presses(values: list[bool], qos: Qos, base: Side) -> None:
+    publisher = base.node.publisher(ESTOP_TOPIC, BOOL, qos)
+    until(lambda: publisher.receivers == (1 + qos.reliable), "the robot receives it")
     data = {value: encode(BOOL, {"data": value}, 1)[0] for value in (False, True)}
     for value in values:
         publisher.send(data[value])
     base.wait(lambda state: state.emergency_stop, "the stop is latched")
     base.reset()
+    assert "best effort" not in base.served.text
 
 
 def goal(name: str, x: float) -> dict[str, Any]:
