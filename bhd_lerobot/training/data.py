@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.state import load_info
-from bhd_lerobot.datasets.loader.check import beyond, fingerprint
+from bhd_lerobot.datasets.loader.check import beyond, constant, fingerprint
 from bhd_lerobot.datasets.loader.loader import Loader, check, expert_stats, imagenet_stats, make_loader
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
@@ -121,6 +121,8 @@ def open_data(
     for key in keep if by_own_statistics else ():
         if warning := _beyond_quantiles(loaders.dataset, policy, key, config.rename_map.get(key, key)):
             report(warning)
+        if warning := _of_constants(loaders.dataset, policy, key, config.rename_map.get(key, key)):
+            report(warning)
     size = getattr(loaders.dataset, "nbytes", None)
     return TrainingData(
         train=loaders.train,
@@ -156,6 +158,28 @@ def _beyond_quantiles(dataset: Any, policy: PreTrainedConfig, key: str, name: st
         f"them, not {100 * expected:.0f} %: LeRobot takes the average of the episodes' quantiles. Set {kind} of "
         "policy.normalization_mapping to MEAN_STD or MIN_MAX."
     )
+
+
+_OWN_SCALE = (None, NormalizationMode.IDENTITY)
+
+
+def _of_constants(dataset: Any, policy: PreTrainedConfig, key: str, name: str) -> str:
+    """Return a warning if an input never changes in the data, and any other value would count as a huge one."""
+    feature = (policy.input_features or {}).get(name)
+    vectors = (FeatureType.STATE, FeatureType.ENV)
+    if feature is None or feature.type not in vectors or hasattr(policy, "min_std"):
+        return ""  # ours give such an input no influence
+    if policy.normalization_mapping.get(feature.type.value) in _OWN_SCALE or not (names := constant(dataset, key)):
+        return ""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return (
+        f"warning: {', '.join(names[:_SHOWN])}{more} of {key} never changes in the data. A {policy.type!r} divides by "
+        "how much it changes: where the robot is off by a little there, its actions mean nothing. Record data in which "
+        "it changes, or without it."
+    )
+
+
+_SHOWN = 6
 
 
 def kept_features(

@@ -265,6 +265,17 @@ def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path, m
     assert "warning: action is normalised by" not in printed
 
 
+def test_an_input_that_never_changes_is_warned_of_where_it_would_count(tmp_path: Path) -> None:
+    """What `bhd_mlp` ignores, other policies divide by nothing: the goals of single episodes do not change."""
+    root = make_dataset(tmp_path / "d", episodes=1, frames=40)
+    what = "warning: goal_x, goal_y of observation.environment_state never changes in the data. A 'act' divides"
+    mapping = {"policy.normalization_mapping": json.dumps(dict.fromkeys(("STATE", "ENV", "ACTION"), "MEAN_STD"))}
+    cases = ((ACT | mapping, True), (ACT, False), (MLP, False))  # ACT itself takes the environment state as it is
+    for number, (policy, warns) in enumerate(cases):
+        _, printed = run_train(options(root, tmp_path / f"run{number}", policy, steps=1))
+        assert (what in printed) == warns
+
+
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
 def test_a_policy_that_is_pushed_holds_no_path_of_this_machine(
     data: Path, tmp_path: Path, hub: HubServer, policy: dict

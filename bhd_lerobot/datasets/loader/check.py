@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bhd_lerobot.datasets.format.features import names_of
+from bhd_lerobot.datasets.format.features import names_of, numbered_names_of
 from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, quoted
 from bhd_lerobot.stock import load_stats
@@ -51,6 +51,13 @@ def beyond(dataset: Any, key: str, low: str, high: str) -> float:
     for _, values, _ in _columns(dataset, [key]):
         shares += ((values < least) | (values > most)).float().mean(0).tolist()
     return max(shares)
+
+
+def constant(dataset: Any, key: str) -> list[str]:
+    """Return the numbers of a feature that are the same in all frames, by name or place."""
+    names = numbered_names_of(dataset.meta.features[key])
+    found = [(values == values[0]).all(0) for _, values, _ in _columns(dataset, [key])]
+    return [names[place] for one in found for place in one.nonzero()[:, 0].tolist()]
 
 
 def fingerprint(dataset: Any, keys: Collection[str]) -> str:

@@ -119,6 +119,18 @@ def test_each_goal_of_a_burst_has_one_result(base: Side) -> None:
     assert sorted(one.task_id for one in base.ended(101)) == sorted(["", *names])
 
 
+def test_each_goal_of_a_burst_to_an_arm_has_one_result(arm: Side) -> None:
+    # Near where the arm stands; the first is followed, eight wait, and the others are refused.
+    pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
+    names = [f"burst {k}" for k in range(100)]
+    for name in names:
+        arm.send(COMMAND_TOPIC, COMMAND, {"header": {"frame_id": "base"}, "task_id": name, "target_pose": pose})
+    ended = arm.ended(100)
+    assert sorted(one.task_id for one in ended) == sorted(names)
+    assert any("goals wait already" in one.message for one in ended)
+    is_at(arm, arm.joints)
+
+
 def test_a_refused_twist_leaves_the_goal_alone(base: Side) -> None:
     twist = "geometry_msgs/msg/TwistStamped"
     base.send(COMMAND_TOPIC, COMMAND, goal("the goal", -0.4))
