@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from bhd_lerobot.errors import ConfigError
 
 _NO_JERK_LIMIT = 1e12
@@ -221,7 +223,9 @@ class PositionLimits(CommandLimits):
 OBSTACLE = "obstacle_"
 """What the names of capsules begin with that are no part of the arm."""
 HELD = "held"
-"""The name of the capsule that stands for what the gripper holds."""
+"""What the names of capsules begin with that stand for what the gripper holds."""
+_PAD, _EDGE = 0.02, 0.001  # [m] what is held reaches at least so far to the sides; radius of its edges
+_SLIPS = 0.003  # [m] farther out its edges are assumed: it may have slipped down in the fingers
 
 
 @dataclass(frozen=True)
@@ -273,13 +277,39 @@ class ArmChain:
     min_manipulability: float
 
     def holding(self, held: Capsule | None) -> "ArmChain":
-        """Return the geometry with something in the gripper, whose distances are checked like those of the gripper."""
+        """Return the geometry with something in the gripper, whose distances are checked like those of the gripper.
+
+        With its edges: what is held stood on a flat end, whose corners come lower when it is tilted.
+        """
         if held is None:
             return self
         tooling = {capsule.name for capsule in self.capsules if capsule.frame == held.frame}
         partners = {one: None for pair in self.disjoint for one in pair if tooling & set(pair) and one not in tooling}
-        pairs = tuple((one, held.name) for one in partners)
-        return replace(self, capsules=(*self.capsules, held), disjoint=(*self.disjoint, *pairs))
+        parts = (*_edges(held), held)
+        pairs = tuple((one, part.name) for one in partners for part in parts)
+        return replace(self, capsules=(*self.capsules, *parts), disjoint=(*self.disjoint, *pairs))
+
+
+def _edges(held: Capsule) -> list[Capsule]:
+    """Return the edges of a square bar along a capsule, with sides along the fingers' way and across it."""
+    start, end = np.array(held.start), np.array(held.end)
+    way = end - start
+    length = float(np.linalg.norm(way))
+    if length < _EDGE:
+        return []
+    along = way / length
+    across = np.cross(along, (0.0, 1.0, 0.0))
+    size = float(np.linalg.norm(across))
+    if size < _EDGE:  # it lies along the fingers' way
+        return []
+    across /= size
+    half, last = max(held.radius, _PAD) + _SLIPS - _EDGE, end + along * (held.radius - _EDGE)
+    edges = []
+    for number, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        offset = half * (x * across + y * np.cross(across, along))
+        first, second = (tuple((point + offset).tolist()) for point in (start, last))
+        edges.append(Capsule(f"{held.name}_{number}", held.frame, first, second, _EDGE))
+    return edges
 
 
 @dataclass(frozen=True)

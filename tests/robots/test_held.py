@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableObject, TableScene
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.policies.manipulation.grasp import pointing_down
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -23,9 +24,9 @@ LIGHT_N = 20.0
 class Hand:
     """A UR5 that holds a box over the table, with the force between both at every tick."""
 
-    def __init__(self, fixtures: tuple[Shape, ...] = (), **config: Any) -> None:
+    def __init__(self, fixtures: tuple[Shape, ...] = (), box: TableObject = BOX, **config: Any) -> None:
         self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
-        arm.reset(FIRST, [TableScene("box", (BOX,), arm.body.home)], [0])
+        arm.reset(FIRST, [TableScene("box", (box,), arm.body.home)], [0])
         self.limits = self.watchdog = self._goals = 0
         self.forces: list[float] = []
         contacts = Contacts(arm)
@@ -37,9 +38,14 @@ class Hand:
     def goal(self, height: float | None, opening: float | None = None, x: float = BOX.x) -> CommandResult:
         """Send the tool to a height [m] on a line, or the gripper to an opening [m], and wait."""
         pose = None if height is None else pointing_down(x, BOX.y, height, yaw=0.0)
-        motion = {} if pose is None else {"target_pose": pose, "motion": "line", "max_velocity": 0.25}
+        return self.reach(pose, opening)
+
+    def reach(self, pose: Pose | None, opening: float | None = None, motion: str = "line") -> CommandResult:
+        """Send the tool to a pose, or the gripper to an opening [m], and wait."""
+        way = {} if pose is None else {"target_pose": pose, "motion": motion}
+        way |= {"max_velocity": 0.25} if way and motion == "line" else {}
         self._goals += 1
-        command = BrainCommand(f"goal {self._goals}", gripper=opening, **motion)  # type: ignore[arg-type]
+        command = BrainCommand(f"goal {self._goals}", gripper=opening, **way)  # type: ignore[arg-type]
         assert self.arm.bridge.submit(command, 0) is None
         while not (results := self._step(None)):
             pass
@@ -86,6 +92,35 @@ def test_a_goal_that_would_press_the_box_into_the_table_is_refused_and_one_that_
     assert hand.slipped < 1e-3
     assert hand.goal(None, 0.085).success  # it stands: the tool may go lower
     assert hand.goal(TAKEN_AT - 0.03).success
+
+
+TILTS = [
+    (0.27, 0.03, -0.0007),
+    (-0.17, 0.09, -0.0003),
+    (-0.36, 0.53, 0.001),
+    (0.36, 0.51, -0.002),
+    (0.11, -0.19, 0.0017),
+]
+"""About x and y [rad], and the tool's height above where the box was taken [m]. Without its edges: up to 175 N."""
+
+
+@pytest.mark.thorough(but=1)
+@pytest.mark.parametrize("size", [(0.03, 0.025), (0.015, 0.01), (0.02, 0.03)])
+@pytest.mark.parametrize("motion", ["line", "joint"])
+def test_goals_that_tilt_the_box_near_the_table_are_refused_or_touch_it_lightly(
+    size: tuple[float, float], motion: str
+) -> None:
+    hand = Hand(box=TableObject("box", "red", *size, 0.1, BOX.x, BOX.y))
+    down = Rotation.from_quat(np.roll(pointing_down(BOX.x, BOX.y, 0.1, yaw=0.0).quaternion, -1))
+    succeeded = []
+    for about_x, about_y, above in (*TILTS, (0.2, -0.2, 0.03)):
+        x, y, z, w = (Rotation.from_euler("xy", (about_x, about_y)) * down).as_quat()
+        result = hand.reach(Pose((BOX.x, BOX.y, TAKEN_AT + above), (w, x, y, z)), motion=motion)
+        succeeded.append(result.success)
+        assert max(hand.forces, default=0.0) < LIGHT_N
+        assert hand.goal(TAKEN_AT + LIFT).success
+    assert succeeded[-1]  # high enough above the table
+    assert not all(succeeded)
 
 
 @pytest.mark.thorough(but=1)

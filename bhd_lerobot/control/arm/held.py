@@ -78,7 +78,7 @@ class HeldObjects:
         below = float(tool[2, 3]) - chain.min_distance - _SLACK
         if not 0.0 < below < _HIGHEST:
             return None
-        radius = min(float(reading.position[sim, -1]) / 2, below)
+        radius = min(float(reading.position[sim, -1]) / 2, 0.9 * below)  # a capsule with a direction
         x, y, z = chain.tool - tool[2, :3] * (below - radius)  # the third row is the vertical in the tool's frame
         return Capsule(HELD, self._dof, chain.tool, (float(x), float(y), float(z)), radius)
 

@@ -243,13 +243,13 @@ class GoalPlanner:
             closest, what = postures[int(distances.argmin())], "the table"
             if code == ResultCode.SELF_COLLISION:
                 other, own = collision.closest_pair(closest)
-                what = other if other.startswith(OBSTACLE) else "the arm" if own == HELD else "itself"
+                what = other if other.startswith(OBSTACLE) else "the arm" if own.startswith(HELD) else "itself"
             else:
                 own = collision.lowest(closest)
-            who = "what the gripper holds" if own == HELD else "the arm"
+            who = "what the gripper holds" if own.startswith(HELD) else "the arm"
             where = f"{who.capitalize()} starts" if inside[0] else f"On the way {who} comes"
             advice = "; it may only move straight away" if inside[0] else ""
-            if own == HELD:
+            if own.startswith(HELD):
                 advice += "; it is taken to reach as far down as the table was when the gripper closed"
             return PlanFailure(
                 code, f"{where} within {distances.min():.4f} m of {what}; {least} m is the least{advice}."
