@@ -43,7 +43,7 @@ class BhdSb3VecEnv(VecEnv):
             raise ConfigError(
                 f"autoreset_mode is {env.autoreset_mode.value!r}; stable-baselines3 needs autoreset_mode='Disabled'."
             )
-        self.env = env
+        self.env, self.metadata = env, env.metadata
         super().__init__(
             env.num_envs, observation_space or env.single_observation_space, action_space or env.single_action_space
         )

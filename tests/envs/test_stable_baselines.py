@@ -26,6 +26,7 @@ def test_it_is_what_stable_baselines3_makes_of_single_environments() -> None:
     theirs = vec_env.DummyVecEnv([lambda: BhdEnv("TurtleBot3Avoid-v0", **OPTIONS) for _ in range(N)])
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
+    assert ours.metadata["render_fps"] == theirs.metadata["render_fps"]
     rng, ends = np.random.default_rng(0), 0
     for env in (ours, theirs):
         env.seed(5)

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -33,7 +34,9 @@ def make(kind: str, **options: Any) -> Any:
 
 def save(folder: Path, policy: Any) -> None:
     policy.save_pretrained(folder)
-    for one in make_pre_post_processors(policy.config, dataset_stats={}):
+    features = {**policy.config.input_features, **policy.config.output_features}
+    stats = {key: {"mean": np.zeros(one.shape[-1]), "std": np.ones(one.shape[-1])} for key, one in features.items()}
+    for one in make_pre_post_processors(policy.config, dataset_stats=stats):
         one.save_pretrained(folder)
 
 
