@@ -43,10 +43,11 @@ class BhdSb3VecEnv(VecEnv):
             raise ConfigError(
                 f"autoreset_mode is {env.autoreset_mode.value!r}; stable-baselines3 needs autoreset_mode='Disabled'."
             )
-        self.env, self.metadata = env, env.metadata
+        self.env = env
         super().__init__(
             env.num_envs, observation_space or env.single_observation_space, action_space or env.single_action_space
         )
+        self.metadata = env.metadata
         self._all = np.arange(env.num_envs)
         self._return = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, np.int64)
