@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError, unknown_name
@@ -21,7 +21,7 @@ CLEARANCE = 0.051  # [m] what must be free beside the robot for a place to count
 RESOLUTION = 0.05  # [m] of the grid that reachability is computed on
 START_CLEARANCE = 0.35  # [m] from the robot's centre to the nearest obstacle at the start
 WALL = 0.05  # [m] half the thickness of the outer walls
-_NEXT = ndimage.generate_binary_structure(2, 1)  # which places of the grid are neighbours: those beside each other
+_NEXT = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)  # neighbours of a place of the grid
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Arena:
 
     def _reached(self, clearance: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return where the robot's centre can get to from the start, on the grid that the clearance is of."""
-        labels, _ = ndimage.label(clearance > self.robot_radius + CLEARANCE, _NEXT)
+        labels, _ = scipy.ndimage.label(clearance > self.robot_radius + CLEARANCE, _NEXT)
         row, column = _nearest(self.extent, self.start[:2])
         label = labels[row, column]
         reached: NDArray[np.bool_] = (labels == label) & (label > 0)
@@ -264,7 +264,7 @@ def _stays_connected(before: NDArray[np.bool_], free: NDArray[np.bool_]) -> bool
     # Where the places just around the lost ones are connected, every way through those has a way around them: most
     # obstacles are small, and all of the floor need not be checked.
     around = tuple(slice(max(0, lines[0] - 1), lines[-1] + 2) for lines in (rows, columns))
-    return bool(ndimage.label(free[around], _NEXT)[1] == 1 or ndimage.label(free, _NEXT)[1] == 1)
+    return bool(scipy.ndimage.label(free[around], _NEXT)[1] == 1 or scipy.ndimage.label(free, _NEXT)[1] == 1)
 
 
 def _axes(extent: tuple[float, float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from bhd_lerobot.errors import DatasetEditedError
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import record
-from bhd_lerobot.recording.resume_advice import instead_of_resuming
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -15,6 +13,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
 
     def program(config: RecordConfig) -> int:
+        from bhd_lerobot.recording.record import record
+        from bhd_lerobot.recording.resume_advice import instead_of_resuming
+
         try:
             return record(config).exit_status
         except DatasetEditedError as error:

@@ -5,17 +5,13 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-import bhd_lerobot.registry  # noqa: F401 - its robots can be named
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.robots.robot import BhdRobot
+from bhd_lerobot.registry import ROBOTS
 from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
-from bhd_lerobot.stock import make_robot_from_config
 
 
 def _serve(config: ServeConfig) -> None:
-    robot = make_robot_from_config(config.robot)
-    assert isinstance(robot, BhdRobot)
-    serve(config, robot, Console(stderr=True))
+    serve(config, ROBOTS.of(config.robot), Console(stderr=True))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -207,11 +207,11 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
         if chosen is None:
             given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
             raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(valid_names(kind))}.")
-        if chosen not in choices:
+        if chosen not in choices and chosen in valid_names(kind):
             choices = choices_of(kind, of_lerobot=True)
         if chosen not in choices:
             raise ConfigError(
-                f"{unknown_name(f'{key}.type', chosen, choices)} To use one that your module registers: "
+                f"{unknown_name(f'{key}.type', chosen, valid_names(kind))} To use one that your module registers: "
                 f"--{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}

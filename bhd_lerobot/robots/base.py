@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from bhd_lerobot.bodies.arenas import Arena, make_arena
+from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.robot import BhdRobot
@@ -23,7 +23,7 @@ class SimulatedBase(BhdRobot):
 
     def make_scene(self) -> Arena:
         """Return the configured arena."""
-        return make_arena(self.config.arena, self.config.seed, robot_radius=self.config.body().radius)
+        return self.simulation_class.start_scene(self.config)
 
     @property
     def observation_names(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
@@ -87,6 +87,11 @@ class BaseSimulation(BaseHost, Simulation):
         due = round((time_s - age_s) * self.scan_rate_hz) + 1
         while self._scans[sim] < due:
             self._scan(np.array([sim]))
+
+    @classmethod
+    def start_scene(cls, config: "MobileBaseConfig") -> Arena:
+        """Return the configured arena."""
+        return make_arena(config.arena, config.seed, robot_radius=config.body().radius)
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Put robots into arenas, at rest at their start."""

@@ -41,10 +41,8 @@ class UR5(BhdRobot):
 
     def make_scene(self) -> TableScene:
         """Return the configured scene."""
-        if self._task is None:
-            scene = TableScene("empty", (), self.config.body().home)
-        else:
-            scene = self._task.sample(self.config.seed)
+        scene = UR5Simulation.start_scene(self.config)
+        if self._task is not None:
             self._task.begin(np.zeros(1, np.intp), [scene])
         self._scene = scene
         return scene

@@ -71,6 +71,18 @@ class UR5Simulation(ArmHost, Simulation):
         self._now = np.ones(n, np.int64)  # times the tick
         self._arm_on_table, self._arm_on_object, self._self_contact = (np.zeros(n, np.bool_) for _ in range(3))
 
+    @classmethod
+    def start_scene(cls, config: "UR5Config") -> TableScene:
+        """Return the configured scene: empty, or one of a task."""
+        from bhd_lerobot.tasks.pick import PickConfig, PickTask
+        from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+
+        if config.scene == "reach":
+            return ReachTask(ReachConfig(), 1, config.fps).sample(config.seed)
+        if config.scene == "pick":
+            return PickTask(PickConfig(), 1, config.fps).sample(config.seed)
+        return TableScene("empty", (), config.body().home)
+
     def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Put the arms and their objects where the scenes want them, at rest."""
         latency = [scene.variation.latency_s for scene in scenes]

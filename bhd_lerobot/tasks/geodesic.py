@@ -1,10 +1,8 @@
 """The lengths of the shortest ways to a place in an arena."""
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from bhd_lerobot.bodies.arenas import RESOLUTION, Arena
 
@@ -48,8 +46,10 @@ def way_lengths(free: NDArray[np.bool_], goal: tuple[int, int]) -> NDArray[np.fl
         ends.append(start + row * columns + column)
         lengths.append(np.full(len(start), np.hypot(row, column)))
     edges = (np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends)))
-    graph = coo_array(edges, shape=(free.size, free.size)).tocsr()
-    found: NDArray[np.float64] = dijkstra(graph, directed=False, indices=goal[0] * columns + goal[1])
+    graph = scipy.sparse.coo_array(edges, shape=(free.size, free.size)).tocsr()
+    found: NDArray[np.float64] = scipy.sparse.csgraph.dijkstra(
+        graph, directed=False, indices=goal[0] * columns + goal[1]
+    )
     return found.reshape(rows, columns)
 
 
@@ -75,7 +75,7 @@ class WayField:
         lengths = way_lengths(free, (row, column)) * RESOLUTION + apart
         self.is_way = np.isfinite(lengths)
         if self.is_way.any():
-            away, (rows, columns) = ndimage.distance_transform_edt(~self.is_way, return_indices=True)
+            away, (rows, columns) = scipy.ndimage.distance_transform_edt(~self.is_way, return_indices=True)
             lengths = lengths[rows, columns] + away * RESOLUTION
         self.lengths: NDArray[np.float64] = lengths
 

@@ -7,6 +7,7 @@ __all__ = [
     "config_bhd_brain",
     "config_bhd_keyboard_arm",
     "config_bhd_keyboard_base",
+    "config_keyboard",
     "errors",
     "keyboard",
     "targets",

@@ -6,7 +6,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
-from bhd_lerobot.teleoperators.keyboard import KeyboardConfig
+from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 
 ACTION_SPACES = ("tool", "joint")
 MAX_SPEED = 0.25  # [m/s] of the tool; the reduced speed of ISO 10218-1, for people near the arm

@@ -6,7 +6,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.teleoperators.keyboard import KeyboardConfig
+from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 
 
 @TeleoperatorConfig.register_subclass("bhd_keyboard_base")

@@ -4,15 +4,13 @@ import sys
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.control.keys import KeySource, key_source
-from bhd_lerobot.errors import check_positive
+from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 
 FASTER, SLOWER = 1.1, 0.9
@@ -22,21 +20,6 @@ FASTER, SLOWER = 1.1, 0.9
 def say(text: str) -> None:
     """Print for the person at the keys; LeRobot's commands leave the cursor at the beginning of a line of theirs."""
     print(f"\x1b[K{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
-
-
-@dataclass(kw_only=True)
-class KeyboardConfig(TeleoperatorConfig):
-    """Options of a teleoperator whose keys come from the terminal: the recorder's marks are then not on letters.
-
-    Attributes:
-        hold_s: time that a key is followed after it was sent [s]. A terminal sends a key again while it is held, for
-            the first time after about 0.5 s, and does not report its release.
-    """
-
-    hold_s: float = 0.6
-
-    def __post_init__(self) -> None:
-        check_positive("teleop", self, ("hold_s",))
 
 
 class KeyboardTeleoperator(Teleoperator):

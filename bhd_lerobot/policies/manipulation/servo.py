@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
@@ -123,10 +123,11 @@ class _ServoBrain(ConfiguredBrain):
         now = observation.state[:, self._tool]
         way = target[:, :3] - now[:, :3]
         share = np.minimum(_GAIN, lead / np.maximum(np.linalg.norm(way, axis=1), 1e-9))
-        turned = Rotation.from_quat(now[:, 3:], scalar_first=True)
-        turn = (Rotation.from_quat(target[:, 3:], scalar_first=True) * turned.inv()).as_rotvec()
+        rotation = scipy.spatial.transform.Rotation  # imported when it is first used
+        turned = rotation.from_quat(now[:, 3:], scalar_first=True)
+        turn = (rotation.from_quat(target[:, 3:], scalar_first=True) * turned.inv()).as_rotvec()
         part = np.minimum(_GAIN, self.config.lead_rad / np.maximum(np.linalg.norm(turn, axis=1), 1e-9))
-        quaternion = (Rotation.from_rotvec(turn * part[:, None]) * turned).as_quat(scalar_first=True)
+        quaternion = (rotation.from_rotvec(turn * part[:, None]) * turned).as_quat(scalar_first=True)
         # Of the two quaternions of an orientation the one that is nearer to what is seen.
         quaternion *= np.where((quaternion * now[:, 3:]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         return np.concatenate([now[:, :3] + share[:, None] * way, quaternion, opening[:, None]], axis=1)
@@ -248,7 +249,7 @@ def _part(value: float, between: tuple[float, float]) -> float:
 
 def _finger_line(tool: Array) -> float:
     """Return the direction of the line through the fingers, seen from above [rad], of a tool pose, shape (7,)."""
-    across = Rotation.from_quat(tool[3:], scalar_first=True).apply((0.0, 1.0, 0.0))
+    across = scipy.spatial.transform.Rotation.from_quat(tool[3:], scalar_first=True).apply((0.0, 1.0, 0.0))
     return math.atan2(across[1], across[0])
 
 

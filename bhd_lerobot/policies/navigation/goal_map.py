@@ -6,12 +6,11 @@ setting of D* Lite (S. Koenig and M. Likhachev, "D* Lite", AAAI 2002).
 """
 
 import math
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 Array = NDArray[np.float64]
 
@@ -103,7 +102,7 @@ class GoalMap:
         bottom, right = max(last_row, row) + _AROUND + 1, max(last_column, column) + _AROUND + 1
         box = (sim, slice(top, bottom), slice(left, right))
         seen = self._seen[box]
-        room = ndimage.distance_transform_edt(~seen) * CELL if seen.any() else np.full(seen.shape, np.inf)
+        room = scipy.ndimage.distance_transform_edt(~seen) * CELL if seen.any() else np.full(seen.shape, np.inf)
         shape, width = seen.shape, seen.shape[1]
         start, goal = (row - top) * width + column - left, (_HALF - top) * width + _HALF - left
         # Where the robot and the goal are, there must be room enough, whatever was seen.
@@ -114,12 +113,14 @@ class GoalMap:
         price = 1.0 + _STEEP * np.clip((_ROOM_M - room) / (_ROOM_M - _BLOCKED_M[1]), 0.0, 1.0)
         for blocked in _BLOCKED_M:
             graph = _graph(ends | (room > blocked), price)
-            lengths, before = dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
+            lengths, before = scipy.sparse.csgraph.dijkstra(
+                graph, directed=False, indices=goal, return_predecessors=True
+            )
             if np.isfinite(lengths[start]):
                 break
         lengths = lengths.reshape(shape)
         found = np.isfinite(lengths)
-        away, (near_row, near_column) = ndimage.distance_transform_edt(~found, return_indices=True)
+        away, (near_row, near_column) = scipy.ndimage.distance_transform_edt(~found, return_indices=True)
         lengths = (lengths[near_row, near_column] + away * _OFF) * CELL
         self._left[box] = np.minimum(lengths / _UNIT, _FAR - 1)
         if not found.ravel()[start]:
@@ -129,7 +130,7 @@ class GoalMap:
         while cell >= 0:
             way[cell] = True
             cell = before[cell]
-        self._way[box] = ndimage.distance_transform_edt(~way.reshape(shape)) * CELL <= _ALARM_M
+        self._way[box] = scipy.ndimage.distance_transform_edt(~way.reshape(shape)) * CELL <= _ALARM_M
         return True
 
 
@@ -141,7 +142,7 @@ def _cells(x: NDArray, y: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]
     return np.where(inside, row, 0), np.where(inside, column, 0), inside
 
 
-def _graph(free: NDArray[np.bool_], price: Array) -> csr_array:
+def _graph(free: NDArray[np.bool_], price: Array) -> Any:
     """Return the steps between free cells, with their lengths [cells] times the mean price at their ends."""
     rows, columns = free.shape
     number = np.arange(free.size, dtype=np.int32).reshape(rows, columns)
@@ -156,4 +157,4 @@ def _graph(free: NDArray[np.bool_], price: Array) -> csr_array:
         flat = price.ravel()
         lengths.append(math.hypot(row, column) * 0.5 * (flat[start] + flat[end]))
     edges = (np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends)))
-    return csr_array(edges, shape=(free.size, free.size))
+    return scipy.sparse.csr_array(edges, shape=(free.size, free.size))

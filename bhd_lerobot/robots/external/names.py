@@ -1,15 +1,21 @@
 """The names of a robot: the types of its configuration, and what its class calls itself."""
 
+import sys
 from collections.abc import Iterator
 from typing import Any
 
 from lerobot.robots.config import RobotConfig
-from lerobot.robots.robot import Robot
+
+from bhd_lerobot.robots.config import BhdRobotConfig
 
 
 def name_of_robot(config: Any) -> str:
     """Return the name that LeRobot's own recorder writes into a dataset, as far as the robot's class is imported."""
-    named = (made.name for made in _classes(Robot) if getattr(made, "config_class", None) is type(config))
+    if isinstance(config, BhdRobotConfig):
+        return str(config.type)
+    module = sys.modules.get("lerobot.robots.robot")  # if it is not imported, no robot's class is
+    made_of = () if module is None else _classes(module.Robot)
+    named = (made.name for made in made_of if getattr(made, "config_class", None) is type(config))
     return str(next(named, config.type))
 
 

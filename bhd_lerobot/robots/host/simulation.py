@@ -58,6 +58,11 @@ class Simulation(Host):
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Put robots into scenes, at rest at their start; `reset` does that and starts an episode."""
 
+    @classmethod
+    def start_scene(cls, config: Any) -> Any:
+        """Return the scene that a configuration describes, for a robot that is used by itself."""
+        raise NotImplementedError(f"{cls.__name__} has no start_scene.")
+
     def privileged_state(self) -> NDArray[np.float64]:
         """Return what is true and no sensor measures, numbers around 1, shape (n, any); for a critic."""
         return np.zeros((self.n, 0))

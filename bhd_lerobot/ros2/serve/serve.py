@@ -2,16 +2,18 @@
 
 import signal
 import threading
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from lerobot.robots.config import RobotConfig
 from rich.console import Console
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.realtime import LiveHost
-from bhd_lerobot.robots.robot import BhdRobot
+from bhd_lerobot.robots.host.realtime import LiveHost, make_live
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
@@ -68,11 +70,13 @@ class ServeConfig:
             raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
 
 
-def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threading.Event | None = None) -> None:
+def serve(
+    config: ServeConfig, simulation: type[Simulation], console: Console, ended: threading.Event | None = None
+) -> None:
     """Serve a robot until SIGINT or SIGTERM.
 
     Args:
-        robot: the robot of `config.robot`, not connected.
+        simulation: of the robot of `config.robot`.
         console: takes lines about the state.
         ended: ends it as well, once it is set.
 
@@ -82,13 +86,13 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threadi
     """
     require_cyclonedds()
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
-    end = ended or threading.Event()
+    end, running = ended or threading.Event(), ExitStack()
     before = {number: signal.signal(number, lambda *_: end.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    robot: Any = config.robot
     try:
-        robot.connect()
-        host = robot.host
-        if not isinstance(host, LiveHost):
-            raise AssertionError("The robot of a served configuration is on the wall clock.")
+        host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
+        host.reset(np.zeros(1, np.intp), [simulation.start_scene(robot)], [robot.seed])
+        host.begin()
         for line in host.notes:
             console.print(line)
         named = config.robot.type, config.network, config.namespace
@@ -112,7 +116,7 @@ def serve(config: ServeConfig, robot: BhdRobot, console: Console, ended: threadi
     finally:
         if foxglove:
             foxglove.close()
-        robot.disconnect()
+        running.close()
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lerobot.robots.utils import make_robot_from_config
 from rich.console import Console
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.registry import ROBOTS
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.ros2.live.network import LATCHED, NetworkConfig
 from bhd_lerobot.ros2.live.node import Publisher
 from bhd_lerobot.ros2.messages.serialize import decode, encode
@@ -242,8 +241,7 @@ def test_a_port_is_a_tcp_port(number: int) -> None:
 
 def served(config: ServeConfig, scenario: Callable[[Any, io.StringIO], Awaitable[None]]) -> None:
     """Serve a robot until a client has done what it does; `scenario` takes the client and what was printed."""
-    robot, printed, ended = make_robot_from_config(config.robot), io.StringIO(), threading.Event()
-    assert isinstance(robot, BhdRobot)
+    printed, ended = io.StringIO(), threading.Event()
 
     async def connected() -> None:
         async with Client(config.foxglove_port) as client:
@@ -259,7 +257,7 @@ def served(config: ServeConfig, scenario: Callable[[Any, io.StringIO], Awaitable
     with ThreadPoolExecutor(1) as pool:
         client = pool.submit(run)
         try:
-            serve(config, robot, Console(file=printed, width=1000), ended)
+            serve(config, ROBOTS.of(config.robot), Console(file=printed, width=1000), ended)
         finally:
             ended.set()
         client.result()
