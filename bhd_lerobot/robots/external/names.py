@@ -6,12 +6,10 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.robots.config import BhdRobotConfig
-
 
 def name_of_robot(config: Any) -> str:
     """Return the name that LeRobot's own recorder writes into a dataset, as far as the robot's class is imported."""
-    if isinstance(config, BhdRobotConfig):
+    if hasattr(config, "rates"):  # of this package, whose robots are called what their types are
         return str(config.type)
     module = sys.modules.get("lerobot.robots.robot")  # if it is not imported, no robot's class is
     made_of = () if module is None else _classes(module.Robot)
