@@ -116,6 +116,9 @@ def _is_encoder(name: str) -> bool:
         return False
 
 
+_AGAIN = np.zeros(0, np.uint8)  # in a queue: the image before, once more
+
+
 class CameraEncoder:
     """Encodes the images of one camera and one episode into one file.
 
@@ -147,6 +150,11 @@ class CameraEncoder:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise FrameError(f"An image of camera {self.path.stem!r} must be uint8 {(*self._size, 3)}; got {got}.")
         self._put(np.array(image, order="C"))
+        self.frames += 1
+
+    def repeat(self) -> None:
+        """Queue the last image once more; it takes a part of the time that a new one takes."""
+        self._put(_AGAIN)
         self.frames += 1
 
     def finish(self) -> np.ndarray:
@@ -196,12 +204,15 @@ class CameraEncoder:
             stream.time_base = step
             with _same_scheduler():
                 stream.codec_context.open()
+            frame: Any = None
             while (image := self._queue.get()) is not None and not self._cancelled.is_set():
-                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                if image is not _AGAIN:
+                    frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=self._settings.pix_fmt)
+                    histogram = statistics.image_histogram(image)
                 frame.pts = len(self._histograms)
                 frame.time_base = step  # not the stream's, which the container changes on the way
                 container.mux(stream.encode(frame))
-                self._histograms.append(statistics.image_histogram(image))
+                self._histograms.append(histogram)
             container.mux(stream.encode())
 
 

@@ -11,6 +11,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from multiprocessing.connection import Connection, Pipe
@@ -23,7 +24,7 @@ from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import FrameError
 
 _SLOTS_BYTES = 64 << 20  # shared memory: 70 images of 640 x 480
-_WAITING_BYTES = 1 << 30  # images that may wait here for room there; beyond that `add` waits
+_WAITING_BYTES = 1 << 30  # images that may wait here for room there; beyond that they are dropped
 
 
 class EncoderProcess:
@@ -48,6 +49,7 @@ class EncoderProcess:
         self._waiting = self._used = 0  # bytes of images that wait here, and in shared memory
         self._next = 0  # where the next image goes in shared memory
         self._spans: queue.SimpleQueue[int] = queue.SimpleQueue()  # bytes of the images on their way, in order
+        self._taken, self._began_s = 0, 0.0  # images encoded since the process had nothing to do, and since when
         self.problem = ""
         self._is_closed = False
         self._threads = [
@@ -72,26 +74,46 @@ class EncoderProcess:
         self.put(("open", self._made, str(path), fps, size, asdict(settings)))
         return encoder
 
+    @property
+    def images_per_s(self) -> float:
+        """Images of all cameras that are encoded in a second, since there was last nothing to do [Hz]."""
+        return self._taken / max(time.monotonic() - self._began_s, 1e-9)
+
     def put(self, message: tuple[Any, ...]) -> None:
-        """Queue a message; an image waits only if more wait already than memory is for."""
-        if message[0] == "image":
-            with self._room:
-                while self._waiting > _WAITING_BYTES and not self.problem:
-                    self._room.wait(0.1)
-                self._waiting += message[2].nbytes
+        """Queue a message."""
         self._wanted.put(message)
+
+    def put_image(self, number: int, image: np.ndarray, *, is_needed: bool) -> bool:
+        """Queue an image of an encoder; return whether there was room for it, which nobody waits for.
+
+        Args:
+            number: of the encoder.
+            image: shape (H, W, 3).
+            is_needed: whether it is queued in any case.
+        """
+        with self._room:
+            if self._waiting + image.nbytes > _WAITING_BYTES and not is_needed:
+                return False
+            if not (self._waiting or self._used):
+                self._taken, self._began_s = 0, time.monotonic()
+            self._waiting += image.nbytes
+        self._wanted.put(("image", number, image))
+        return True
 
     def _feed(self) -> None:
         while (message := self._wanted.get()) is not None:
             kind, number, *rest = message
             if kind == "image":
                 image = rest[0]
-                start = self._place(image.nbytes)
-                self._memory[start : start + image.nbytes] = image.tobytes()
+                is_wanted = number in self._encoders and not self._encoders[number].is_cancelled
+                if is_wanted:
+                    start = self._place(image.nbytes)
+                    self._memory[start : start + image.nbytes] = image.tobytes()
+                    rest = [start, image.shape]
                 with self._room:
                     self._waiting -= image.nbytes
-                    self._room.notify_all()
-                rest = [start, image.shape]
+                if not is_wanted:
+                    continue
             with contextlib.suppress(OSError):  # the process has ended, which the other thread notices
                 self._pipe.send((kind, number, *rest))
         with contextlib.suppress(OSError):
@@ -116,6 +138,7 @@ class EncoderProcess:
                 kind, number, *rest = self._pipe.recv()
                 if kind == "taken":
                     with self._room:
+                        self._taken += 1
                         self._used -= self._spans.get()
                         self._room.notify_all()
                 elif (encoder := self._encoders.get(number)) is not None:
@@ -149,11 +172,21 @@ class EncoderProcess:
 
 
 class RemoteEncoder:
-    """Encodes the images of one camera and one episode into one file; in the place of a `CameraEncoder`."""
+    """Encodes the images of one camera and one episode into one file; in the place of a `CameraEncoder`.
+
+    Nobody waits for it: an image for which there is no room is dropped, and the one before stands in its place.
+
+    Attributes:
+        frames: images so far.
+        dropped: numbers of those that were dropped.
+        is_cancelled: whether nobody cares for the file any more.
+    """
 
     def __init__(self, process: EncoderProcess, number: int, path: Path, size: tuple[int, int]) -> None:
         self.path = path
         self.frames = 0
+        self.dropped: list[int] = []
+        self.is_cancelled = False
         self._process, self._number, self._size = process, number, size
         self._done = threading.Event()
         self._histograms: np.ndarray | None = None
@@ -165,8 +198,15 @@ class RemoteEncoder:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise FrameError(f"An image of camera {self.path.stem!r} must be uint8 {(*self._size, 3)}; got {got}.")
         self._raise_error()
-        self._process.put(("image", self._number, np.array(image, order="C")))
+        if not self._process.put_image(self._number, np.array(image, order="C"), is_needed=not self.frames):
+            self._process.put(("repeat", self._number))
+            self.dropped.append(self.frames)
         self.frames += 1
+
+    @property
+    def images_per_s(self) -> float:
+        """Images of all cameras that the process encodes in a second [Hz]."""
+        return self._process.images_per_s
 
     def finish(self) -> np.ndarray:
         """Encode what is queued, close the file and return the histograms, shape (T, 3, 256)."""
@@ -182,6 +222,7 @@ class RemoteEncoder:
 
     def cancel(self) -> None:
         """Stop without caring for the file; also after an error, also twice."""
+        self.is_cancelled = True
         if not self._done.is_set():
             self._process.put(("cancel", self._number))
             self._done.wait()
@@ -217,6 +258,7 @@ class Server:
         calls: dict[str, Callable[..., None]] = {
             "open": self._open,
             "image": self._image,
+            "repeat": self._repeat,
             "finish": self._finish,
             "cancel": self._cancel,
         }
@@ -242,6 +284,10 @@ class Server:
                 self._encoders[number].add(image)
         finally:
             self._pipe.send(("taken", number))
+
+    def _repeat(self, number: int) -> None:
+        if number not in self._failed:
+            self._encoders[number].repeat()
 
     def _finish(self, number: int) -> None:
         if number not in self._failed:

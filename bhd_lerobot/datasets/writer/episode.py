@@ -115,7 +115,9 @@ class EpisodeWriter:
         self._rows = rows
 
     def add_image(self, key: str, image: np.ndarray) -> None:
-        """Append one image to a camera; waits while the encoder is busy, never drops it.
+        """Append one image to a camera.
+
+        Waits while the encoder is busy; after `DatasetRecorder.encode_in_process` it never waits, see `dropped`.
 
         Args:
             key: the video feature.
@@ -138,6 +140,17 @@ class EpisodeWriter:
             if isinstance(encoder, EncodedVideo):
                 raise FrameError(f"The video of camera {key!r} is complete; it takes no more images.")
             encoder.add(image)
+
+    @property
+    def dropped(self) -> dict[str, list[int]]:
+        """Frames whose image was dropped because the encoder was too slow, by camera; it shows the one before."""
+        encoders = ((key, getattr(encoder, "dropped", [])) for key, encoder in self._encoders.items())
+        return {key: rows for key, rows in encoders if rows}
+
+    @property
+    def images_per_s(self) -> float:
+        """Images of all cameras that the encoders' process encodes in a second [Hz]; 0 where there is none."""
+        return max((getattr(encoder, "images_per_s", 0.0) for encoder in self._encoders.values()), default=0.0)
 
     @property
     def video(self) -> VideoSettings:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings, count_frames
+from bhd_lerobot.datasets.writer import encoder_process
 from bhd_lerobot.datasets.writer.encoder_process import EncoderProcess
 from bhd_lerobot.errors import FrameError
 from tests.waiting import until
@@ -119,3 +120,48 @@ def test_it_ends_with_the_process_that_started_it() -> None:
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert threading.active_count() == before
+
+
+def test_nobody_waits_for_an_encoder_that_does_not_keep_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images are dropped and counted; the one before stands in the place of each, and the video is complete."""
+    monkeypatch.setattr(encoder_process, "_WAITING_BYTES", 10 << 20)
+    size = (720, 1280)
+    numbers = np.arange(60)
+    with closing(EncoderProcess()) as process:
+        encoder = process.encoder(tmp_path / "a.mp4", 10, size, SETTINGS)
+        encoder.add(np.zeros((*size, 3), np.uint8))
+        os.kill(process.pid, signal.SIGSTOP)  # as slow as can be
+        for number in numbers[1:]:
+            encoder.add(np.full((*size, 3), 4 * number, np.uint8))
+        os.kill(process.pid, signal.SIGCONT)
+        histograms = encoder.finish()
+        assert 0 < process.images_per_s < 10_000
+        after = process.encoder(tmp_path / "b.mp4", 10, size, SETTINGS)
+        after.add(np.zeros((*size, 3), np.uint8))
+        assert len(after.finish()) == 1
+        assert after.dropped == []
+    assert encoder.frames == len(histograms) == count_frames(tmp_path / "a.mp4") == 60
+    shown = histograms[:, 0].argmax(axis=1)
+    expected = 4 * numbers
+    assert 20 < len(encoder.dropped) < 57
+    for number in encoder.dropped:
+        expected[number] = expected[number - 1]
+    assert shown.tolist() == expected.tolist()
+
+
+def test_a_cancelled_episode_is_not_encoded_to_its_end(tmp_path: Path) -> None:
+    size = (720, 1280)
+    with closing(EncoderProcess()) as process:
+        encoder = process.encoder(tmp_path / "a.mp4", 10, size, SETTINGS)
+        os.kill(process.pid, signal.SIGSTOP)
+        for _ in range(60):
+            encoder.add(np.zeros((*size, 3), np.uint8))
+        thread = threading.Thread(target=encoder.cancel)
+        thread.start()
+        until(lambda: encoder.is_cancelled)
+        os.kill(process.pid, signal.SIGCONT)
+        thread.join()
+        other = process.encoder(tmp_path / "b.mp4", 10, size, SETTINGS)
+        other.add(np.zeros((*size, 3), np.uint8))
+        assert len(other.finish()) == 1
+        assert encoder.dropped == []
