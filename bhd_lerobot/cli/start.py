@@ -20,6 +20,7 @@ from bhd_lerobot.stock import defer_packages
 from bhd_lerobot.versions import check_version
 
 _WITHOUT_LEROBOT = ("bhd_lerobot.cli.doctor", "bhd_lerobot.cli.monitor")
+_WITH_ESTOP = ("bhd_lerobot.cli.record", "bhd_lerobot.cli.evaluate", "bhd_lerobot.cli.replay")
 
 
 @contextmanager
@@ -57,6 +58,9 @@ def run(module: str) -> int:
     if sys.argv[1:] == ["--version"]:
         print(f"lerobot_robot_bhd {__version__}")
         return 0
+
+    if module in _WITH_ESTOP:  # signals of an emergency stop wait for what handles them, and end nothing
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1, signal.SIGUSR2])
 
     def program() -> int | None:
         with leaving_on_interrupt():

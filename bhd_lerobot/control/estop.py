@@ -82,14 +82,16 @@ class EstopInputs:
 
     Args:
         press: what presses: sets the word of the emergency stop. Called from any thread and from a signal handler, as
-            often as it likes; must neither block nor raise.
+            often as it likes; must neither block nor raise. None: what comes until `attach` is kept for it.
         on_key: gets the terminal's keys that do not press, from the thread that waits for them; must not block either.
 
     Attributes:
         causes: what has pressed so far, as text, each once, in the order of the first time.
     """
 
-    def __init__(self, press: Callable[[], None], on_key: Callable[[bytes], None] = lambda keys: None) -> None:
+    def __init__(
+        self, press: Callable[[], None] | None = None, on_key: Callable[[bytes], None] = lambda keys: None
+    ) -> None:
         self.causes: list[str] = []
         self._on_other_keys = on_key
         self._press_word = press
@@ -104,6 +106,12 @@ class EstopInputs:
         self._poll = select.poll()
         self._waker, self._wake = os.pipe()
         self._poll.register(self._waker, select.POLLIN)
+
+    def attach(self, press: Callable[[], None]) -> None:
+        """Call this from now on, and at once if something has pressed already, while there was no robot."""
+        self._press_word = press
+        if self.causes:
+            press()
 
     def cause(self, is_pressed: bool) -> str:
         """Return what an emergency stop came from, as text.
@@ -156,6 +164,8 @@ class EstopInputs:
     def add_signal(self, number: signal.Signals = signal.SIGUSR1) -> None:
         """Let a signal press. The former handler comes back with `close`.
 
+        Where that was the system's, which ends the program, the signal is ignored then.
+
         Raises:
             ConfigError: this is not the main thread, the only one in which Python installs handlers.
         """
@@ -171,6 +181,7 @@ class EstopInputs:
         if self._pipe is None:
             self._open_pipe()
         self._signals[number] = signal.signal(number, self._handle)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [number])  # blocked while a command starts
 
     def _open_pipe(self) -> None:
         reader, writer = os.pipe()
@@ -190,9 +201,10 @@ class EstopInputs:
     def _press(self, cause: str) -> None:
         if self._stop.is_set():
             return
-        self._press_word()
         if cause not in self.causes:
-            self.causes.append(cause)
+            self.causes.append(cause)  # first: `attach` presses if there is one
+        if self._press_word is not None:
+            self._press_word()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._press(f"signal {signal.Signals(number).name}")
@@ -281,7 +293,7 @@ class EstopInputs:
         # Outside of the main thread handler and pipe stay, and do nothing any more.
         with contextlib.suppress(ValueError):
             for number, handler in self._signals.items():
-                signal.signal(number, signal.SIG_DFL if handler is None else handler)
+                signal.signal(number, signal.SIG_IGN if handler in (None, signal.SIG_DFL) else handler)
             if self._pipe is not None:
                 signal.set_wakeup_fd(-1)
         for thread in self._threads:

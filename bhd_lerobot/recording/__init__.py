@@ -8,4 +8,6 @@ __all__ = [
     "report",
     "reset",
     "resume_advice",
+    "status",
+    "takes",
 ]

@@ -106,6 +106,7 @@ class RecordConfig:
             failure, and `i` begins or ends an intervention (Enter, Backspace and Tab with a keyboard teleoperator of
             ours); by default if there is a terminal and the robot runs on the wall clock.
         estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
+        bell: ring the terminal's bell when a take on the wall clock begins and when it ends.
         display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
             these options are those of `lerobot-record`.
         display_mode: viewer: `rerun` or `foxglove`.
@@ -142,6 +143,7 @@ class RecordConfig:
     preview_video: bool | None = None
     estop_key: bool | None = None
     estop_signal: str = "SIGUSR1"
+    bell: bool = True
     display_data: bool = False
     display_mode: str = "rerun"
     display_ip: str | None = None

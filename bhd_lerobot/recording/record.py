@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -25,11 +25,14 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError, counted
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
+from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.driver import mark_keys, open_driver
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_summary
 from bhd_lerobot.recording.reset import ResetPhase
+from bhd_lerobot.recording.status import RecordStatus
+from bhd_lerobot.recording.takes import Takes
 from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
@@ -38,13 +41,21 @@ from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.progress import print_notes, progress_bars
 from bhd_lerobot.rollout.provenance import episode_metadata
-from bhd_lerobot.rollout.recorder import Recording, info_of, language_column, open_recorder, save_episode
+from bhd_lerobot.rollout.recorder import (
+    Recording,
+    closing_used,
+    info_of,
+    language_column,
+    open_recorder,
+    save_episode,
+)
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
+_SHORTEST_S = 0.5  # a take that a person's key ends is at least so long
 _ATTEMPTS = 3  # that an episode gets to be punctual
 
 
@@ -58,21 +69,25 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         _keep_to(root, config.robot, console)
     is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
-    robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
+    marks, is_new = _make_marks(config, n), is_free(root)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    outcomes = outcomes_of(config.task.get_choice_name(type(config.task)))
-    marks = Marks(n, outcomes, mark_keys(config), hands_over=config.teleop is not None)
-    pressed = EstopInputs(robots.estop, marks.on_key)
-    with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as cluster:
+    # An emergency stop counts from the first moment on, while there is no robot yet.
+    with ExitStack() as outer:
+        status = _make_status(config, marks, console) if config.is_live and is_here else None
+        if status is not None:
+            outer.enter_context(status.shown())
+        pressed = outer.enter_context(EstopInputs(on_key=marks.on_key))
         _add_estop_inputs(config, pressed, console)
+        robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
+        outer.enter_context(closing(robots))
+        pressed.attach(robots.estop)
+        stop, cluster = outer.enter_context(stop_on_signals()), outer.enter_context(ExitStack())
         task = _judged_task(config, robots, console)
         brain = cluster.enter_context(open_driver(config, marks))
         pool = None if is_here else cluster.enter_context(open_pool(config.ray, console))
         loop = _make_loop(config, robots, task, brain, pool)
         loop.marks = marks
-        if robots.clock is not None and robots.world is None:
-            seconds = config.dataset.reset_time_s
-            loop.before_start = ResetPhase(robots, brain, marks, seconds, stop=lambda: bool(stop), console=console)
+        loop.status = status
         print_notes(console, robots, task)
         preview = _make_preview(config, robots, console)
         if robots.camera_shapes and is_here:
@@ -81,7 +96,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             with run_folder(config, "record") as output_dir:
                 # A view that cannot be started fails before a dataset exists.
                 loop.observer = opened.enter_context(live_view(config, robots, console))
-                recorder = opened.enter_context(open_recorder(_recording(config, root), robots, task, brain))
+                made = open_recorder(_recording(config, root), robots, task, brain)
+                recorder = opened.enter_context(closing_used(made, is_new=is_new))
             result = RecordResult(root, output_dir, attempts=getattr(brain, "attempts", True), stopped_by=stop)
             if recorder.repair_report:
                 console.print(f"Repaired before resuming: {recorder.repair_report}")
@@ -90,18 +106,32 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             result.fault = loop.problem or robots.problem
         if loop.emergency_stop:
             result.estop = pressed.cause(robots.estop_pressed)
+    _draw(config, result, album, first=first, preview=preview, title=f"{task.name}, {brain.name}")
+    print_summary(console, config, result, preview is not None and first is not None)
+    if config.dataset.push_to_hub:
+        _push(config, result, console)
+    return result
+
+
+def _draw(
+    config: RecordConfig,
+    result: RecordResult,
+    album: TrajectoryAlbum,
+    *,
+    first: Episode | None,
+    preview: Preview | None,
+    title: str,
+) -> None:
+    """Draw the trajectories, and the first episode as a video."""
+    output_dir = result.output_dir
     if album.added:
-        heading = f"{task.name}, {brain.name}: {result.succeeded or counted(result.recorded, 'episode')}"
+        heading = f"{title}: {result.succeeded or counted(result.recorded, 'episode')}"
         album.draw(output_dir / "trajectories.png", heading)
     if first is not None and preview is not None:
         states = first.columns[PHYSICS_STATE]
         preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
         preview.write_strip(first.scene, states, config.dataset.fps, output_dir / "episode.png")
         preview.close()
-    print_summary(console, config, result, preview is not None and first is not None)
-    if config.dataset.push_to_hub:
-        _push(config, result, console)
-    return result
 
 
 def _make_loop(config: RecordConfig, robots: Robots, task: Task, brain: Any, pool: WorkerPool | None) -> EpisodeLoop:
@@ -128,30 +158,91 @@ def _run(
             "it: nothing is recorded. For more, raise --dataset.num_episodes.",
             soft_wrap=True,
         )
-    with progress_bars(console, "success", "speed") as progress:
-        bar = progress.add_task("recording", total=len(specs), success="", speed="")
-        started = time.perf_counter()
+    started = time.perf_counter()
+
+    def save(episode: Episode) -> None:
+        metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
+        if config.dataset.language and brain.has_plan:
+            rows = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
+            episode.columns[LANGUAGE] = rows
+        save_episode(recorder, episode, metadata)
+
+    def count(episode: Episode) -> None:
+        nonlocal first
+        result.count(episode, config.dataset.fps)
+        if episode.writer is not None:
+            result.dropped.update({key: len(rows) for key, rows in episode.writer.dropped.items()})
+        result.wall_s = time.perf_counter() - started
+        if (trajectory := _trajectory(episode, loop.robots, result.attempts)) is not None:
+            album.add(trajectory)
+        first = first or episode
+
+    status = loop.status
+    with Takes(save, recorder.drop_last, count) as takes, ExitStack() as shown:
+        progress = bar = None
+        if isinstance(status, RecordStatus):
+            if loop.robots.world is None:
+                loop.before_start = ResetPhase(
+                    loop.robots, brain, loop.marks, config.dataset.reset_time_s,
+                    stop=lambda: bool(result.stopped_by), console=console, status=status, takes=takes,
+                )  # fmt: skip
+        else:
+            progress = shown.enter_context(progress_bars(console, "success", "speed"))
+            bar = progress.add_task("recording", total=len(specs), success="", speed="")
         for episode in _episodes(loop, specs, result, recorder, console):
-            metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
-            if config.dataset.language and brain.has_plan:
-                rows = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
-                episode.columns[LANGUAGE] = rows
-            save_episode(recorder, episode, metadata)
-            result.count(episode, config.dataset.fps)
-            result.wall_s = time.perf_counter() - started
-            if (trajectory := _trajectory(episode, loop.robots, result.attempts)) is not None:
-                album.add(trajectory)
-            first = first or episode
-            progress.update(
-                bar,
-                advance=1,
-                success=result.succeeded,
-                speed=f"{result.real_time_factor:.0f}x real time",
-            )
+            if episode.writer is not None and episode.writer.dropped:
+                _print_dropped(episode, len(loop.robots.camera_shapes), console)
+            takes.add(episode)
+            if loop.before_start is None:
+                takes.settle()
+            if progress is not None and bar is not None:
+                progress.update(
+                    bar,
+                    advance=1,
+                    success=result.succeeded,
+                    speed=f"{result.real_time_factor:.0f}x real time",
+                )
     result.episodes = recorder.num_episodes
     recorder.finalize()
     result.wall_s = time.perf_counter() - started if result.recorded else 0.0
     return album, first
+
+
+def _print_dropped(episode: Episode, cameras: int, console: Console) -> None:
+    """Print that the encoder did not keep up, with the rate that it keeps."""
+    writer = episode.writer
+    images = ", ".join(f"{len(rows)} of {episode.frames} of {key}" for key, rows in writer.dropped.items())
+    console.print(
+        f"The video encoder {writer.video.vcodec} keeps about {writer.images_per_s / cameras:.0f} frames a second of "
+        f"{counted(cameras, 'camera')}: it dropped {images}; the image before stands in the place of each. Record "
+        "with a lower --dataset.fps, smaller images or fewer cameras.",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _make_marks(config: RecordConfig, n: int) -> Marks:
+    """Return what takes a person's keys: before the first take they mean nothing."""
+    outcomes = outcomes_of(config.task.get_choice_name(type(config.task)))
+    hands_over, shortest_s = config.teleop is not None, _SHORTEST_S if config.is_live else 0.0
+    marks = Marks(n, outcomes, mark_keys(config), hands_over=hands_over, shortest_s=shortest_s)
+    marks.close("the first take has not begun; only the emergency stop counts")
+    return marks
+
+
+def _make_status(config: RecordConfig, marks: Marks, console: Console) -> RecordStatus:
+    """Return what a person sees of a recording on the wall clock."""
+    brain: Any = config.brain
+    name = "a person" if isinstance(brain, TeleopConfig) else brain.get_choice_name(type(brain))
+    return RecordStatus(
+        console,
+        config.dataset.num_episodes,
+        config.dataset.fps,
+        cast(Any, config.task).duration_s,
+        driver=lambda: "a person" if config.teleop is not None and marks.is_driving() else name,
+        marks=marks,
+        bell=config.bell,
+    )
 
 
 def _episodes(
@@ -165,17 +256,23 @@ def _episodes(
     if not (loop.robots.clock is not None and loop.tolerance.reject):
         yield from loop.run(specs, stop, recorder.begin_episode)
         return
-    for spec in specs:
+    waiting = list(reversed(specs))
+    while waiting:
+        spec = waiting[-1]
         for attempt in range(1, _ATTEMPTS + 1):
             with closing(loop.run([spec], stop, recorder.begin_episode)) as run_once:
                 episode = next(run_once, None)
             if episode is None:
                 return
+            if episode.spec != spec:  # the one before, again, because it was discarded
+                waiting.append(episode.spec)
+                spec = episode.spec
             if loop.emergency_stop or loop.fault:  # it is not run again, however punctual it was
                 yield episode
                 return
             why = verdict(episode.timing, loop.tolerance)
             if why is None:
+                waiting.pop()
                 yield episode
                 break
             if episode.writer is not None:

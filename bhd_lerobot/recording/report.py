@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.datasets.format.features import TIME
 from bhd_lerobot.errors import counted
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
@@ -36,7 +38,9 @@ class RecordResult:
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
-        kept_fps: frames a second that a robot kept which left some out [Hz]; None if it left out less than 2 %.
+        kept_fps: frames a second that a robot kept which left out more than 2 % of them in most seconds [Hz], or None.
+        dropped: images that were dropped because the video encoder was too slow, by camera; the one before stands in
+            the place of each.
         fault: why a real robot's fault ended the run, as text; None if none did.
         estop: what pressed the emergency stop that ended the run, as text; None if there was none.
     """
@@ -57,6 +61,7 @@ class RecordResult:
     estop: str | None = None
     fault: str | None = None
     kept_fps: float | None = None
+    dropped: Counter[str] = field(default_factory=Counter)
 
     @property
     def succeeded(self) -> str:
@@ -87,10 +92,19 @@ class RecordResult:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
         self.simulated_s += episode.frames / fps
-        timing = episode.timing
-        if timing.clock == "realtime" and timing.skipped > _LEFT_OUT * (timing.ticks + timing.skipped):
-            kept = timing.ticks / (timing.elapsed or 1.0) if timing.period * fps > 0.99 else None
-            self.kept_fps = kept if self.kept_fps is None or kept is None else min(self.kept_fps, kept)
+        if episode.timing.clock == "realtime":
+            kept = _kept_fps(episode.columns[TIME], fps)
+            if kept < (1 - _LEFT_OUT) * fps:
+                self.kept_fps = min(kept, self.kept_fps or kept)
+
+
+def _kept_fps(time_s: NDArray[np.float64], fps: int) -> float:
+    """Return the frames a second that a robot kept: the median over whole seconds, which no single hiccup changes."""
+    elapsed = time_s - time_s[0] + 0.5 / fps  # in the middle of its frame, so that jitter puts none into another second
+    seconds = int(elapsed[-1])
+    if seconds < 2:
+        return float((len(elapsed) - 1) / (elapsed[-1] - elapsed[0])) if len(elapsed) > 1 else np.inf
+    return float(np.median(np.bincount(elapsed.astype(int), minlength=seconds)[:seconds]))
 
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
@@ -121,17 +135,25 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
     table.add_row("files", ", ".join(files))
     console.print(table)
     # A path stands in one line, however narrow the terminal.
-    console.print(escape(f"Dataset: {result.root}\nRun folder: {result.output_dir}"), soft_wrap=True)
-    if result.estop is not None:
-        console.print(
-            f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
-            "outcome 'estop', and no other was started. Clear the cause and continue with --resume=true."
-        )
-    if result.fault is not None:
-        console.print(
-            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] The episode that was running is saved "
-            "with the outcome 'fault', and no other was started. Clear the cause and continue with --resume=true."
-        )
+    dataset = (
+        f"Dataset: {result.root}" if result.episodes else f"No episode was saved; nothing is left at {result.root}"
+    )
+    console.print(escape(f"{dataset}\nRun folder: {result.output_dir}"), soft_wrap=True)
+    for outcome, what, why in (
+        ("estop", "Emergency stop ({}).", result.estop),
+        ("fault", "The robot stopped by a fault: {}.", result.fault),
+    ):
+        if why is not None:
+            is_saved = result.outcomes[outcome] > 0
+            saved = f"The episode that was running is saved with the outcome '{outcome}', and no other was started."
+            again = " with --resume=true" if result.episodes else ": the same command starts again"
+            console.print(
+                f"[bold]{what.format(escape(why))}[/bold] {saved if is_saved else 'No episode was running.'} "
+                f"Clear the cause and continue{again}."
+            )
+    if result.dropped:
+        images = ", ".join(f"{count} of {escape(camera)}" for camera, count in result.dropped.items())
+        console.print(f"Images dropped because the video encoder was too slow: {images} (control.image_age).")
     if result.kept_fps is not None:
         console.print(
             f"The robot keeps about {result.kept_fps:.0f} of the {config.dataset.fps} frames a second that were asked "

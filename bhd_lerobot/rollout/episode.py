@@ -4,13 +4,13 @@ import contextlib
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
@@ -23,7 +23,7 @@ from bhd_lerobot.rollout.images import EpisodeImages, Observer
 from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.faults import add_faults
-from bhd_lerobot.tasks.task import Event, Task, outcomes_of
+from bhd_lerobot.tasks.task import ConfiguredTask, Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
@@ -34,6 +34,19 @@ def track_of(robots: Robots, columns: Mapping[str, NDArray]) -> NDArray[np.float
     return robots.track(columns[keys.OBSERVATION_STATE if robots.world is None else keys.PHYSICS_STATE])
 
 
+class Status(Protocol):
+    """What shows a person the state of episodes."""
+
+    def begin(self, take: int) -> None:
+        """An episode begins: its number."""
+
+    def frame(self, number: int) -> None:
+        """A frame is over, of this number on the grid of time."""
+
+    def end(self, take: int, outcome: str) -> None:
+        """An episode has ended."""
+
+
 class EpisodeLoop:
     """Runs episodes on n simulations. A simulation that is done with one takes the next.
 
@@ -42,6 +55,8 @@ class EpisodeLoop:
 
     Attributes:
         before_start: called before an episode starts, with its specification: a person may have to set up its scene.
+            Returns whether the one before is discarded, and is to be run again.
+        status: what shows a person the state of episodes on the wall clock; None if nothing does.
         observer: receives every frame of every simulation, and every image; None if there is none.
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
         fault: whether a real robot's fault has, or a brain that has stopped.
@@ -51,7 +66,8 @@ class EpisodeLoop:
     """
 
     observer: Observer | None = None
-    before_start: Callable[[EpisodeSpec], None] | None = None
+    before_start: Callable[[EpisodeSpec], bool | None] | None = None
+    status: Status | None = None
 
     def __init__(
         self,
@@ -66,6 +82,9 @@ class EpisodeLoop:
         self.problem = ""
         self.marks = Marks(robots.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
+        self._last_spec: EpisodeSpec | None = None  # of the episode that ended last
+        self._mode: NDArray[np.int8] = np.zeros(robots.n, np.int8)
+        self._order: list[int] = []  # numbers of the episodes in the order in which they are yielded
         self._open_images: Callable[[], Any] | None = None
         self._is_stopped: Callable[[], bool] = lambda: False
         self._frames = max(1, round(task.duration_s * robots.rates.fps))
@@ -107,7 +126,7 @@ class EpisodeLoop:
         self._open_images, self._is_stopped = open_images, stop
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
-        order = [spec.index for spec in specs]
+        order = self._order = [spec.index for spec in specs]
         n = self.robots.n
         self._specs: list[EpisodeSpec | None] = [None] * n
         self._scenes: list[Any] = [None] * n
@@ -116,8 +135,8 @@ class EpisodeLoop:
         self._initial: list[NDArray[np.float64] | None] = [None] * n
         self._images = EpisodeImages(self.robots)
         self.robots.stop(np.arange(n))
-        self._start(np.arange(n), waiting)
         try:
+            self._start(np.arange(n), waiting)
             while self.robots.running.any():
                 if stop():
                     return
@@ -128,11 +147,8 @@ class EpisodeLoop:
                     self._take_again(waiting)
                     continue
                 for sim, event in finished:
-                    episode = self._finish(sim, event)
+                    episode = self._end(sim, event)
                     done[episode.spec.index] = episode
-                    self.emergency_stop |= event == Event.ESTOP
-                    # A person finds out why a real robot stopped before it moves again.
-                    self.fault |= event == Event.FAULT and (self.robots.world is None or bool(self.problem))
                 if not finished:
                     continue
                 ids = np.array([sim for sim, _ in finished])
@@ -141,6 +157,11 @@ class EpisodeLoop:
                 while order and order[0] in done:
                     yield done.pop(order.pop(0))
                 self._start(ids, waiting)
+        except RealtimeError as error:
+            if self.robots.world is not None:
+                raise
+            # A real robot's fault where no frame can say it: while no episode runs, or before its first frame ends.
+            self.fault, self.problem = True, self.problem or str(error).removesuffix(".")
         finally:
             if self.robots.clock is not None:  # it does not go on while the dataset is finished
                 with contextlib.suppress(RealtimeError):
@@ -165,8 +186,10 @@ class EpisodeLoop:
         ids = ids[: len(waiting)]
         if not len(ids):
             return
-        if self.before_start is not None and not (self.emergency_stop or self.fault):
-            self.before_start(waiting[-1])
+        asks = self.before_start is not None and not (self.emergency_stop or self.fault)
+        if asks and self.before_start(waiting[-1]) and self._last_spec is not None:  # type: ignore[misc]
+            waiting.append(self._last_spec)
+            self._order.insert(0, self._last_spec.index)
         # A person decides when the robot moves again; the stop may also have come between two episodes.
         self.emergency_stop |= self.robots.estop_pressed
         if self.emergency_stop or self.fault or self._is_stopped():
@@ -185,8 +208,11 @@ class EpisodeLoop:
             self._commands[sim], self._ends[sim] = [], []
             self._images.sinks[sim] = self._open_images() if self._open_images and self.robots.camera_shapes else None
         self._length[ids] = 0
+        self._last_frame = -1
         self._drivers.start(ids)
         self.marks.begin(ids)
+        if self.status is not None:
+            self.status.begin(specs[0].index)
         self._truth = None
 
     def _frame(self) -> list[tuple[int, Event]]:
@@ -248,7 +274,12 @@ class EpisodeLoop:
         """Judge and store a frame; return the episodes that ended with it."""
         robots = self.robots
         running = np.flatnonzero(robots.running)
-        self._last_frame = report.number
+        if robots.clock is not None:
+            if isinstance(self.task, ConfiguredTask):  # time goes on in frames that were left out
+                self.task.frame[running] += max(0, report.number - self._last_frame - 1)
+            if self.status is not None:
+                self.status.frame(report.number)
+        self._last_frame, self._mode = report.number, report.mode
         self._truth = report.truth()
         reward, event = self.task.judge(self._truth, robots.running)
         event = add_faults(event, report.mode, robots.running)
@@ -335,6 +366,20 @@ class EpisodeLoop:
             drops=self._last_frame + 1 - length,
             tolerated=self.tolerance.limits(rates, clock.sensor_period_s),
         )
+
+    def _end(self, sim: int, event: Event) -> Episode:
+        """End an episode, and note whether it ends the run."""
+        episode = self._finish(sim, event)
+        if self.robots.n == 1:
+            self.marks.close("no take runs")
+        self.emergency_stop |= event == Event.ESTOP
+        # A person finds out why a real robot stopped before it moves again.
+        is_faulty = event == Event.FAULT or self._mode[sim] == Mode.FAULT
+        self.fault |= is_faulty and (self.robots.world is None or bool(self.problem))
+        self._last_spec = episode.spec
+        if self.status is not None:
+            self.status.end(episode.spec.index, episode.outcome.event.cause)
+        return episode
 
     def _finish(self, sim: int, event: Event) -> Episode:
         spec, scene, initial = self._specs[sim], self._scenes[sim], self._initial[sim]

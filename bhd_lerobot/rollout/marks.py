@@ -1,5 +1,6 @@
 """Marks of a person while an episode is recorded: success, failure, intervention."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -49,7 +50,7 @@ _MEANINGS = {
     "success": "success",
     "failure": "failure",
     "intervention": "intervention begins or ends",
-    "again": "discards this take and records it again",
+    "again": "discards this take, or between two the last, and records it again",
     "pause": "pauses before the next episode",
 }
 
@@ -59,7 +60,7 @@ def key_help(keys: Sequence[MarkKey]) -> str:
     return ", ".join(f"{key.name} {_MEANINGS[key.meaning]}" for key in keys)
 
 
-_HELD_S = 0.7  # so long an Enter that began an episode may repeat itself without ending it
+_HELD_S = 0.7  # a key that comes again within this time is held: terminals repeat it first after 0.25 to 0.66 s
 _HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
 
 
@@ -67,7 +68,10 @@ class Marks:
     """Takes marks from any thread and hands them to the recording loop, frame by frame.
 
     An outcome ends the episode with the frame in which it is set. A frame of an intervention carries the
-    event ``intervention``; what moves the robot meanwhile is not decided here.
+    event ``intervention``; what moves the robot meanwhile is not decided here. A key that is held is one key.
+
+    Attributes:
+        answer: gets what each key does, or why it does nothing, as text, from the thread of the keys; must not block.
 
     Args:
         n: number of simulations.
@@ -75,6 +79,8 @@ class Marks:
         keys: the terminal's keys: `KEYS`, or `TELEOP_KEYS` while a keyboard teleoperator uses the letters.
         hands_over: whether an intervention hands the robot over to a person: then the brain says in which frames they
             drove, which are not those of the key where an action takes its time.
+        shortest_s: an episode that a key ends lasts at least so long [s].
+        clock: monotonic time [s].
     """
 
     def __init__(
@@ -84,14 +90,19 @@ class Marks:
         keys: Sequence[MarkKey] = KEYS,
         *,
         hands_over: bool = False,
+        shortest_s: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self.answer: Callable[[str], None] = lambda text: None
         self._n, self._valid, self._keys, self._hands_over = n, tuple(outcomes), tuple(keys), hands_over
-        self._lock = threading.Lock()
+        self._lock, self._clock, self._shortest_s = threading.Lock(), clock, shortest_s
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
         self._again = self._is_paused = False
-        self._is_waiting, self._go = False, threading.Event()
-        self._until = 0.0  # Enter means nothing before this time
+        self._is_waiting, self._has_last, self._go = False, False, threading.Event()
+        self._closed = ""  # why keys mean nothing now
+        self._began_s = -math.inf
+        self._last: tuple[int, float] = -1, -math.inf  # the last key, and when it came
 
     def outcome(self, name: str, simulation: int = 0) -> None:
         """Mark that the running episode of a simulation ends now, and how: by one of the outcomes."""
@@ -130,37 +141,85 @@ class Marks:
             self._is_paused = not self._is_paused
 
     @contextmanager
-    def waiting(self) -> Iterator[Callable[[], bool]]:
-        """Let Enter mean that the next episode begins; yield what returns whether it was pressed."""
+    def waiting(self, *, has_last: bool = False) -> Iterator[Callable[[], bool]]:
+        """Let Enter mean that the next episode begins; yield what returns whether it was pressed.
+
+        Args:
+            has_last: whether there is a take before it that can be discarded.
+        """
         with self._lock:
             self._go.clear()
-            self._is_waiting = True
+            self._is_waiting, self._has_last, self._again = True, has_last, False
         try:
             yield self._go.is_set
         finally:
             with self._lock:
                 self._is_waiting = self._is_paused = False
-                self._until = time.monotonic() + _HELD_S
 
     @property
     def is_paused(self) -> bool:
         """Whether the next episode waits for a person."""
         return self._is_paused
 
+    def close(self, why: str) -> None:
+        """Let keys mean nothing until the next episode begins, and answer them why."""
+        self._closed = why
+
     def on_key(self, keys: bytes) -> None:
         """Take keys of a terminal. They mean the first simulation."""
-        marks = {"intervention": self.intervention, "again": self.again, "pause": self.pause}
         for key in keys:
-            if self._is_waiting and key in b"\r\n":
-                self._go.set()
+            (last, last_s), now = self._last, self._clock()
+            if key == last and now - last_s <= _HELD_S:
+                self._last = key, now
                 continue
-            if key in b"\r\n" and time.monotonic() < self._until:
-                continue
-            for meaning in [one.meaning for one in self._keys if key in one.sent]:
-                marks[meaning]() if meaning in marks else self.outcome(meaning)
+            counts, answer = self._take_key(key, now - self._began_s)
+            self._last = key if counts else -1, now
+            if answer:
+                self.answer(answer)
+
+    def _take_key(self, key: int, age_s: float) -> tuple[bool, str]:
+        """Return whether a key counts at this age of the episode, and the answer; do what it means."""
+        if self._is_waiting and key in b"\r\n":
+            self._go.set()
+            return True, "Enter: the next take begins"
+        found = next((one for one in self._keys if key in one.sent), None)
+        if found is None:  # of somebody else, such as a keyboard teleoperator
+            is_ours = self._keys is KEYS and key > 32
+            return False, f"{chr(key)} means nothing here: {key_help(self._keys)}" if is_ours else ""
+        if refusal := self._refusal(found.meaning, age_s):
+            return False, f"{found.name} counts for nothing: {refusal}"
+        return True, f"{found.name}: {self._do(found.meaning)}"
+
+    def _refusal(self, meaning: str, age_s: float) -> str:
+        if self._is_waiting:
+            if meaning == "again":
+                return "" if self._has_last and not self._again else "there is no take to discard"
+            return "" if meaning == "pause" else "no take runs"
+        if meaning in ("success", "failure") and age_s < self._shortest_s and not self._closed:
+            return f"a take has at least {self._shortest_s:g} s"
+        return self._closed
+
+    def _do(self, meaning: str) -> str:
+        match meaning:
+            case "pause" if self._is_waiting:
+                self._is_paused = True
+                return "pause, Enter begins the next take"
+            case "pause":
+                self.pause()
+                return f"{'a' if self._is_paused else 'no'} pause comes after this take"
+            case "again":
+                self.again()
+                return f"{'the last take is discarded' if self._is_waiting else 'discarded'} and recorded again"
+            case "intervention":
+                self.intervention()
+                return f"an intervention {'begins' if self.is_driving() else 'ends'}"
+            case _:
+                self.outcome(meaning)
+                return meaning
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
         """Forget the marks of episodes before."""
+        self._closed, self._began_s = "", self._clock()
         with self._lock:
             for simulation in simulations.tolist():
                 self._outcomes.pop(simulation, None)

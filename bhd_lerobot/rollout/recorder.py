@@ -1,6 +1,8 @@
 """The dataset of a run: opened or continued, and filled with episodes."""
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.features import ACTION, EFFORT, EXPERT_ACTION, dataset_features
+from bhd_lerobot.datasets.format.features import (
+    ACTION,
+    EFFORT,
+    EXPERT_ACTION,
+    IMAGE_AGE,
+    OBSERVATION_IMAGES,
+    TIME,
+    dataset_features,
+)
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -98,11 +108,36 @@ def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str
         columns = {key: column for key, column in episode.columns.items() if key not in _BY_OPTION or key in known}
         if EXPERT_ACTION in known:
             columns.setdefault(EXPERT_ACTION, columns[ACTION])  # of a rule, which is the expert
+        _age_dropped(columns, writer.dropped, known.get(IMAGE_AGE, {}).get("names", ()))
         writer.set_columns(columns)
         recorder.save(writer, task=episode.instruction, metadata=metadata)
     except BaseException:
         writer.discard()
         raise
+
+
+def _age_dropped(columns: dict[str, NDArray], dropped: Mapping[str, list[int]], cameras: Sequence[str]) -> None:
+    """Let the age of an image that stands in the place of dropped ones grow from frame to frame."""
+    if not cameras or not dropped:
+        return
+    ages, time_s = columns[IMAGE_AGE].copy(), columns[TIME]
+    for key, rows in dropped.items():
+        column = cameras.index(key.removeprefix(f"{OBSERVATION_IMAGES}."))
+        for row in rows:
+            ages[row, column] = ages[row - 1, column] + time_s[row] - time_s[row - 1]
+    columns[IMAGE_AGE] = ages
+
+
+@contextmanager
+def closing_used(recorder: DatasetRecorder, *, is_new: bool) -> Iterator[DatasetRecorder]:
+    """Finalise a dataset at the end; remove a new one without an episode, which would be in the next run's way."""
+    try:
+        with recorder:
+            yield recorder
+    finally:
+        info = info_of(recorder.root)
+        if is_new and info is not None and not info.episodes:
+            shutil.rmtree(recorder.root, ignore_errors=True)
 
 
 def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:

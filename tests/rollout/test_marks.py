@@ -1,5 +1,7 @@
 """What a person says during an episode is in its frames and in its outcome."""
 
+import contextlib
+import itertools
 import os
 import pty
 import time
@@ -66,7 +68,8 @@ def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
 )
 def test_keys(keys: tuple[MarkKey, ...], others: bytes, typed: tuple[bytes, ...]) -> None:
     success, failure, intervention, again, pause = typed
-    marks = Marks(2, keys=keys)
+    seconds = itertools.count()
+    marks = Marks(2, keys=keys, clock=lambda: float(next(seconds)))
     marks.on_key(others)
     assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
     assert not marks.frame(NOTHING, ALL)[1].any()
@@ -97,8 +100,106 @@ def test_keys(keys: tuple[MarkKey, ...], others: bytes, typed: tuple[bytes, ...]
     assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
 
 
+class Keyboard:
+    """Marks with a clock that stands still between two keys, and what was answered."""
+
+    def __init__(self, keys: tuple[MarkKey, ...] = KEYS) -> None:
+        self.now, self.answers = 100.0, list[str]()
+        self.marks = Marks(keys=keys, shortest_s=0.5, clock=lambda: self.now)
+        self.marks.answer = self.answers.append
+        self.marks.begin(np.zeros(1, np.intp))
+        self.now += 10.0
+
+    def hold(self, key: bytes, seconds: float, first_s: float = 0.66, then_s: float = 0.03) -> None:
+        """Hold a key, as a terminal sends it."""
+        self.marks.on_key(key)
+        pause, end = first_s, self.now + seconds
+        while self.now + pause < end:
+            self.now += pause
+            self.marks.on_key(key)
+            pause = then_s
+
+    def frame(self) -> int:
+        return int(self.marks.frame(np.zeros(1, np.int64), np.ones(1, np.bool_))[0][0])
+
+
+@each_case(("first_s", "then_s"), [(0.66, 0.04), (0.25, 0.03), (0.5, 0.1)])
+def test_a_key_that_is_held_is_one_key_whatever_it_means(first_s: float, then_s: float) -> None:
+    for one in KEYS:
+        board = Keyboard()
+        board.hold(one.sent[:1], 3.0, first_s, then_s)
+        assert len(board.answers) == 1, one
+        assert board.marks.is_driving() == (one.meaning == "intervention")
+        assert board.marks.is_paused == (one.meaning == "pause")
+        assert board.marks.take_again() == (one.meaning == "again")
+        assert not board.marks.take_again()
+        # Held into the next take it does not end that one.
+        board.frame()
+        board.marks.begin(np.zeros(1, np.intp))
+        board.now += 0.6
+        for _ in range(40):
+            board.now += then_s
+            board.marks.on_key(one.sent[:1])
+        assert board.frame() == Event.NOTHING
+    board = Keyboard()
+    with board.marks.waiting() as is_pressed:
+        board.hold(b"\r", 0.1)
+        assert is_pressed()
+    board.marks.begin(np.zeros(1, np.intp))
+    assert board.frame() == Event.NOTHING
+
+
+def test_a_key_that_is_pressed_twice_is_two_keys() -> None:
+    board = Keyboard()
+    for is_on in (True, False, True):
+        board.marks.on_key(b"i")
+        assert board.marks.is_driving() == is_on
+        board.now += 1.0
+
+
+@each_case(("age_s", "event"), [(0.1, Event.NOTHING), (0.4, Event.NOTHING), (0.6, Event.SUCCESS)])
+def test_a_take_that_a_key_ends_has_a_shortest_length(age_s: float, event: Event) -> None:
+    board = Keyboard()
+    board.marks.begin(np.zeros(1, np.intp))
+    board.now += age_s
+    board.marks.on_key(b"s")
+    assert board.frame() == event
+    assert ("at least 0.5 s" in board.answers[0]) == (event == Event.NOTHING)
+
+
+def test_every_key_is_answered_in_every_state() -> None:
+    for key in b"sfirpx":
+        for state in ("take", "waiting", "closed"):
+            board = Keyboard()
+            if state == "closed":
+                board.marks.close("the robot starts")
+            with board.marks.waiting(has_last=True) if state == "waiting" else contextlib.nullcontext():
+                board.marks.on_key(bytes([key]))
+            assert len(board.answers) == 1, (chr(key), state)
+            assert board.answers[0].startswith(chr(key))
+            counts = state == "take" or (state == "waiting" and key in b"rp")
+            assert ("counts for nothing" in board.answers[0]) == (not counts and key != ord("x"))
+            ends = {ord("s"): Event.SUCCESS, ord("f"): Event.FAILURE} if counts else {}
+            assert board.frame() == ends.get(key, Event.NOTHING)
+            if state == "closed":
+                assert board.answers[0].endswith("the robot starts") or key == ord("x")
+                assert not board.marks.is_paused
+
+
+def test_a_pause_is_not_ended_by_its_own_key() -> None:
+    board = Keyboard()
+    board.marks.on_key(b"p")
+    with board.marks.waiting() as is_pressed:
+        for _ in range(3):
+            board.now += 1.0
+            board.marks.on_key(b"p")
+            assert board.marks.is_paused
+        assert not is_pressed()
+    assert not board.marks.is_paused
+
+
 def test_the_help_names_every_key() -> None:
-    rest = "discards this take and records it again, p pauses before the next episode"
+    rest = "discards this take, or between two the last, and records it again, p pauses before the next episode"
     assert key_help(KEYS) == f"s success, f failure, i intervention begins or ends, r {rest}"
     assert key_help(TELEOP_KEYS) == f"Enter success, Backspace failure, Tab intervention begins or ends, t {rest}"
 

@@ -104,6 +104,17 @@ class Committer:
         state.without_stats.add(index)
         return replace(state, info=info, tasks=content.tasks, metadata_types=dict(content.metadata_types))
 
+    def take_back(self, root: Path, info: dict[str, Any], tasks: list[str]) -> None:
+        """Return to the ``info.json``, which says how many episodes there are, and to the tasks of an earlier state."""
+        staging = root / layout.STAGING / "save"
+        self._disk.make_folder(staging)
+        self._disk.write(staging / "info.json", self._info_text(info))
+        self._disk.move(staging / "info.json", root / layout.INFO)
+        if tasks:
+            self._disk.move(self._stage(staging / "tasks.parquet", tasks_table(tasks)), root / layout.TASKS)
+        else:
+            (root / layout.TASKS).unlink()
+
     def _stage(self, path: Path, table: pa.Table, **options: Any) -> Path:
         sink = pa.BufferOutputStream()
         pq.write_table(table, sink, **options)

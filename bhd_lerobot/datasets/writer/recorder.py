@@ -62,6 +62,7 @@ class DatasetRecorder:
         self._state, self._schema, self._lock, self._disk, self._video = state, schema, lock, disk, video
         self._committer = Committer(schema, disk, video)
         self._stats: dict[int, EpisodeStats] = {}
+        self._before: tuple[dict[str, Any], list[str]] | None = None  # ``info.json`` and tasks before the last save
         self._open: list[EpisodeWriter] = []
         self._begun = 0
         self._encoders: EncoderProcess | None = None
@@ -237,6 +238,7 @@ class DatasetRecorder:
                 stats |= {key: statistics.image_stats(histograms) for key, (_, histograms) in videos.items()}
                 files = {key: path for key, (path, _) in videos.items()}
                 content = EpisodeContent(columns, files, stats, task, tasks, types, extra)
+                self._before = dict(self._state.info), list(self._state.tasks)
                 self._state = self._committer.commit(self._state, content)
         except BaseException as error:
             episode.discard()
@@ -248,6 +250,24 @@ class DatasetRecorder:
         self._is_uncertain = False
         episode.close()
         return index
+
+    def drop_last(self) -> None:
+        """Take back the last save of this recorder, once: the episode does not exist any more.
+
+        Raises:
+            DatasetError: nothing was saved, or the last save was taken back already.
+            DatasetWriteError: the disk refused it; the episode is still there.
+        """
+        self._check_not_finalized()
+        before, self._before = self._before, None
+        if before is None:
+            raise DatasetError("There is no episode of this recording that can be taken back.")
+        self._settle_if_is_uncertain()
+        with write_errors("take back the last episode", self.root, _INTACT):
+            self._committer.take_back(self.root, *before)
+            # What is not counted any more is dropped as after a kill in the middle of a save.
+            self._state, _ = settle(self.root, self._disk, keep_staging=True)
+        self._stats.pop(self.num_episodes, None)
 
     def finalize(self) -> None:
         """Discard open episodes, merge the files of this recording, store all statistics, and release the dataset.

@@ -12,8 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.datasets.format.statistics import QUANTILES
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.storage.places import wrong_name
+from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError, FrameError
 from tests.cases import each_case
@@ -455,3 +457,36 @@ def test_the_language_column_has_its_own_name(tmp_path, key, dtype):
     features = {key: {"dtype": dtype, "shape": (1,), "names": None}}
     with pytest.raises(ConfigError, match="is for 'language_persistent' and for nothing else"):
         DatasetRecorder.create("test/said", 10, features, root=tmp_path / "d", robot_type="r")
+
+
+@pytest.mark.parametrize("video", [False, True])
+@pytest.mark.parametrize("dropped", [(0,), (1,), (2,), (0, 1, 2), (3,)])
+def test_the_last_save_may_be_taken_back(tmp_path: Path, dropped: tuple[int, ...], video: bool) -> None:
+    """As if it had never been: what is recorded afterwards gives the dataset of a recording without it."""
+    roots = tmp_path / "plain", tmp_path / "taken_back"
+    for root, taken_back in zip(roots, ((), dropped), strict=True):
+        with support.create(root, video=video) as recorder:
+            for episode in range(4):
+                if episode in taken_back:
+                    writer = support.fill(recorder.begin_episode(), 7, video=video)  # another episode and another task
+                    recorder.save(writer, task="another task", metadata=support.metadata(7))
+                    recorder.drop_last()
+                    assert recorder.num_episodes == episode
+                    with pytest.raises(DatasetError, match="no episode of this recording that can be taken back"):
+                        recorder.drop_last()
+                support.record(recorder, video=video)
+        assert check_dataset(root).is_valid
+    first, second = (sorted(path.relative_to(root) for path in root.rglob("*") if path.is_file()) for root in roots)
+    assert first == second
+    for path in first:
+        read = json.loads if path.suffix == ".json" else bytes
+        assert read((roots[0] / path).read_bytes()) == read((roots[1] / path).read_bytes()), path
+
+
+def test_a_dataset_may_end_with_a_save_that_was_taken_back(tmp_path: Path) -> None:
+    with support.create(tmp_path / "d", video=True) as recorder:
+        for _ in range(3):
+            support.record(recorder, video=True)
+        recorder.drop_last()
+    assert check_dataset(tmp_path / "d").is_valid
+    assert [one.frames for one in dataset_info(tmp_path / "d").episodes] == [support.length(0), support.length(1)]

@@ -73,7 +73,8 @@ def test_requested_and_applied_actions_times_and_images_of_every_device(tmp_path
     assert np.abs(asked).max() > 100
     assert np.abs(applied).max() <= 90  # the robot's own range, which `send_action` returns
     assert (np.asarray(columns["control.limits"]) & Limit.VELOCITY).any()
-    assert np.stack(columns["control.image_age"]).shape == (15, 2)
+    assert np.stack(columns["control.image_age"]).shape == (info.episodes[0].frames, 2)
+    assert info.episodes[0].frames <= 15  # fewer where a busy machine skips a frame: a take lasts as long as it says
     assert set(columns["control.mode"]) <= {Mode.HOLD, Mode.TRACKING}
     time_s = np.asarray(columns["control.time"], np.float64)
     assert (np.diff(time_s) > 0).all()
@@ -281,7 +282,7 @@ def test_a_signal_ends_a_replay_and_lets_go_of_the_robot(
     monkeypatch.setattr(MockArm, "send_action", interrupted)
     monkeypatch.setattr(MockArm, "disconnect", let_go)
     console = Console(file=io.StringIO(), width=120)
-    with pytest.raises(RealtimeError, match=rf"stopped after \d+ of 15 frames: {number.name}"):
+    with pytest.raises(RealtimeError, match=rf"stopped after \d+ of \d+ frames: {number.name}"):
         replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
     assert ended
     assert ended[0] < 15
