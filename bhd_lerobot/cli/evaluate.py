@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
+from bhd_lerobot.cli.start import loading
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import CommandLine
@@ -20,8 +21,9 @@ def program_of(line: CommandLine) -> Program:
 
 
 def _compare(config: EvalConfig) -> int:
-    from bhd_lerobot.evaluation.evaluate import evaluate
-    from bhd_lerobot.evaluation.plan import print_plan
+    with loading():
+        from bhd_lerobot.evaluation.evaluate import evaluate
+        from bhd_lerobot.evaluation.plan import print_plan
 
     if config.plan:
         print_plan(config, Console())

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 
+from bhd_lerobot.cli.start import loading
 from bhd_lerobot.errors import DatasetEditedError
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.recording.config import RecordConfig
@@ -13,8 +14,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
 
     def program(config: RecordConfig) -> int:
-        from bhd_lerobot.recording.record import record
-        from bhd_lerobot.recording.resume_advice import instead_of_resuming
+        with loading():
+            from bhd_lerobot.recording.record import record
+            from bhd_lerobot.recording.resume_advice import instead_of_resuming
 
         try:
             return record(config).exit_status

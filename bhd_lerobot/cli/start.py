@@ -43,6 +43,19 @@ def leaving_on_interrupt() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextmanager
+def loading() -> Iterator[None]:
+    """Show at once in a terminal that the command has begun, until it has loaded what it needs."""
+    is_shown = sys.stderr is not None and sys.stderr.isatty()
+    if is_shown:
+        print("Loading…", end="\r", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        if is_shown:
+            print("\x1b[K", end="", file=sys.stderr, flush=True)
+
+
 def _leave(number: int, frame: FrameType | None) -> None:
     os.write(2, b"Stopped before it began; nothing was changed.\n")
     os._exit(INTERRUPTED)
@@ -63,7 +76,7 @@ def run(module: str) -> int:
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1, signal.SIGUSR2])
 
     def program() -> int | None:
-        with leaving_on_interrupt():
+        with leaving_on_interrupt(), loading():
             if module not in _WITHOUT_LEROBOT:
                 check_version("lerobot")
                 defer_packages()

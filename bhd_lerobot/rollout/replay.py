@@ -24,7 +24,6 @@ from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.rollout.plots import draw_divergence
 from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
 
 MODES = ("open_loop", "state", "both")
@@ -271,6 +270,8 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         time = np.arange(len(result.state)) / episode.fps
         heading = f"Episode {config.dataset.episode}, replay of the {mode.replace('_', ' ')}"
         path = folder / f"episode_{config.dataset.episode:06d}_{mode}.png"
+        from bhd_lerobot.rollout.plots import draw_divergence
+
         draw_divergence(
             scene=episode.scene,
             recorded=result.recorded_xy,

@@ -129,6 +129,49 @@ def test_nothing_slow_is_imported(program: str, slow: str) -> None:
     assert not loaded & {*slow.split(), "huggingface_hub"}
 
 
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("cli.record", ["--help"]),
+        ("cli.record", ["--robot.type=turtelbot"]),
+        ("cli.record", ["--config_path=there_is_none.yaml"]),
+        ("cli.evaluate", ["--help"]),
+        ("cli.replay", ["--help"]),
+        ("cli.ros2", ["serve", "--help"]),
+    ],
+)
+def test_help_and_errors_need_neither_pytorch_nor_pandas_nor_matplotlib(module: str, arguments: list[str]) -> None:
+    program = f"import sys; sys.argv[1:] = {arguments}; from bhd_lerobot.cli import start"
+    program += f"; start.run('bhd_lerobot.{module}'); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
+    )
+    loaded = {name.partition(".")[0] for name in done.stderr.splitlines()[-1].split()}
+    assert "bhd_lerobot" in loaded
+    assert not loaded & {"torch", "pandas", "matplotlib", "deepdiff", "datasets", "av"}
+
+
+def test_lerobots_packages_are_what_they_were_once_they_are_needed() -> None:
+    program = """
+import sys
+from bhd_lerobot.stock import defer_packages
+defer_packages()
+import lerobot.robots.config
+assert "torch" not in sys.modules
+from lerobot.robots import Robot, make_robot_from_config
+from lerobot.utils import constants
+from lerobot.policies import *
+import lerobot.robots as package
+assert "torch" in sys.modules
+assert Robot is sys.modules["lerobot.robots.robot"].Robot and "Robot" in package.__all__
+try:
+    package.nobody
+except AttributeError as error:
+    assert "'lerobot.robots' has no attribute 'nobody'" in str(error)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT, stdin=subprocess.DEVNULL)
+
+
 def test_the_handler_before_comes_back() -> None:
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
