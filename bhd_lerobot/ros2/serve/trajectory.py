@@ -79,7 +79,7 @@ def _derivatives(number: int, point: Any, order: list[int]) -> NDArray[np.float6
         given = getattr(point, name)
         if len(given) != len(order) and (len(given) or name == "positions"):
             raise ActionError(f"point {number} of the trajectory does not have {len(order)} {name}, but {len(given)}")
-        if not np.isfinite(given).all():
+        if name in _ORDERS and not np.isfinite(given).all():
             raise ActionError(f"the {name} of point {number} of the trajectory have a value that is not finite")
         if len(given) and name == dict(enumerate(_ORDERS)).get(len(values)):
             values.append(np.asarray(given, np.float64)[order])

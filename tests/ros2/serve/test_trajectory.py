@@ -94,3 +94,10 @@ def test_a_stretch_has_the_order_that_both_its_points_have() -> None:
     np.testing.assert_allclose(one.at(share), 10 * share**3 - 15 * share**4 + 6 * share**5)
     np.testing.assert_allclose(one.at(1 + share), 1 - (3 * share**2 - 2 * share**3))
     np.testing.assert_allclose(one.at(2 + share), share)
+
+
+def test_efforts_are_counted_and_not_used() -> None:
+    one = made(point(1.0, [1.0, 2.0], effort=[np.nan, 7.0]))
+    np.testing.assert_allclose(one.at(1.0), [1.0, 2.0])
+    with pytest.raises(ActionError, match="2 effort, but 1"):
+        made(point(1.0, [1.0, 2.0], effort=[7.0]))
