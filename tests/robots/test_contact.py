@@ -273,7 +273,7 @@ def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
     wall = Wall(arm, np.array(direction), speed, seconds, stiffness)
     pushed, fastest = settled(arm, wall, seconds)
     assert 0.0 < pushed < 300.0
-    after, _ = settled(arm, wall, 1.0)
+    after, _ = settled(arm, wall, 2 * WITHIN_S if stiffness > 1e4 else 3.0)  # soft things are followed for longer
     assert after < LIGHT_N
     assert fastest < 1.5
     where = arm.cerebellum.reading.position.copy()

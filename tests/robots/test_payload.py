@@ -112,6 +112,22 @@ def test_a_declared_load_is_none_that_is_noticed(monkeypatch: pytest.MonkeyPatch
         assert arm.modes[0] == Mode.HOLD, (mass, declared)
 
 
+@pytest.mark.parametrize(("mass", "most"), [(1.5, 2e-3), (4.0, 0.06)])
+def test_a_stopped_arm_with_a_load_that_was_not_declared_does_not_sink(
+    monkeypatch: pytest.MonkeyPatch, mass: float, most: float
+) -> None:
+    """What need not be declared is no push; by more it sinks a little, once."""
+    arm = carrying(monkeypatch, mass, 0.0)
+    arm.reset(FIRST, [TableScene("", (), (*HOME[:6], 0.02))], [0])
+    arm.cerebellum.estop.press()
+    heights = []
+    for _ in range(100):
+        arm.step(None)
+        heights.append(float(arm.table.tool_pose[0, 2]))
+    assert heights[0] - heights[-1] < most
+    assert heights[75] - heights[-1] < 1e-3
+
+
 def test_a_load_slows_motions_down_and_none_changes_nothing() -> None:
     shares = [acceleration_share(ur5(load=load)) for load in (0.0, 1.0, 2.0, 5.0)]
     assert shares[0] == 1.0

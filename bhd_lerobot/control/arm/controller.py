@@ -245,7 +245,7 @@ class ArmController(Controller):
         known = (self._rest_ticks > self._settled_ticks) & ~self._blind & ~self._misread_joints(reading).any(axis=1)
         efforts = None
         if self.force is not None and reading.has_effort:
-            efforts = self.force.torque, self.force.force
+            efforts = self.force.torque, self.force.pressing
         self._blind[:] = False
         self._relief.run(ready, known, reading.position[:, :dof], efforts, self.command, self.velocity)
 
@@ -302,8 +302,7 @@ class ArmController(Controller):
         off = np.minimum(np.maximum(reading.position[mask, :dof] - now, -self._reach), self._reach)
         self._aim[mask] = now + off
         # On a straight line, on which no joint is faster than it was, nor the tool.
-        jacobian = self._forward.jacobian(self.command[mask, :dof])[:, :3]
-        fast, way = (np.linalg.norm(np.einsum("nij,nj->ni", jacobian, one), axis=1) for one in (speed, off))
+        fast, way = (self._forward.tool_speed(self.command[mask, :dof], one) for one in (speed, off))
         joints = (np.maximum(np.abs(speed), _BACK) / np.maximum(np.abs(off), _TINY)).min(axis=1)
         rate = np.minimum(joints, np.maximum(fast, _BACK_TOOL) / np.maximum(way, _TINY))
         self._top[mask] = np.abs(off) * rate[:, None]

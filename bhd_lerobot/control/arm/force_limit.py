@@ -43,6 +43,7 @@ class ForceLimit:
         torque: what the motors give more than the posture and its motion need [N m], shape (n, dof).
         wrench: what the surroundings put on the tools, in the base frame: forces [N] and moments about the tool centre
             points [N m], shape (n, 6); shape (n, 0) if it is not asked for.
+        pressing: the forces that are more than a load which need not be declared, shape (n,); 0 for the others.
         exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
 
     Args:
@@ -70,7 +71,7 @@ class ForceLimit:
         self._sum, self._ticks = np.zeros((n, dof)), 0
         self._position, self._velocity, self.torque = (np.zeros((n, dof)) for _ in range(3))
         self._fresh = np.ones(n, np.bool_)
-        self.force: Array = np.zeros(n)
+        self.force, self.pressing = np.zeros((2, n))
         self.wrench: Array = np.zeros((n, 6 if wrench else 0))
         self.exceeded: NDArray[np.bool_] = np.zeros(n, np.bool_)
 
@@ -102,7 +103,7 @@ class ForceLimit:
         if self.wrench.size:
             every = np.ascontiguousarray(self._forward.jacobian(position))
             np.negative(tool_wrench(every, torque, _DAMPING), out=self.wrench)
-        self.force[:] = self._pull[:] = 0.0
+        self.force[:] = self.pressing[:] = self._pull[:] = 0.0
         self.exceeded[:] = False
         felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
         if not np.count_nonzero(felt):
@@ -117,6 +118,8 @@ class ForceLimit:
         np.greater(self.force, self.largest, out=self.exceeded)
         self._pull[felt] = force[:, 2]  # the tool pulls it up
         hangs = (self._pull > _LOAD_N) & (self._pull > _DOWN * self.force) & (np.abs(velocity) < _STILL).all(axis=1)
+        self.pressing[:] = self.force
+        self.pressing[(self._pull > _DOWN * self.force) & (self.force < _LOAD_N)] = 0.0
         self._hung += 1
         self._hung *= hangs
         self.exceeded |= self._hung >= self._most_hung
@@ -144,6 +147,6 @@ class ForceLimit:
         """Forget arms that were put somewhere else."""
         self._fresh[ids] = True
         self._hung[ids] = 0
-        self._sum[ids] = self.torque[ids] = self.force[ids] = 0.0
+        self._sum[ids] = self.torque[ids] = self.force[ids] = self.pressing[ids] = 0.0
         self.wrench[ids] = 0.0
         self.exceeded[ids] = False

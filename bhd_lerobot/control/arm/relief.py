@@ -15,7 +15,10 @@ _SPEED, _TOOL_SPEED = 0.5, 0.25  # [rad/s, m/s] the most with which an arm gives
 _FOLLOW, _EASE, _KEEP = 0.5, 0.5, 0.6  # shares of a servo's stretch, of its change, and of the speed once it is light
 _VAIN_RAD = 0.05  # [rad] of all joints, by which an arm gives way though the force stays: a load, or a wrong estimate
 _CREEP = 0.01  # [rad/s] an arm that is slower, and presses on nothing, stands still
-_CHANGE_N = 5.0  # [N] a force that changed by less has stayed as it is
+_CHANGE_N = 5.0  # [N] a force that changed by less has stayed as it is; of what may be a load's weight twice as much,
+_WEIGHT_N, _GENTLE = 60.0, 0.25  # because it is lighter or heavier by that when it speeds up by this share of a stop's
+_STANDS = 2  # decisions after which an arm that has stopped giving way is known to stand
+_AGAIN_RAD, _AGAIN_S, _TRIES = 0.02, 0.25, 3  # so far, after this time, and so often it is tried again
 _PUSHED_RAD = 0.01  # [rad] ahead of its reference, in the direction in which it gives way, a joint is pushed
 _SLACK_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
 _SPRINGS_RAD = 0.05  # [rad] farther than to where it was read an arm without efforts does not give way
@@ -43,13 +46,15 @@ class ContactRelief:
         self._hz, self._period = control_hz, max(1, round(_PERIOD_S * control_hz))
         self._stiffness = np.asarray(arm.servo_stiffness[:dof])
         self._largest = np.asarray(limits.effort[:dof]) / self._stiffness  # stretch [rad]
-        self._change = np.asarray(limits.stop_deceleration[:dof]) / control_hz  # of a speed in a tick [rad/s]
+        self._change = _GENTLE * np.asarray(limits.stop_deceleration[:dof]) / control_hz  # of a speed in a tick [rad/s]
         self._forward = ForwardKinematics(arm.chain)
         self._lower = np.asarray(limits.lower[:dof]) + _MARGIN_RAD
         self._upper = np.asarray(limits.upper[:dof]) - _MARGIN_RAD
         self._ticks = np.zeros(n, np.int64)  # since the arm came to rest
         self._wanted, self._stretch = np.zeros((n, dof)), np.zeros((n, dof))
         self._level, self._vain = np.zeros(n), np.zeros(n)  # a force that stays as it is [N], and the way since [rad]
+        self._stood: NDArray[np.int64] = np.zeros(n, np.int64)  # decisions since it moved last
+        self._waited, self._tries = np.zeros(n), np.zeros(n, np.int64)  # for how long [s], and how often tried again
         self._room = np.full(n, np.nan)  # so far an arm without efforts may still give way [rad]
 
     def active(self) -> Mask:
@@ -78,12 +83,13 @@ class ContactRelief:
         """
         trusted = mask & known
         self._ticks[~trusted] = 0
+        self._tries[~trusted] = 0
         self._wanted[~trusted] = self._level[~trusted] = self._vain[~trusted] = 0.0
         self._room[~mask] = np.nan
         self._ticks[trusted] += 1
         due = trusted & (self._ticks % self._period == 0)
         if due.any():
-            self._decide(np.flatnonzero(due), position, efforts, command)
+            self._decide(np.flatnonzero(due), position, efforts, command, velocity)
         if not self._wanted.any() and not velocity[mask].any():
             return
         dof = self._dof
@@ -95,7 +101,12 @@ class ContactRelief:
         command[mask, :dof] = reference + speed / self._hz
 
     def _decide(
-        self, ids: NDArray[np.intp], position: Array, efforts: tuple[Array, Array] | None, command: Array
+        self,
+        ids: NDArray[np.intp],
+        position: Array,
+        efforts: tuple[Array, Array] | None,
+        command: Array,
+        velocity: Array,
     ) -> None:
         """Choose the speeds of the coming period."""
         stretch: Array
@@ -110,18 +121,28 @@ class ContactRelief:
         else:
             stretch, force = efforts[0][ids] / self._stiffness, efforts[1][ids]
             presses = np.asarray(force > _LIGHT_N)
+            most = np.where(self._level[ids] < _WEIGHT_N, 2.0, 1.0) * _CHANGE_N
             ahead = (off * np.sign(stretch) > _PUSHED_RAD) & (np.abs(stretch) > _SLACK_RAD)
-            same = presses & ~ahead.any(axis=1) & (np.abs(force - self._level[ids]) < _CHANGE_N)
+            same = np.abs(force - self._level[ids]) < most
+            self._stood[ids] = (self._stood[ids] + 1) * ~velocity[ids, : self._dof].any(axis=1)
+            same |= (self._vain[ids] >= _VAIN_RAD) & (self._stood[ids] <= _STANDS)  # what braked made it heavier
+            same &= presses & ~ahead.any(axis=1)
             self._level[ids] = np.where(same, self._level[ids], force)
             self._vain[ids] *= same
-            presses &= self._vain[ids] < _VAIN_RAD
+            waits = self._vain[ids] >= _VAIN_RAD
+            self._waited[ids] = (self._waited[ids] + self._period / self._hz) * waits
+            again = ids[(self._waited[ids] > _AGAIN_S) & (self._tries[ids] < _TRIES)]
+            self._vain[again] = _VAIN_RAD - _AGAIN_RAD
+            self._tries[again] += 1
+            self._tries[ids[~same]] = 0
+            presses &= ~waits
         moving = self._wanted[ids].any(axis=1, keepdims=True)
         before = np.where(moving, self._stretch[ids], stretch)
         push = _FOLLOW * stretch + _EASE * (stretch - before)
         wanted = self._wanted[ids] - push * (self._hz / self._period)
         wanted *= wanted * stretch < 0.0  # never against the push
-        tool = np.einsum("nij,nj->ni", self._forward.jacobian(command[ids, : self._dof])[:, :3], wanted)
-        joints, tools = np.abs(wanted).max(axis=1) / _SPEED, np.linalg.norm(tool, axis=1) / _TOOL_SPEED
+        tools = self._forward.tool_speed(command[ids, : self._dof], wanted) / _TOOL_SPEED
+        joints = np.abs(wanted).max(axis=1) / _SPEED
         wanted /= np.maximum(np.maximum(joints, tools), 1.0)[:, None]
         slower = _KEEP * self._wanted[ids]
         slower[np.abs(slower).max(axis=1) < _CREEP] = 0.0

@@ -65,6 +65,12 @@ class ForwardKinematics:
             jacobian[row + 3] = axes[:, row]
         return components_last(jacobian, 2)
 
+    def tool_speed(self, q: Array, velocity: Array) -> Array:
+        """Return how fast the tool moves [m/s], shape (n,), from positions and speeds of joints, shape (n, 6)."""
+        # Sums over what lies otherwise in memory round otherwise: with it the number of arms would count.
+        jacobian = np.ascontiguousarray(self.jacobian(q))[:, :3]
+        return np.asarray(np.sqrt(((jacobian * velocity[:, None]).sum(axis=2) ** 2).sum(axis=1)))
+
     def manipulability(self, q: Array) -> Array:
         """Return the product of the Jacobian's singular values [m^3], shape (...).
 
