@@ -159,7 +159,7 @@ class Cerebellum:
         """Stop robots that report a stop of their own, or whose readings are no measurements."""
         reading = self.reading
         wrong = self.readings.wrong_positions(reading, self._now_ns)
-        odd = self.readings.wrong_motions(reading, self.guard.written, self.mode)
+        odd = self.readings.wrong_motions(reading, self.guard.written, self.mode, self._now_ns)
         if odd is not None:
             wrong = odd if wrong is None else wrong | odd
         if wrong is None and self._flat_reading.dot(self._zeros) == 0.0 and not np.count_nonzero(reading.safety):

@@ -21,6 +21,7 @@ _SLACK_PERIODS = 3  # by so much may stamps be off
 _TURN = 2 * math.pi
 _MEMORY_S = 0.1  # over which the ways of joints are compared with their speeds
 _CONTRADICTION_RAD, _CONTRADICTION_SHARE = 0.01, 0.1  # so far they may differ: at least, and of the way
+_LONGEST_GAP_PERIODS = 10
 _FROZEN_S = 0.02  # a reading that is the same for so long
 _FROZEN_SHARE = 0.01  # while the torque changed by more than this share of the largest does not measure
 
@@ -95,21 +96,22 @@ class MotionCheck:
         self._last[:, ids], self._same[:, ids] = np.nan, 0
         self._off[ids] = self._way[ids] = 0.0
 
-    def find(self, reading: PlantReading, torque: Array, mode: NDArray[np.int8]) -> Mask | None:
+    def find(self, reading: PlantReading, torque: Array, mode: NDArray[np.int8], now_ns: int) -> Mask | None:
         """Return the arms whose reading is no measurement, shape (n,); None if there are none.
 
         Args:
             torque: that the motors were commanded last [N m], shape (n, dof).
             mode: the `Mode` of each arm, shape (n,).
+            now_ns: the tick's time [ns].
         """
         driven = (mode >= Mode.HOLD) & (mode <= Mode.STOPPING)  # elsewhere the brakes are closed
         new = reading.values[:2, :, : len(self._names)]
-        elapsed: Array = np.full(len(driven), self._period_s)
-        if reading.stamp_ns is not None:
-            elapsed = np.maximum((reading.stamp_ns - self._since_ns) / NANOSECONDS, 0.0)
-            self._since_ns[:] = reading.stamp_ns
+        stamp_ns = now_ns if reading.stamp_ns is None else reading.stamp_ns
+        elapsed: Array = np.maximum((stamp_ns - self._since_ns) / NANOSECONDS, 0.0)
+        self._since_ns[:] = stamp_ns
         before = self._last
-        fresh = np.isnan(before).any(axis=(0, 2)) | (elapsed > _MEMORY_S)
+        # What happened in a longer gap is not known.
+        fresh = np.isnan(before).any(axis=(0, 2)) | (elapsed > _LONGEST_GAP_PERIODS * self._period_s)
         step = np.where(fresh[:, None], 0.0, new[0] - before[0])
         turned = np.where(fresh[:, None], 0.0, 0.5 * (new[1] + before[1]) * elapsed[:, None])
         kept = np.maximum(1.0 - elapsed / _MEMORY_S, 0.0)[:, None]
@@ -207,16 +209,19 @@ class ReadingCheck:
             self.problem = self._explain(joint, float(self._beyond[sim, joint]), int(self._elapsed[sim]))
         return self._wrong
 
-    def wrong_motions(self, reading: PlantReading, actuators: Array, mode: NDArray[np.int8]) -> Mask | None:
+    def wrong_motions(
+        self, reading: PlantReading, actuators: Array, mode: NDArray[np.int8], now_ns: int
+    ) -> Mask | None:
         """Return the arms with torque motors whose readings contradict each other, shape (n,); None if there are none.
 
         Args:
             actuators: what was written last, shape (n, actuators).
             mode: the `Mode` of each arm, shape (n,).
+            now_ns: the tick's time [ns].
         """
         if self._motion is None:
             return None
-        wrong = self._motion.find(reading, actuators[:, :-1], mode)
+        wrong = self._motion.find(reading, actuators[:, :-1], mode, now_ns)
         self.problem = self.problem or self._motion.problem
         return wrong
 

@@ -123,10 +123,13 @@ def test_both_sides_of_an_age_are_checked() -> None:
 
 
 def moving(check: ReadingCheck, reading: PlantReading, spoil: Callable[[int], None], ticks: int = 300) -> int | None:
-    """Sway an arm with torque motors, torques changing; return the tick in which its reading was refused, or None."""
+    """Sway an arm with torque motors, torques changing; return the tick in which its reading was refused, or None.
+
+    Now and then ticks are skipped.
+    """
     rng = np.random.default_rng(0)
     phase, mode = rng.uniform(0, 6, 6), np.array([Mode.TRACKING], np.int8)
-    for tick in range(ticks):
+    for tick in sorted({*range(0, ticks, 3), *rng.integers(0, ticks, ticks).tolist()} - set(range(40, 90))):
         time_s = tick / HZ
         reading.position[0, :6] = 0.4 * np.sin(2 * time_s + phase) + rng.normal(0, 1e-4, 6)
         reading.velocity[0, :6] = 0.8 * np.cos(2 * time_s + phase) + rng.normal(0, 5e-3, 6)
@@ -134,7 +137,7 @@ def moving(check: ReadingCheck, reading: PlantReading, spoil: Callable[[int], No
             reading.stamp_ns[0] = tick * PERIOD
         spoil(tick)
         torque = np.array([[*np.sin(3 * time_s + phase) * 10.0, 0.0]])
-        if check.wrong_motions(reading, torque, mode) is not None:
+        if check.wrong_motions(reading, torque, mode, tick * PERIOD) is not None:
             return tick
     return None
 
