@@ -35,7 +35,7 @@ class RecordResult:
         scores: their scores.
         problems: why brains gave up, as text, of the episodes that were no success.
         frames: frames that this run added.
-        simulated_s: simulated time of the episodes that this run added [s].
+        simulated_s: time of the episodes that this run added, simulated or on the wall clock [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
         kept_fps: frames a second that a robot kept which left out more than 2 % of them in most seconds [Hz], or None.
@@ -91,9 +91,11 @@ class RecordResult:
         if episode.plan.get("problem") and not episode.outcome.success:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
-        self.simulated_s += episode.frames / fps
-        if episode.timing.clock == "realtime":
-            kept = _kept_fps(episode.columns[TIME], fps)
+        time_s = episode.columns[TIME]
+        is_live = episode.timing.clock == "realtime"
+        self.simulated_s += time_s[-1] - time_s[0] + 1 / fps if is_live else episode.frames / fps
+        if is_live:
+            kept = _kept_fps(time_s, fps)
             if kept < (1 - _LEFT_OUT) * fps:
                 self.kept_fps = min(kept, self.kept_fps or kept)
 

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
+from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.recording.reset import ResetPhase
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.recording.takes import Takes
@@ -150,6 +151,11 @@ def test_a_take_lasts_as_long_as_it_says_whatever_the_robot_keeps(tmp_path: Path
         time_s = episode.columns["control.time"]
         assert 2.7 < time_s[-1] - time_s[0] < 3.0 + 5 / FPS
         assert episode.frames < 100
+        result = RecordResult(tmp_path, tmp_path)
+        result.count(episode, FPS)
+        assert 2.7 < result.simulated_s < 3.0 + 5 / FPS
+        assert result.kept_fps is not None
+        assert result.kept_fps <= 25
         found = re.search(r"The robot keeps (\d+) of the 50 frames a second", rig.text.getvalue())
         assert found
         assert 5 < int(found[1]) <= 25
