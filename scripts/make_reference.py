@@ -230,7 +230,7 @@ def _type_name(kind: Any) -> str:
     if arguments and typing.get_origin(kind) is dict:
         return f"{_type_name(arguments[1])} for each name"
     if arguments and typing.get_origin(kind) not in (list, tuple):
-        return " or ".join("nothing" if one is type(None) else _type_name(one) for one in arguments)
+        return " or ".join("null" if one is type(None) else _type_name(one) for one in arguments)
     if arguments:
         return f"list of {_type_name(arguments[0])}"
     return {"str": "text", "Path": "path", "bool": "yes or no", "int": "whole number", "float": "number"}.get(

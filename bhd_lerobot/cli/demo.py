@@ -11,7 +11,7 @@ from bhd_lerobot.options.command import Parser, exit_status
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit status."""
     parser = Parser(prog="python -m bhd_lerobot.cli.demo", description=demo.__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, help="new folder; one in outputs/demo if nothing")
+    parser.add_argument("folder", nargs="?", type=Path, help="new folder; one in outputs/demo if not set")
     return exit_status(lambda: demo.run(parser.parse(arguments).folder), "Stopped. What was finished is complete.")
 
 

@@ -20,9 +20,9 @@ class TimingTolerance:
     observation older than a frame sees what it could have seen a frame before.
 
     Attributes:
-        max_lateness_s: how late a control tick may start [s]; half a control period if nothing.
+        max_lateness_s: how late a control tick may start [s]; half a control period if not set.
         max_age_s: how old the oldest reading of an observation may be when the brain gets it [s]; a frame, and in
-            addition a period of the slowest sensor, if nothing.
+            addition a period of the slowest sensor, if not set.
         max_jitter_s: by how much the time between two observations may differ from 1 / fps [s]; half a frame if
             nothing.
         max_skipped: how many control ticks of a frame may have been skipped.
@@ -42,7 +42,7 @@ class TimingTolerance:
         for name in ("max_lateness_s", "max_age_s", "max_jitter_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"timing.{name} is {value}; it must be positive, or nothing for the default.")
+                raise ConfigError(f"timing.{name} is {value}; it must be positive, or null for the default.")
         if self.max_skipped < 0:
             raise ConfigError(f"timing.max_skipped is {self.max_skipped}; it must be 0 or more.")
         if not 0 <= self.max_late_frames <= 1:

@@ -255,7 +255,7 @@ def _named(kind: Any) -> str:
 
 
 _WORDS = {int: "a whole number", float: "a number", str: "text", Path: "a path", bool: "true or false"} | {
-    type(None): "nothing"
+    type(None): "null"
 }
 _PLURALS = {int: "whole numbers", float: "numbers", str: "texts", Path: "paths"}
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")

@@ -35,7 +35,7 @@ class ReplayDatasetConfig:
 
     Attributes:
         repo_id: name of the dataset; not needed with `root`.
-        root: folder of the dataset; LeRobot's default place of `repo_id` if nothing.
+        root: folder of the dataset; LeRobot's default place of `repo_id` if not set.
         episode: its number in the dataset.
     """
 
@@ -51,7 +51,7 @@ class ReplayConfig:
     Attributes:
         dataset: which episode.
         mode: `open_loop`, `state`, or `both`.
-        output_dir: where the plots go; `outputs/replay` if nothing.
+        output_dir: where the plots go; `outputs/replay` if not set.
         tolerance_m: largest position difference that counts as the same [m]; beyond it the exit status is 1.
         robot: a robot that the recorded actions are sent to, of LeRobot or of a plug-in, or one of ours on the wall
             clock; by default the episode is simulated.

@@ -23,7 +23,7 @@ def add_to(commands: Commands) -> None:
     help_text = "upload a dataset to the Hub or below a URL, with a card; to the Hub only what differs"
     command = add_command(commands, "push", help_text, _run, names_dataset=False)
     command.add_argument("places", nargs="*", metavar="ROOT [TARGET]", help="folder; user/name on the Hub, or a URL")
-    command.add_argument("--root", help="the folder, as an option; LeRobot's default place of the name if nothing")
+    command.add_argument("--root", help="the folder, as an option; LeRobot's default place of the name if not set")
     command.add_argument("--repo_id", help="the name on the Hub, as an option")
     command.add_argument("--branch", "--revision", help="branch to write to; created if it does not exist")
     command.add_argument("--tag", help="a further tag for what is pushed")

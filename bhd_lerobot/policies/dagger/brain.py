@@ -45,7 +45,7 @@ class DaggerConfig(BrainConfig):
         disagreement: the learner's action is farther from the expert's than this share of its range.
         disagreement_s: it has been so for so long [s].
         patience_s: the learner has driven for so long [s].
-        hold_s: how long the expert drives before the learner has another turn [s]; to the episode's end if nothing.
+        hold_s: how long the expert drives before the learner has another turn [s]; to the episode's end if not set.
     """
 
     is_composed: ClassVar[bool] = True

@@ -32,12 +32,12 @@ class LearnedBrainConfig(BrainConfig):
     Attributes:
         path: the checkpoint: its folder, a training run's folder (then its last checkpoint), or a name on the Hub.
         device: where it runs: `cpu`, `cuda`, …
-        n_action_steps: how many actions of a chunk are carried out before it looks again; as it was trained if nothing.
+        n_action_steps: how many actions of a chunk are carried out before it looks again; as it was trained if not set.
         sample: draw actions from a Gaussian policy instead of taking its mean.
         stream: give whole chunks, which continue while the policy thinks: for `clock = realtime`, where it is slow.
         exact: infer for every simulation by itself: the bits are those of LeRobot's own evaluation however many run
             side by side; slower.
-        threads: threads for torch on the CPU; if nothing, one for small networks and torch's own choice for others.
+        threads: threads for torch on the CPU; if not set, one for small networks and torch's own choice for others.
         name: what reports call it.
     """
 

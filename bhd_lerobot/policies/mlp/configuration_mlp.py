@@ -29,7 +29,7 @@ class ScanConfig:
     Attributes:
         transform: ``"none"``: the beams are normalised like the other numbers; ``"inverse"``: `scale` / range;
             ``"log"``: log(range / `scale`).
-        start: column of the first beam in `observation.state`; found by its name (`scan_000.pos`) if nothing.
+        start: column of the first beam in `observation.state`; found by its name (`scan_000.pos`) if not set.
         beams: how many beams there are, evenly spaced over a full turn; found by their names if 0.
         scale: range at which the input is 1 or 0 [m].
         minimum: ranges below this count as this [m].
@@ -92,7 +92,7 @@ class MlpConfig(TrainedConfig):
         min_std: least standard deviation that an input or an action is divided by, in its own unit: what varies by less
             than a millimetre or a milliradian is noise, and would be blown up to the size of everything else. An input
             that stays within twice of it in the whole dataset has no influence.
-        loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if nothing, ``"nll"`` with `gaussian` and
+        loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if not set, ``"nll"`` with `gaussian` and
             ``"l1"`` without.
         huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.
         modes: chunks that it predicts, of which it carries out the likeliest: where a rule passes something now on the
@@ -181,7 +181,7 @@ class MlpConfig(TrainedConfig):
         self.check_numbers("at least 1", lambda number: number >= 1, *positive)
         self.check_numbers("0 or more", lambda number: number >= 0, "yaw_harmonics")
         self.check_numbers("in [0, 1)", lambda number: 0 <= number < 1, "dropout")
-        self.check_numbers("positive, or nothing", lambda number: number > 0, "feature_clip")
+        self.check_numbers("positive, or null", lambda number: number > 0, "feature_clip")
         self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, "min_std")
         self.check_numbers("positive and finite", lambda number: 0 < number < math.inf, "huber_delta")
         self.check_chunk()

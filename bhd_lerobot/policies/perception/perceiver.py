@@ -26,7 +26,7 @@ class PerceptionOptions:
     """How a brain sees.
 
     Attributes:
-        path: the checkpoint of a `bhd_perception`; if nothing, objects are looked up in what the task reports, which in
+        path: the checkpoint of a `bhd_perception`; if not set, objects are looked up in what the task reports, which in
             simulation is the truth.
         device: where it runs: `cpu`, `cuda`, …
         max_error_m: an object whose place is not known better than this, with 90 % probability, is not grasped [m].

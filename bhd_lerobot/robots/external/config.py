@@ -19,7 +19,7 @@ class GateConfig:
         range: lowest and highest value of an action by its name, `--gate.range.x.vel='[-0.2, 0.2]'`; where there is
             none, that of the robot's calibration, if it says one.
         max_change: largest change of an action from one frame to the next, in its unit: by name, or one number for
-            all positions (names that end in `.pos`); not limited if nothing.
+            all positions (names that end in `.pos`); not limited if not set.
         brain_timeout_s: after so long without an action the robot holds: positions stay, speeds are 0 [s].
         end_timeout_s: after so long without an action the episode ends with a fault [s].
         call_timeout_s: after so long a call of the robot that has not returned ends the episode with a fault [s].

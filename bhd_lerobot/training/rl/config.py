@@ -58,7 +58,7 @@ class RlEnvConfig:
 
     Attributes:
         n_envs: how many run side by side.
-        threads: threads that step the physics; all processors if nothing.
+        threads: threads that step the physics; all processors if not set.
     """
 
     n_envs: int = 64
@@ -117,7 +117,7 @@ class PpoConfig:
         lr_schedule: ``"linear"``: to 0 over `steps`, whatever time they take; ``"constant"``.
         target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
         log_std_init: logarithm of the exploration noise, in normalised actions, the same for all; the mean of the
-            checkpoint's own, or 0, if nothing.
+            checkpoint's own, or 0, if not set.
     """
 
     n_steps: int = 64
@@ -170,7 +170,7 @@ class ValidationConfig:
         n_envs: how many run side by side.
         seed: run seed of these episodes, of the split `train`; another than the training's.
         select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``; of equals, the score.
-        rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
+        rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if not set.
     """
 
     freq: int = 200_000
@@ -203,10 +203,10 @@ class RlConfig:
         see_history: let the actor see `policy.n_obs_steps` observations, `policy.obs_stride` frames apart, where the
             checkpoint sees the last one; it begins as if it saw that only.
         critic_warmup: environment steps in which only the critic learns.
-        output_dir: folder of the run; a new one in `outputs/train` if nothing.
+        output_dir: folder of the run; a new one in `outputs/train` if not set.
         resume: continue with the run in `output_dir`.
         seed: of everything that is random.
-        threads: threads of torch; its own choice if nothing.
+        threads: threads of torch; its own choice if not set.
     """
 
     robot: RobotConfig
