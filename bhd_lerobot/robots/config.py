@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 from lerobot.robots.config import RobotConfig
@@ -14,6 +14,7 @@ from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
 
+_ROS2 = Ros2Config()
 _ROS2_PLANTS = {
     True: "bhd_lerobot.ros2.robots.base_plant:BasePlant",
     False: "bhd_lerobot.ros2.robots.arm_plant:ArmPlant",
@@ -76,6 +77,12 @@ class BhdRobotConfig(RobotConfig):
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s, brain_timeout_s=brain_s)
         if self.plant:
             self._check_plant()
+        elif given := [
+            one.name for one in fields(Ros2Config) if getattr(self.ros2, one.name) != getattr(_ROS2, one.name)
+        ]:
+            raise ConfigError(
+                f"robot.ros2.{given[0]} is of a robot on a network; add --robot.plant=ros2 or leave it out."
+            )
 
     def _check_plant(self) -> None:
         module, sign, name = self.plant.partition(":")

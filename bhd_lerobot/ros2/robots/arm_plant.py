@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages import ur
@@ -85,6 +85,8 @@ class ArmPlant(Ros2Plant):
     usual_latency_s = 0.1
 
     def __init__(self, config: Any, body: Arm) -> None:
+        if config.ros2.scan_yaw is not None:
+            raise ConfigError(f"robot.ros2.scan_yaw is {config.ros2.scan_yaw}; an arm has no scanner.")
         joints = tuple(f"{joint}_joint" for joint in body.chain.joints)
         self._count = len(joints)
         self._opening = body.home[-1]

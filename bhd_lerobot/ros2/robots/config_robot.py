@@ -33,5 +33,10 @@ class Ros2RobotConfig(RobotConfig):
                 f"robot.ros2.silence_s is {self.ros2.silence_s}; it is of robots with --robot.plant=ros2. Of the robot "
                 f"type ros2 use --robot.topic_timeout_s={self.ros2.silence_s}."
             )
+        if self.ros2.latency_s is not None:
+            raise ConfigError(
+                f"robot.ros2.latency_s is {self.ros2.latency_s}; it is of robots with --robot.plant=ros2. Whether a "
+                "robot of the type ros2 follows its commands is not supervised."
+            )
         if not 0 < self.topic_timeout_s < float("inf"):
             raise ConfigError(f"robot.topic_timeout_s is {self.topic_timeout_s}; it is positive and finite.")

@@ -1,6 +1,8 @@
 """Any ROS 2 robot as a LeRobot `Robot`: a mapping says which fields of which topics are its features."""
 
 import os
+import sys
+import time
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -28,6 +30,8 @@ from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.robots.plant import scan_reader
 
 _COMMAND_HZ = 50.0
+_STANDS_NS = 3_000_000_000  # so long a robot may stand that is commanded to move
+_MOVES = 0.05  # of the way that is commanded; less is noise
 
 
 class Ros2Robot(Robot):
@@ -61,6 +65,10 @@ class Ros2Robot(Robot):
             )
         if unknown := [name for name in config.stop if name not in mapping.action]:
             raise ConfigError(unknown_name("action in robot.stop", unknown[0], mapping.action))
+        if config.ros2.scan_yaw is not None and not any(one.beams for one in mapping.observation.values()):
+            raise ConfigError(
+                f"robot.ros2.scan_yaw is {config.ros2.scan_yaw}; {config.mapping} has no scan with beams."
+            )
         self._names, self._actions = features_of(mapping.observation), tuple(mapping.action)
         inputs, self._places = self._inputs(mapping)
         self._acted = sendable_topics(mapping.action, mapping.types)
@@ -86,6 +94,10 @@ class Ros2Robot(Robot):
         self.reading_timestamps: dict[str, float] = {}
         self._is_connected = False
         self._whole_turns: NDArray[np.float64] | None = None
+        self._both = [name for name in self._actions if name in self._names]  # observed and commanded
+        self._values = np.full(len(self._names), np.nan)
+        self._first: NDArray[np.float64] | None = None  # what was observed when commands began
+        self._since_ns = 0
 
     def _inputs(self, mapping: MappingConfig) -> tuple[tuple[InputSpec, ...], list[list[int]]]:
         """Return what is received, and where its numbers are in the observation."""
@@ -182,6 +194,7 @@ class Ros2Robot(Robot):
         if self._whole_turns is None:
             self._whole_turns = self._turns * np.round(values[self._yaws] / self._turns)
         values[self._yaws] -= self._whole_turns
+        self._values = values
         topics = (one.topic for one in self.spec.inputs)
         self.reading_timestamps = dict(zip(topics, (state["measured_ns"] / 1e9).tolist(), strict=True))
         observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))
@@ -212,7 +225,30 @@ class Ros2Robot(Robot):
             raise ActionError(f"The action {dict(action)} has a value that is not finite.")
         sent = np.concatenate([values[list(topic.columns)] for topic in self._acted]) if self._acted else values
         self._link.write(sent)
+        self._watch(action)
         return dict(zip(self._actions, values.tolist(), strict=True))
+
+    def _watch(self, action: Mapping[str, Any]) -> None:
+        """Print once that the robot stands although it is commanded to move, as with an inactive controller."""
+        if not self._both or self._since_ns < 0:
+            return
+        now, seen = time.monotonic_ns(), self._values[[self._names.index(name) for name in self._both]]
+        if self._first is None:
+            speeds = np.array([name.endswith(".vel") for name in self._both])
+            self._first, self._since_ns = np.where(speeds, 0.0, seen), now  # one that stands has no speed
+        wanted = np.abs(np.array([float(action[name]) for name in self._both]) - self._first).max()
+        if np.isnan(seen).any() or not wanted:
+            self._first = None
+        elif np.abs(seen - self._first).max() >= _MOVES * wanted:
+            self._since_ns = -1
+        elif now - self._since_ns > _STANDS_NS:
+            topics = ", ".join(one.topic for one in self.spec.outputs)
+            print(
+                f"warning: the robot has not moved for {_STANDS_NS / 1e9:g} s, though it is commanded to, on {topics}. "
+                "Are its motors on, and its controller active (ros2 control list_controllers)?",
+                file=sys.stderr,
+            )
+            self._since_ns = -1
 
     def disconnect(self) -> None:
         """Stop the robot if it has a stop, and leave the network. May be called twice."""

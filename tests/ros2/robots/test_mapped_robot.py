@@ -12,6 +12,7 @@ import pytest
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.external.device import Device
 from bhd_lerobot.ros2.bag.importer.sources import Reading, mapped_sources
 from bhd_lerobot.ros2.live.network import Ros2Config
@@ -80,9 +81,23 @@ def test_a_namespace_is_in_front_of_images_and_of_topics_without_a_slash(tmp_pat
     assert topics[section] == {"images": "/r/image", "observation": "/r/odom"}[section]
 
 
-def test_an_option_of_another_robot_type_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"robot.ros2.silence_s is 0.5;.*--robot.topic_timeout_s=0.5"):
-        config(tmp_path, {"observation": {"x.vel": SPEED}}, silence_s=0.5)
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ({"silence_s": 0.5}, r"robot.ros2.silence_s is 0.5;.*--robot.topic_timeout_s=0.5"),
+        ({"latency_s": 0.1}, "robot.ros2.latency_s is 0.1; it is of robots with --robot.plant=ros2"),
+        ({"scan_yaw": 0.1}, "robot.ros2.scan_yaw is 0.1; .* has no scan"),
+    ],
+)
+def test_an_option_that_would_not_act_is_refused(tmp_path: Path, network: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Ros2Robot(config(tmp_path, {"observation": {"x.vel": SPEED}}, **network))
+
+
+@pytest.mark.parametrize("network", [{"domain": 3}, {"namespace": "/tb3_1"}, {"latency_s": 0.2}])
+def test_a_network_without_a_plant_on_it_is_refused(network: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=rf"robot.ros2.{next(iter(network))} .* add --robot.plant=ros2"):
+        TurtleBot3Config(ros2=Ros2Config(**network))
 
 
 def element(field: str, kind: str = FLOATS) -> dict[str, str]:
@@ -258,3 +273,23 @@ def test_a_command_that_no_node_receives_is_named_before_the_first_episode(tmp_p
         r"The subscription of /cmd_vel in /robot is of type .*TwistStamped; .*Correct the type", ("/cmd_vel", STAMPED)
     )
     fails(r"No node receives /cmd_vel \(.*Twist\).*Of this type there are: /base/cmd_vel", ("/base/cmd_vel", TWIST))
+
+
+@pytest.mark.parametrize(("moves", "commanded"), [(False, 0.2), (True, 0.2), (False, 0.0)])
+def test_a_robot_that_stands_against_its_commands_is_named(
+    tmp_path: Path, domain: int, capsys: pytest.CaptureFixture[str], moves: bool, commanded: float
+) -> None:
+    started: list[bool] = []
+    with (
+        feed(domain, lambda _: [("/odom", ODOMETRY, odometry(0.15 if moves and started else 0.0))]),
+        connected(tmp_path, {"x.vel": SPEED}, domain=domain) as robot,
+    ):
+        robot.get_observation()
+        started.append(True)
+        end, printed = time.monotonic() + 5, ""
+        while time.monotonic() < end or (commanded and not moves and not printed):
+            robot.send_action({"x.vel": commanded})
+            robot.get_observation()
+            printed += capsys.readouterr().err
+            time.sleep(0.05)
+    assert ("has not moved for 3 s, though it is commanded to, on /cmd_vel" in printed) == bool(commanded and not moves)
