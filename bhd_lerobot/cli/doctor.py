@@ -16,6 +16,12 @@ def _parser() -> Parser:
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
+    parser.add_argument(
+        "--dataset",
+        type=Path,
+        metavar="FOLDER",
+        help="how late the robot of this dataset follows its commands, only that",
+    )
     parser.add_argument("--realtime", action="store_true", help="latency test: how late a real-time process wakes up")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the latency test [s] (default: 10)")
     parser.add_argument("--rate", type=int, default=1000, help="wake-ups a second [Hz] (default: 1000)")

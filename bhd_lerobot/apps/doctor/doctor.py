@@ -110,6 +110,11 @@ def _print_latency(measured: dict[str, Any], console: Console) -> None:
 
 def examine_and_print(options: argparse.Namespace, run: RunTrials) -> int:
     """Check this machine as the options ask; return the exit status."""
+    if options.dataset:
+        from bhd_lerobot.apps.doctor.following import describe_following
+
+        print(describe_following(options.dataset.expanduser()))
+        return 0
     root = options.root.expanduser() if options.root else None
     if root is None:
         from bhd_lerobot.datasets.format.identity import default_root

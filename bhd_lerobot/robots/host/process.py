@@ -95,11 +95,11 @@ class LiveProcess:
         planning = planning_link(self._block, dof, spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
         self._host: Host
-        link, sensed_ns = PlantLink.of(self._block), time.monotonic_ns
+        link, sensed_ns, age_ns = PlantLink.of(self._block), time.monotonic_ns, None
         if self._plant is not None:
             self._plant.open()
             self._host = spec.make_host(self._plant, planning=planning)
-            sensed_ns = self._stamp_ns
+            age_ns = self._age_ns
         elif link is not None:
             from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
 
@@ -110,7 +110,7 @@ class LiveProcess:
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
-        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns)
+        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns, age_ns)
         # A tick is for the time that it was due at. How far stamps are ahead of now is checked where they are read.
         cerebellum.readings.oldest_ns = cerebellum.readings.ahead_ns = spec.oldest_ns
         period = NANOSECONDS // spec.rates.control_hz
@@ -223,13 +223,14 @@ class LiveProcess:
         moves = mode in (Mode.HOLD, Mode.TRACKING, Mode.STOPPING) or not cerebellum.controller.at_rest()[0]
         return not moves or self._standing_ticks > self._most_orphan_ticks
 
-    def _stamp_ns(self) -> int:
-        """Return when the newest of what a plant reads was measured, monotonic [ns]."""
+    def _age_ns(self) -> int:
+        """Return how long ago the newest of what a plant reads was measured [ns]."""
         reading = self._host.cerebellum.reading
         if reading.stamp_ns is None:
             return 0
         newest = int(reading.stamp_ns[0])
-        return max(newest, int(reading.sensors_ns[0])) if reading.sensors.shape[1] else newest
+        newest = max(newest, int(reading.sensors_ns[0])) if reading.sensors.shape[1] else newest
+        return max(0, time.monotonic_ns() - newest)
 
     def _advance(self, ticks: int) -> None:
         for _ in range(ticks):

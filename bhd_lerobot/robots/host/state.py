@@ -67,10 +67,17 @@ class StatePublisher:
     Args:
         ring: where they go, of dtype `state_dtype(host)`.
         clock: monotonic time [ns].
+        age_ns: how much older than the tick its newest reading is [ns]; not older if None.
     """
 
-    def __init__(self, host: Host, ring: StateRing, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        self._clock = clock
+    def __init__(
+        self,
+        host: Host,
+        ring: StateRing,
+        clock: Callable[[], int] = time.monotonic_ns,
+        age_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self._clock, self._age_ns = clock, age_ns
         self._host, self._cerebellum, self._ring = host, host.cerebellum, ring
         self._record = np.zeros(1, state_dtype(host))
         # The one robot's values, as views: an index costs as much as a write.
@@ -128,7 +135,7 @@ class StatePublisher:
             cerebellum.command_age_of(0, slot.due_ns - grid.start_ns),
             # Before the first tick everything stands still: what is read then is so until that tick.
             self._clock() if slot.index >= 0 else slot.due_ns,
-            (host.tick - int(oldest[0])) * grid.period_ns,
+            (host.tick - int(oldest[0])) * grid.period_ns + (self._age_ns() if self._age_ns else 0),
         )
         self._physics[0][:], self._physics[1][:] = host.physics
         self._ring.publish(self._state)

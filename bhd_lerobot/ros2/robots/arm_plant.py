@@ -83,6 +83,7 @@ class ArmPlant(Ros2Plant):
 
     command_hz = 125.0
     usual_latency_s = 0.1
+    moves = 0.05  # [rad] of a joint
 
     def __init__(self, config: Any, body: Arm) -> None:
         if config.ros2.scan_yaw is not None:
@@ -90,6 +91,7 @@ class ArmPlant(Ros2Plant):
         joints = tuple(f"{joint}_joint" for joint in body.chain.joints)
         self._count = len(joints)
         self._opening = body.home[-1]
+        self._rest: NDArray[np.float64] | None = None  # the joints at the first command
         inputs = (
             InputSpec(
                 "/joint_states", JOINT_STATE, JointReader(joints), SENSOR_DATA, max(_SILENCE_S, config.ros2.silent_s)
@@ -103,6 +105,15 @@ class ArmPlant(Ros2Plant):
         )
         super().__init__(body.name, config, inputs, outputs)
         self.hint += " A controller that is not active takes none (ros2 control list_controllers)."
+
+    def commanded(self, ctrl: NDArray[np.float64]) -> float:
+        """Return how far the joint that is to turn most is to turn from the first command [rad]."""
+        self._rest = ctrl[0, : self._count].copy() if self._rest is None else self._rest
+        return float(np.abs(ctrl[0, : self._count] - self._rest).max())
+
+    def moved(self, out: PlantReading) -> float:
+        """Return how far the joint that has turned most has turned from there [rad]."""
+        return 0.0 if self._rest is None else float(np.abs(out.position[0, : self._count] - self._rest).max())
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the joints and the driver's status into `out`."""

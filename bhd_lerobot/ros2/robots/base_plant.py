@@ -87,12 +87,14 @@ class BasePlant(Ros2Plant):
     takes = "twist"
     command_hz = 50.0
     usual_latency_s = 0.3
+    moves = 0.05  # [m/s] of a wheel
 
     def __init__(self, config: Any, body: MobileBase) -> None:
         if body.lidar is None:
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
+        self._half_track, self._wheel_radius = body.drive.wheel_separation / 2, body.drive.wheel_radius
         node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         writer = TwistWriter(config.ros2.distro != "humble")
         inputs = [
@@ -111,6 +113,14 @@ class BasePlant(Ros2Plant):
         remedy = f"Set --robot.ros2.distro={other}."
         output = OutputSpec("/cmd_vel", writer.msgtype, writer, remedy=remedy, stop=_STOP)
         super().__init__(body.name, config, tuple(inputs), (output,))
+
+    def commanded(self, ctrl: NDArray[np.float64]) -> float:
+        """Return the speed of the faster wheel [m/s]."""
+        return abs(float(ctrl[0, 0])) + abs(float(ctrl[0, 1])) * self._half_track
+
+    def moved(self, out: PlantReading) -> float:
+        """Return the speed of the faster wheel [m/s]."""
+        return float(np.abs(out.velocity[0]).max()) * self._wheel_radius
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the wheels, the scan and the gyroscope into `out`."""

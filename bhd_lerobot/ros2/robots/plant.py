@@ -1,6 +1,7 @@
 """What plants of ROS 2 robots have in common: a node in a process of its own below the cerebellum."""
 
 import os
+import sys
 import time
 from dataclasses import replace
 from typing import Any
@@ -29,11 +30,17 @@ class Ros2Plant(Plant):
         config: the robot's configuration.
         inputs: what is received.
         outputs: what is sent.
+
+    Attributes:
+        usual_latency_s: of robots of this kind [s].
+        moves: a command that is so far from rest moves the robot, see `commanded` and `moved`.
+        followed_s: how long after its first such command the robot had moved as far [s]; None before.
     """
 
     n = 1
     command_hz: float
     usual_latency_s: float
+    moves: float
 
     def __init__(self, name: str, config: Any, inputs: tuple[InputSpec, ...], outputs: tuple[OutputSpec, ...]) -> None:
         network = config.ros2
@@ -53,6 +60,8 @@ class Ros2Plant(Plant):
         sent = ", ".join(one.topic for one in spec.outputs if one.is_required)
         self.hint = f"Commands go to {sent}. A robot that follows later needs a larger robot.ros2.latency_s."
         self._enabled = False
+        self._commanded_ns = 0
+        self.followed_s: float | None = None
 
     def open(self) -> None:
         """Join the network, and wait for the robot's topics.
@@ -89,6 +98,16 @@ class Ros2Plant(Plant):
             RealtimeError: as for `state`.
         """
         self.read_parts(self.state(), out)
+        if self.followed_s is None and self._commanded_ns and self.moved(out) >= self.moves:
+            self.followed_s = (time.monotonic_ns() - self._commanded_ns) / 1e9
+
+    def commanded(self, ctrl: np.ndarray) -> float:
+        """Return how far from rest a command is, shape (n, joints)."""
+        raise NotImplementedError
+
+    def moved(self, out: PlantReading) -> float:
+        """Return how far from rest the robot is, in the same unit."""
+        raise NotImplementedError
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write what the robot's topics say into `out`."""
@@ -102,8 +121,20 @@ class Ros2Plant(Plant):
         """Send commands."""
         if self._enabled:
             self.link.write(ctrl[0])
+            if not self._commanded_ns and self.commanded(ctrl) >= self.moves:
+                self._commanded_ns = time.monotonic_ns()
 
     def close(self) -> None:
         """Stop the robot, and leave the network."""
         self._enabled = False
         self.link.close()
+        if self.followed_s is not None:
+            advice = (
+                "" if self.followed_s < self.latency_s else f" Set --robot.ros2.latency_s={1.25 * self.followed_s:.2f}"
+            )
+            print(
+                f"The robot followed its first command after {self.followed_s:.2f} s (robot.ros2.latency_s "
+                f"{self.latency_s:g}).{advice}",
+                file=sys.stderr,
+            )
+            self.followed_s = None
