@@ -117,21 +117,27 @@ class Receiver:
     def __init__(self, spec: NodeSpec, channel: Channel, node: Node) -> None:
         self._spec, self._channel, self._node = spec, channel, node
         self._columns = spec.columns
-        self._inputs = [
-            [node.subscription(one.topic, one.msgtype, qos) for qos in _either(one.qos)] for one in spec.inputs
+        # Several inputs may be of one topic, whose messages have the numbers of some of them each.
+        self._inputs: dict[tuple[str, str, Qos], list[int]] = {}
+        for index, one in enumerate(spec.inputs):
+            self._inputs.setdefault((one.topic, one.msgtype, one.qos), []).append(index)
+        self._subscriptions = [
+            [node.subscription(topic, msgtype, each) for each in _either(qos)] for topic, msgtype, qos in self._inputs
         ]
         self._cameras = [node.subscription(one.topic, one.msgtype, one.qos) for one in spec.cameras]
         self._clocks = [
             ClockOffset(is_synchronised=spec.network.is_local or spec.is_synchronised)
-            for _ in (*self._inputs, *self._cameras)
+            for _ in (*spec.inputs, *spec.cameras)
         ]
         self._is_rate_known = False  # whether it was printed that a clock is slow
         self._dropped: dict[int, tuple[int, int]] = {}  # stamp and arrival of the message that was dropped last [ns]
-        self._stamps = [0] * len(self._inputs)  # newest of each [ns]
-        self._old_stamps = [0] * len(self._inputs)  # newest before the sender's clock was set [ns]
+        self._stamps = [0] * len(spec.inputs)  # newest of each [ns]
+        self._old_stamps = [0] * len(spec.inputs)  # newest before the sender's clock was set [ns]
         self._record = np.zeros((), channel.state_dtype)
         self._record["values"] = np.nan
-        self._wrong: dict[str, str] = {}  # topic -> what is wrong with its newest message
+        self._wrong: dict[
+            int, str
+        ] = {}  # number of the input, or beyond them of the camera -> what is wrong with its newest message
         self._topics: list[Any] = [*spec.inputs, *spec.cameras]
         self._heard: list[list[int]] = [[] for _ in self._topics]  # publishers, the one that was heard last at the end
         self._mixed_ns = [0] * len(self._topics)  # when a publisher was heard again after another one
@@ -156,12 +162,10 @@ class Receiver:
                 self._frame_senders.add(received.sender)
                 for scanner in self._scanners.values():
                     scanner.static |= static_frames([received.data])[0]
-        for index, subscriptions in enumerate(self._inputs):
-            received_now = [received for subscription in subscriptions for received in subscription.take()]
-            for received in (
-                sorted(received_now, key=lambda one: one.sent_ns) if len(subscriptions) > 1 else received_now
-            ):
-                news = self._take(index, received) or news
+        for subscriptions, indices in zip(self._subscriptions, self._inputs.values(), strict=True):
+            arrived = [received for subscription in subscriptions for received in subscription.take()]
+            for received in sorted(arrived, key=lambda one: one.sent_ns) if len(subscriptions) > 1 else arrived:
+                news = self._take_all(indices, received) or news
         for index, subscription in enumerate(self._cameras):
             for received in subscription.take()[-1:]:
                 self._take_image(index, received)
@@ -176,15 +180,24 @@ class Receiver:
             self._record["problem"] = problem
             self._channel.states.publish(self._record)
 
-    def _take(self, index: int, received: Received) -> bool:
-        one, record = self._spec.inputs[index], self._record
+    def _take_all(self, indices: list[int], received: Received) -> bool:
+        """Take a message for all inputs of its topic; return whether any has read it."""
         try:
             message = received.message()
+        except DatasetError as error:
+            self._wrong |= dict.fromkeys(indices, str(error))
+            return False
+        taken = [self._take(index, received, message) for index in indices]
+        return any(taken)
+
+    def _take(self, index: int, received: Received, message: Any) -> bool:
+        one, record = self._spec.inputs[index], self._record
+        try:
             if one.topic in self._scanners and (lacking := self._lacking_frames(received.arrived_ns)):
                 raise DatasetError(lacking)
             values = one.reader.read(message)
         except DatasetError as error:
-            self._wrong[one.topic] = str(error)
+            self._wrong[index] = str(error)
             return False
         if not one.qos.transient_local:
             self._hear(index, received)
@@ -202,7 +215,7 @@ class Receiver:
             if abs(stamp - newest) > _TOMORROW_NS:
                 self._old_stamps[index] = newest
             self._stamps[index] = stamp
-        self._wrong.pop(one.topic, None)
+        self._wrong.pop(index, None)
         record["count"][index] += 1
         self._count_interval(index, received.arrived_ns - int(record["arrived_ns"][index]), record["count"][index])
         record["arrived_ns"][index] = received.arrived_ns
@@ -246,27 +259,27 @@ class Receiver:
         return f"{' and '.join(silent)} may state how the scanner is mounted, and has not been received" * bool(silent)
 
     def _take_image(self, index: int, received: Received) -> None:
-        camera = self._spec.cameras[index]
+        camera, number = self._spec.cameras[index], len(self._spec.inputs) + index
         ring = self._channel.images[index]
         try:
             image = decode_image(camera.topic, camera.msgtype, received.data)
         except DatasetError as error:
-            self._wrong[camera.topic] = str(error)
+            self._wrong[number] = str(error)
             return
         if image.shape != (camera.height, camera.width, 3):
             height, width, _ = image.shape
-            self._wrong[camera.topic] = f"it is {width} x {height} px, not {camera.width} x {camera.height}"
+            self._wrong[number] = f"it is {width} x {height} px, not {camera.width} x {camera.height}"
             return
-        self._wrong.pop(camera.topic, None)
+        self._wrong.pop(number, None)
         record = np.zeros((), self._channel.image_dtypes[index])
         stamp = _header_stamp(received.data)
-        record["measured_ns"] = self._measured_ns(len(self._inputs) + index, stamp, received)
+        record["measured_ns"] = self._measured_ns(len(self._spec.inputs) + index, stamp, received)
         record["pixels"] = image
         ring.publish(record)
         interval, known = received.arrived_ns - self._images_ns[index], 1 + bool(self._images_ns[index])
-        self._count_interval(len(self._inputs) + index, interval, known)
+        self._count_interval(len(self._spec.inputs) + index, interval, known)
         self._images_ns[index] = received.arrived_ns
-        self._hear(len(self._inputs) + index, received)
+        self._hear(len(self._spec.inputs) + index, received)
 
     # --- problems ----------------------------------------------------------------------------------------------------
 
@@ -276,15 +289,15 @@ class Receiver:
             *zip(self._spec.inputs, self._record["arrived_ns"], strict=True),
             *zip(self._spec.cameras, self._images_ns, strict=True),
         ]
-        for one, arrived in listened:
+        for number, (one, arrived) in enumerate(listened):
             silent = (now_ns - max(int(arrived), self._start_ns)) / 1e9
             # What has never come is named soon, for the one who waits for it.
             if silent > (one.silence_s if arrived or math.isinf(one.silence_s) else min(one.silence_s, _FIRST_S)):
-                return self._why(one, silent, heard=bool(arrived))
+                return self._why(number, one, silent, heard=bool(arrived))
         return ""
 
-    def _why(self, one: Any, silent_s: float, *, heard: bool) -> str:
-        if wrong := self._wrong.get(one.topic):
+    def _why(self, number: int, one: Any, silent_s: float, *, heard: bool) -> str:
+        if wrong := self._wrong.get(number):
             return f"The newest message of {one.topic} cannot be used: {wrong}"
         mismatches = self._node.graph.mismatches(one.topic, one.msgtype, _either(one.qos)[-1], is_publisher=False)
         if mismatches:

@@ -1,7 +1,7 @@
 """Which field of which topic is which feature of a robot: one description for bags and for robots on the network."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -194,6 +194,22 @@ class TopicFields:
     def has_header(self) -> bool:
         """Whether a message begins with a header, and so with a stamp."""
         return has_header(self.msgtype)
+
+    def parts(self) -> "list[TopicFields]":
+        """Return the features that come in the same message for certain, each that is selected by a name by itself."""
+        named = [k for k, one in enumerate(self.fields) if one.key]
+        groups = [[k for k in range(self.width) if k not in named], *[[k] for k in named]]
+        return [
+            replace(
+                self,
+                columns=tuple(self.columns[k] for k in group),
+                fields=tuple(self.fields[k] for k in group),
+                scales=self.scales[group],
+                offsets=self.offsets[group],
+            )
+            for group in groups
+            if group
+        ]
 
     @property
     def turns(self) -> dict[int, float]:

@@ -104,7 +104,7 @@ class Ros2Robot(Robot):
         found, places, named = [], [], self.config.ros2.in_namespace
         yaws: list[tuple[int, float]] = []
         numbers = {name: one for name, one in mapping.observation.items() if not one.beams}
-        for topic in topics_of(numbers, mapping.types):
+        for topic in [part for whole in topics_of(numbers, mapping.types) for part in whole.parts()]:
             features = [list(numbers)[column] for column in topic.columns]
             reader = FieldsReader(topic, features)
             found.append(InputSpec(named(topic.topic), topic.msgtype, reader, SENSOR_DATA, self.config.topic_timeout_s))
@@ -195,8 +195,9 @@ class Ros2Robot(Robot):
             self._whole_turns = self._turns * np.round(values[self._yaws] / self._turns)
         values[self._yaws] -= self._whole_turns
         self._values = values
-        topics = (one.topic for one in self.spec.inputs)
-        self.reading_timestamps = dict(zip(topics, (state["measured_ns"] / 1e9).tolist(), strict=True))
+        self.reading_timestamps = {}
+        for one, measured in zip(self.spec.inputs, (state["measured_ns"] / 1e9).tolist(), strict=True):
+            self.reading_timestamps[one.topic] = min(measured, self.reading_timestamps.get(one.topic, measured))
         observation: dict[str, Any] = dict(zip(self._names, values.tolist(), strict=True))
         return observation | {name: camera.read_latest() for name, camera in self.cameras.items()}
 

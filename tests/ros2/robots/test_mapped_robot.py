@@ -293,3 +293,43 @@ def test_a_robot_that_stands_against_its_commands_is_named(
             printed += capsys.readouterr().err
             time.sleep(0.05)
     assert ("has not moved for 3 s, though it is commanded to, on /cmd_vel" in printed) == bool(commanded and not moves)
+
+
+def test_an_arm_and_a_gripper_on_one_topic_are_read_as_in_a_bag(tmp_path: Path, domain: int) -> None:
+    """Each publishes its own joints; only two publishers of the same joint are a problem."""
+    second: list[bool] = []
+
+    def joints(angles: dict[str, float]) -> dict[str, Any]:
+        return {"header": head(), "name": list(angles), "position": np.array([list(angles.values())])}
+
+    def make(at: float) -> list[Sent]:
+        also = [("/joint_states#3", JOINTS, joints({"elbow": 9.0}))] * bool(second)
+        return [
+            ("/joint_states", JOINTS, joints({"wrist": 0.2, "elbow": 0.1})),
+            ("/joint_states#2", JOINTS, joints({"finger": 0.03})),
+            *also,
+        ]
+
+    place = {"topic": "/joint_states", "type": JOINTS}
+    observed = {f"{name}.pos": place | {"field": f"position[name={name}]"} for name in ("elbow", "finger", "wrist")}
+    with feed(domain, make), connected(tmp_path, observed, domain=domain) as robot:
+        assert robot.reading_names == ("/joint_states",)
+        for _ in range(20):
+            assert robot.get_observation() == {"elbow.pos": 0.1, "finger.pos": 0.03, "wrist.pos": 0.2}
+            time.sleep(0.02)
+        second.append(True)
+        with pytest.raises(RealtimeError, match="Several nodes send /joint_states at a time"):
+            until(lambda: [robot.get_observation(), False][1], "it is noticed")
+
+
+def test_a_joint_that_no_message_has_is_named(tmp_path: Path, domain: int) -> None:
+    sent = {"header": head(), "name": ["elbow"], "position": np.zeros((1, 1))}
+    place = {"topic": "/joint_states", "type": JOINTS}
+    observed = {f"{name}.pos": place | {"field": f"position[name={name}]"} for name in ("elbow", "wrist")}
+    robot = Ros2Robot(config(tmp_path, {"observation": observed}, domain=domain))
+    with (
+        feed(domain, lambda _: [("/joint_states", JOINTS, sent | {"header": head()})]),
+        pytest.raises(RealtimeError, match="/joint_states cannot be used: name has no 'wrist'; it has 'elbow'"),
+    ):
+        robot._link.open(patience_s=3.0)
+    robot.disconnect()
