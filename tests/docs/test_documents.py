@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies
-from bhd_lerobot.cli import evaluate, monitor, ros2
+from bhd_lerobot.cli import doctor, evaluate, monitor, ros2
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -166,8 +166,8 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
             except SystemExit as end:
                 if end.code:
                     raise
-    elif program == "bhd-monitor":
-        monitor._parser().parse_args(arguments)
+    elif program in ("bhd-monitor", "bhd-doctor"):
+        (monitor if program == "bhd-monitor" else doctor)._parser().parse_args(arguments)
     else:
         raise AssertionError(f"Unknown program {program}.")
 
