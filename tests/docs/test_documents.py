@@ -198,7 +198,9 @@ def test_every_quoted_command_parses(monkeypatch: pytest.MonkeyPatch) -> None:
         except (Exception, SystemExit) as error:
             wrong.append(f"{by_name(path)}: {line}: {error}")
     assert wrong == []
-    assert programs == {f"bhd-{name}" for name in ("record", "replay", "data", "monitor", "train", "eval", "ros2")}
+    assert programs == {
+        f"bhd-{name}" for name in ("record", "replay", "data", "doctor", "monitor", "train", "eval", "ros2")
+    }
 
 
 def test_a_wrong_command_does_not_parse(monkeypatch: pytest.MonkeyPatch) -> None:
