@@ -1,6 +1,7 @@
 """`bhd-record`: episodes of a robot, driven by a brain or a person, into a LeRobotDataset."""
 
 import os
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -77,17 +78,20 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         if status is not None:
             outer.enter_context(status.shown())
         pressed = outer.enter_context(EstopInputs(on_key=marks.on_key))
-        _add_estop_inputs(config, pressed, console)
+        is_main = threading.current_thread() is threading.main_thread()
+        if is_main:
+            _add_estop_inputs(config, pressed, console)
         robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
         outer.enter_context(closing(robots))
         pressed.attach(robots.estop)
+        if not is_main:  # no signal can be handled: an error, of which a robot that cannot be made comes first
+            _add_estop_inputs(config, pressed, console)
         stop, cluster = outer.enter_context(stop_on_signals()), outer.enter_context(ExitStack())
         task = _judged_task(config, robots, console)
         brain = cluster.enter_context(open_driver(config, marks))
         pool = None if is_here else cluster.enter_context(open_pool(config.ray, console))
         loop = _make_loop(config, robots, task, brain, pool)
-        loop.marks = marks
-        loop.status = status
+        loop.marks, loop.status = marks, status
         print_notes(console, robots, task)
         preview = _make_preview(config, robots, console)
         if robots.camera_shapes and is_here:
