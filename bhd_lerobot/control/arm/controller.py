@@ -262,12 +262,17 @@ class ArmController(Controller):
         self._off_ticks = (self._off_ticks + 1) * (off & ~self._stopped)
         blocked = self._off_ticks >= self._most_off_ticks
         if np.count_nonzero(blocked):
-            wrong = blocked & ((away > limit) & self._misread_joints(reading)).any(axis=1)
-            self._protect(wrong, reading, Watchdog.BLOCKED, self._misread, follows=True)
-            blocked &= ~wrong
-        deaf = blocked & (np.abs(reading.position - self._first) < _STANDS).all(axis=1)
-        self._protect(deaf, reading, Watchdog.BLOCKED, _DEAF)
-        self._protect(blocked & ~deaf, reading, Watchdog.BLOCKED, self._blocked)
+            unsure = (
+                blocked.copy()
+            )  # without efforts nothing says whether it is the joint or the encoder that stays behind
+            if reading.has_effort:
+                unsure &= ((away > limit) & self._misread_joints(reading)).any(axis=1)
+            deaf = blocked & (np.abs(reading.position - self._first) < _STANDS).all(axis=1)
+            self._protect(deaf & unsure, reading, Watchdog.BLOCKED, _DEAF, follows=True)
+            self._protect(deaf & ~unsure, reading, Watchdog.BLOCKED, _DEAF)
+            message = self._misread if reading.has_effort else self._blocked
+            self._protect(unsure & ~deaf, reading, Watchdog.BLOCKED, message, follows=True)
+            self._protect(blocked & ~deaf & ~unsure, reading, Watchdog.BLOCKED, self._blocked)
 
     def _misread_joints(self, reading: PlantReading) -> NDArray[np.bool_]:
         """Return the joints that are far from where they are commanded to, and not pulled there, shape (n, dof).
