@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, cast
@@ -40,7 +40,7 @@ from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import Marks, key_help
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
-from bhd_lerobot.rollout.progress import print_notes, progress_bars
+from bhd_lerobot.rollout.progress import part_done, print_notes, progress_bars
 from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.recorder import (
     Recording,
@@ -56,6 +56,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
+_SHOWN_EVERY_S = 0.1
 _SHORTEST_S = 0.5  # a take that a person's key ends is at least so long
 _ATTEMPTS = 3  # that an episode gets to be punctual
 
@@ -183,7 +184,7 @@ def _run(
 
     status = loop.status
     with Takes(save, recorder.drop_last, count) as takes, ExitStack() as shown:
-        progress = bar = None
+        progress = None
         if isinstance(status, RecordStatus):
             if loop.robots.world is None:
                 loop.before_start = ResetPhase(
@@ -193,19 +194,24 @@ def _run(
         else:
             progress = shown.enter_context(progress_bars(console, "success", "speed"))
             bar = progress.add_task("recording", total=len(specs), success="", speed="")
-        for episode in _episodes(loop, specs, result, recorder, console):
+
+        shown_at = 0.0
+
+        def show(now: bool = False) -> None:
+            nonlocal shown_at
+            if progress is not None and (now or time.perf_counter() - shown_at > _SHOWN_EVERY_S):
+                shown_at = time.perf_counter()
+                speed = f"{result.real_time_factor:.0f}x real time" if result.recorded else ""
+                done = result.recorded + part_done(loop)
+                progress.update(bar, completed=done, success=result.succeeded if result.recorded else "", speed=speed)
+
+        for episode in _episodes(loop, specs, result, recorder, show=show, console=console):
             if episode.writer is not None and episode.writer.dropped:
                 _print_dropped(episode, len(loop.robots.camera_shapes), console)
             takes.add(episode)
             if loop.before_start is None:
                 takes.settle()
-            if progress is not None and bar is not None:
-                progress.update(
-                    bar,
-                    advance=1,
-                    success=result.succeeded,
-                    speed=f"{result.real_time_factor:.0f}x real time",
-                )
+            show(now=True)
     result.episodes = recorder.num_episodes
     recorder.finalize()
     result.wall_s = time.perf_counter() - started if result.recorded else 0.0
@@ -250,11 +256,18 @@ def _make_status(config: RecordConfig, marks: Marks, console: Console) -> Record
 
 
 def _episodes(
-    loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
+    loop: EpisodeLoop,
+    specs: list[EpisodeSpec],
+    result: RecordResult,
+    recorder: DatasetRecorder,
+    *,
+    show: Callable[[], None],
+    console: Console,
 ) -> Iterator[Episode]:
-    """Run episodes; with `timing.reject`, those that were too unpunctual are run again."""
+    """Run episodes; with `timing.reject`, those that were too unpunctual are run again. `show` is called each frame."""
 
     def stop() -> bool:
+        show()
         return bool(result.stopped_by)
 
     if not (loop.robots.clock is not None and loop.tolerance.reject):

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.datasets.format.features import TIME
-from bhd_lerobot.errors import counted
+from bhd_lerobot.datasets.format.features import LATE, TIME
+from bhd_lerobot.errors import counted, quoted
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
 from bhd_lerobot.rollout.signals import StopRequest
@@ -35,6 +35,7 @@ class RecordResult:
         scores: their scores.
         problems: why brains gave up, as text, of the episodes that were no success.
         frames: frames that this run added.
+        late: how many of them were later than the timing tolerance permits, on the wall clock.
         simulated_s: time of the episodes that this run added, simulated or on the wall clock [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
@@ -55,6 +56,7 @@ class RecordResult:
     scores: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
     frames: int = 0
+    late: int = 0
     simulated_s: float = 0.0
     wall_s: float = 0.0
     stopped_by: StopRequest | None = None
@@ -91,6 +93,7 @@ class RecordResult:
         if episode.plan.get("problem") and not episode.outcome.success:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
+        self.late += int(np.count_nonzero(episode.columns[LATE]))
         time_s = episode.columns[TIME]
         is_live = episode.timing.clock == "realtime"
         self.simulated_s += time_s[-1] - time_s[0] + 1 / fps if is_live else episode.frames / fps
@@ -129,6 +132,9 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
             "speed",
             f"{result.real_time_factor:.{0 if result.real_time_factor > 9 else 2}f} x real time, {_clock(config)}",
         )
+    if result.late:
+        share = 100 * result.late / result.frames
+        table.add_row("late", f"{counted(result.late, 'frame')}, {share:.1f} % (bhd-data timing lists them)")
     files = [
         "config.yaml",
         *(["trajectories.png"] if (result.output_dir / "trajectories.png").is_file() else []),
@@ -163,10 +169,13 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
             "images."
         )
     if result.stopped_by:
+        again = "recorded anew" if config.is_live else "repeated identically"
         console.print(
             f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
-            "Continue with --resume=true: the dropped ones are repeated identically."
+            f"Continue with --resume=true: the dropped ones are {again}."
         )
+    if result.episodes:
+        console.print(escape(f"Look at it with: bhd-data view {quoted(result.root)}"), soft_wrap=True, highlight=False)
 
 
 def _clock(config: RecordConfig) -> str:

@@ -27,6 +27,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.report import print_summary
 from bhd_lerobot.registry import make_brain
 from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.signals import StopRequest
 from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
 
@@ -215,8 +216,22 @@ def test_a_path_stands_in_one_line_at_80_columns(recorded):
     far = Path("/", *(f"folder_{number}_of_a_long_path" for number in range(6)))
     print_summary(console, parse(RecordConfig, options(root)), replace(result, root=far / "d", output_dir=far), False)
     lines = console.file.getvalue().splitlines()
-    assert lines[-2:] == [f"Dataset: {far / 'd'}", f"Run folder: {far}"]
-    assert all(len(line) <= 80 for line in lines[:-2])
+    assert lines[-3:-1] == [f"Dataset: {far / 'd'}", f"Run folder: {far}"]
+    assert lines[-1] == f"Look at it with: bhd-data view {far / 'd'}"
+    assert all(len(line) <= 80 for line in lines[:-3])
+
+
+def test_late_frames_and_what_becomes_of_dropped_episodes_are_said(recorded, tmp_path):
+    _, result, _ = recorded
+    stopped = StopRequest()
+    stopped.signal = signal.SIGINT
+    for clock, again in (("realtime", "recorded anew"), ("lockstep", "repeated identically")):
+        console = Console(file=io.StringIO(), width=200)
+        config = parse(RecordConfig, options(tmp_path / "d", robot__clock=clock))
+        print_summary(console, config, replace(result, late=result.frames // 4, stopped_by=stopped), False)
+        printed = console.file.getvalue()
+        assert again in printed
+        assert f"{result.frames // 4} frames, 25.0 %" in printed
 
 
 def test_the_video_is_made_where_images_can_be_rendered(tmp_path):
