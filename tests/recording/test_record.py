@@ -231,7 +231,7 @@ def test_late_frames_and_what_becomes_of_dropped_episodes_are_said(recorded, tmp
         print_summary(console, config, replace(result, late=result.frames // 4, stopped_by=stopped), False)
         printed = console.file.getvalue()
         assert again in printed
-        assert f"{result.frames // 4} frames, 25.0 %" in printed
+        assert f"{result.frames // 4} frames, {100 * (result.frames // 4) / result.frames:.1f} %" in printed
 
 
 def test_the_video_is_made_where_images_can_be_rendered(tmp_path):
