@@ -133,6 +133,23 @@ def test_whatever_is_read_nothing_becomes_faster_by_the_stop(lie: str) -> None:
     assert one.moved < wire.NEEDED["joints"][lie]
 
 
+@pytest.mark.parametrize("lie", ["frozen", "counting twice"])
+def test_without_efforts_a_blocked_arm_brakes_along_its_reference(lie: str) -> None:
+    arm: Any = wire.make("joints", 12)
+    read, first = arm.cerebellum.plant.read, wire.start_of(arm)
+
+    def without_efforts(out: PlantReading) -> None:
+        read(out)
+        out.effort[:], out.has_effort = 0.0, False
+
+    arm.cerebellum.plant.read = without_efforts
+    liar = arm.cerebellum.plant = wire.Liar(arm, lie, np.random.default_rng(3))
+    for frame in range(50):
+        arm.step(first + np.array([0.5] * 6 + [0.0]) * np.sin(2.0 * frame / 25))
+    assert (arm.modes == Mode.FAULT).sum() > 6
+    assert liar.faster.max() < wire.FASTER
+
+
 def test_a_speed_that_is_wrong_moves_nothing() -> None:
     speeds = np.array([2.0, -2.0, 1e6])
 

@@ -12,6 +12,7 @@ Mask = NDArray[np.bool_]
 _LIGHT_N = 12.0  # [N] an arm of which less is felt has given way: it presses with less than 20 N
 _PERIOD_S = 0.04  # between two decisions: a servo and the estimate of force have followed the last one
 _SPEED, _TOOL_SPEED = 0.5, 0.25  # [rad/s, m/s] the most with which an arm gives way
+_UNSURE = 0.4  # share of these where only positions tell that something presses
 _FOLLOW, _EASE, _KEEP = 0.5, 0.5, 0.6  # shares of a servo's stretch, of its change, and of the speed once it is light
 _VAIN_RAD = 0.05  # [rad] of all joints, by which an arm gives way though the force stays: a load, or a wrong estimate
 _CREEP = 0.01  # [rad/s] an arm that is slower, and presses on nothing, stands still
@@ -143,7 +144,8 @@ class ContactRelief:
         wanted *= wanted * stretch < 0.0  # never against the push
         tools = self._forward.tool_speed(command[ids, : self._dof], wanted) / _TOOL_SPEED
         joints = np.abs(wanted).max(axis=1) / _SPEED
-        wanted /= np.maximum(np.maximum(joints, tools), 1.0)[:, None]
+        share = 1.0 if efforts is not None else _UNSURE
+        wanted *= share / np.maximum(np.maximum(joints, tools), share)[:, None]
         slower = _KEEP * self._wanted[ids]
         slower[np.abs(slower).max(axis=1) < _CREEP] = 0.0
         self._wanted[ids] = np.where(presses[:, None], wanted, slower)
