@@ -50,7 +50,10 @@ LIES = ("false", "drifting", "wrapped", "frozen", "counting twice", "from the fu
 ROUNDING = 1.021  # a trajectory ends inside a tick
 # [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6; an
 # arm that is found to be blocked for 50 ms goes on meanwhile.
-NEEDED = {"joints": dict.fromkeys(LIES, 0.35), "wheels": dict.fromkeys(LIES, 0.6)}
+NEEDED = {
+    "joints": dict.fromkeys(LIES, 0.2) | dict.fromkeys(("drifting", "frozen", "counting twice"), 0.35),
+    "wheels": dict.fromkeys(LIES, 0.6),
+}
 # [rad/s, m/s] of joint and tool: a stop makes an arm no faster than this, or than it was, times what the servos of an
 # arm that is speeding up lag behind.
 SLOW, FASTER = (0.5, 0.25), 1.3

@@ -26,7 +26,7 @@ def test_the_commands_that_are_told_do_what_was_meant(tmp_path: Path, capsys) ->
     capsys.readouterr()
     arguments = [part for one in options(root, **short) for part in one.split("=", 1)]
     assert record.main([*arguments, "--resume", "true"]) == 2
-    error, *lines = capsys.readouterr().err.splitlines()
+    error, *lines = (line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning:"))
     assert "was edited after its recording (delete), so it cannot be continued" in error
     assert len(lines) == 2
     for line, main in zip(lines, (record.main, data.main), strict=True):
