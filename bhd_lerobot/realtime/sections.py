@@ -2,14 +2,16 @@
 
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.mailbox import Mailbox
-from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
+
+if TYPE_CHECKING:  # planning takes 100 MB, and a base plans nothing
+    from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 
 _REQUESTS, _EVENTS = 16, 64
 _REST_S = 0.002  # between two checks of the planner for a request
@@ -19,20 +21,31 @@ def _dof(cerebellum: Cerebellum) -> int:
     return len(cerebellum.body.chain.joints) if isinstance(cerebellum.body, Arm) else 0
 
 
+def _goals_of(cerebellum: Cerebellum) -> Any:
+    """Return the goals of a robot that takes goals, else None."""
+    return getattr(cerebellum.controller, "goals", None)
+
+
 def section_sizes(cerebellum: Cerebellum) -> dict[str, int]:
     """Return what sections a block needs for one robot, and their sizes [bytes]."""
     sizes = {
         "requests": Mailbox.nbytes(request_dtype(_dof(cerebellum)), _REQUESTS),
         "events": Mailbox.nbytes(EVENT_DTYPE, _EVENTS),
     }
-    if isinstance(cerebellum.controller, ArmController):
+    if _goals_of(cerebellum) is not None:
+        from bhd_lerobot.realtime.planning_link import PlanningLink
+
         sizes["plan"] = PlanningLink.nbytes(_dof(cerebellum), cerebellum.control_hz)
     return sizes
 
 
-def planning_link(block: LiveBlock, dof: int, control_hz: int) -> PlanningLink | None:
+def planning_link(block: LiveBlock, dof: int, control_hz: int) -> "PlanningLink | None":
     """Return the planning of an arm whose goals the brain's process plans; None for a robot that takes none."""
-    return PlanningLink(block.section("plan"), dof, control_hz) if block.has("plan") else None
+    if not block.has("plan"):
+        return None
+    from bhd_lerobot.realtime.planning_link import PlanningLink
+
+    return PlanningLink(block.section("plan"), dof, control_hz)
 
 
 def cerebellum_side(block: LiveBlock, cerebellum: Cerebellum) -> Callable[[int], None]:
@@ -65,8 +78,10 @@ class BrainSide:
         self.client = RequestClient(requests, Mailbox(EVENT_DTYPE, _EVENTS, block.section("events")), wait)
         self.serve: Callable[[Callable[[], bool]], None] | None = None
         self.planner: PlanServer | None = None
-        if isinstance(cerebellum.controller, ArmController):
-            server = self.planner = PlanServer(block.section("plan"), cerebellum.controller.goals.planner)
+        if (goals := _goals_of(cerebellum)) is not None:
+            from bhd_lerobot.realtime import planning_link as planning
+
+            server = self.planner = planning.PlanServer(block.section("plan"), goals.planner)
 
             def serve(stop: Callable[[], bool]) -> None:
                 server.serve(stop, lambda: time.sleep(_REST_S))

@@ -21,14 +21,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body, Rates
 from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
-from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
@@ -40,6 +39,9 @@ from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.state import StatePublisher
+
+if TYPE_CHECKING:  # it takes 100 MB, and a base plans nothing
+    from bhd_lerobot.control.motion.planning import Planning
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02
@@ -78,7 +80,7 @@ class LiveSpec:
         """Return the plant; it is not opened yet."""
         return CheckedPlant.made(self.plant, self._config, self.body, self.oldest_ns)
 
-    def make_host(self, *plant: CheckedPlant, planning: Planning | None = None) -> Any:
+    def make_host(self, *plant: CheckedPlant, planning: "Planning | None" = None) -> Any:
         """Return the host of a plant, or without one a simulation of one robot."""
         planned = () if planning is None else (planning,)
         return pkgutil.resolve_name(self.host)(self._config, *(plant or (1, 1)), *planned)
