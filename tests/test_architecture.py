@@ -422,10 +422,14 @@ def tracked_files() -> list[Path]:
         text=True,
         check=True,
     ).stdout
-    return [ROOT / name for name in listing.split("\0") if name and (ROOT / name).is_file()]
+    names = [ROOT / name for name in listing.split("\0") if name]
+    return [path for path in names if path.is_file() or path.is_symlink()]
 
 
 def forbidden_lines(path: Path) -> list[str]:
+    if path.is_symlink():
+        target = path.readlink()
+        return [f"{path}: a link to {target}"] * (target.is_absolute() or not path.exists())
     pattern = re.compile("|".join(FORBIDDEN))
     lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
     return [f"{path}:{number}: {line.strip()[:160]}" for number, line in enumerate(lines, 1) if pattern.search(line)]
@@ -442,3 +446,10 @@ def test_a_planted_address_is_found(tmp_path: Path, half: str) -> None:
     path = tmp_path / "notes.md"
     path.write_text("fine: a/home/b, network/work/x, https://www.apache.org\n" + half.replace("|", "") + "\n")
     assert len(forbidden_lines(path)) == 1
+
+
+def test_a_planted_link_to_another_folder_is_found(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("fine")
+    for name, target, found in (("good", "a", 0), ("absolute", tmp_path / "a", 1), ("nowhere", "b", 1)):
+        (tmp_path / name).symlink_to(target)
+        assert len(forbidden_lines(tmp_path / name)) == found
