@@ -67,6 +67,7 @@ int64 WATCHDOG_PLANT_SILENT=16
 int64 WATCHDOG_MISSED_TICKS=32
 int64 WATCHDOG_GUARD=64
 int64 WATCHDOG_FORCE=128
+int64 WATCHDOG_SPEED=256
 std_msgs/Header header
 builtin_interfaces/Time observed  # stamp of the observation that the frame began with
 int64 episode_index

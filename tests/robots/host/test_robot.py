@@ -128,8 +128,15 @@ def test_a_press_of_another_process_while_it_connects_stays_until_a_person_reset
     name = unique("starting")
 
     def press() -> None:
-        until(lambda: name in names(), "the robot starts")
-        block = LiveBlock.attach(name)
+        blocks: list[LiveBlock] = []
+
+        def attached() -> bool:
+            with suppress(RealtimeError):  # it is there a moment before it can be attached to
+                blocks.append(LiveBlock.attach(name))
+            return bool(blocks)
+
+        until(lambda: name in names() and attached(), "the robot starts")
+        (block,) = blocks
         until(lambda: block.words[Word.PHASE] >= until_phase, "it has got so far")
         block.estop.press()
         block.close()
