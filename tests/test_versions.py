@@ -40,8 +40,9 @@ def test_the_sentence_names_the_version_the_valid_ones_and_how_to_get_one(name: 
 COMMANDS = """
 import sys
 from bhd_lerobot.cli import start
-for name in sys.argv[1:]:
-    sys.argv = [f"bhd-{name}", "--help"]
+for line in sys.argv[1:]:
+    name, *options = line.split()
+    sys.argv = [f"bhd-{name}", *(options or ["--help"])]
     try:
         status = getattr(start, name)()
     except SystemExit as end:
@@ -89,7 +90,9 @@ def run_beside(folder: Path, name: str, version: str, program: str, *arguments: 
 
 @pytest.mark.thorough
 def test_every_command_that_simulates_ends_in_one_sentence_beside_another_mujoco(tmp_path: Path) -> None:
-    done = run_beside(tmp_path, "mujoco", "3.8.1", COMMANDS, "record", "train", "evaluate", "replay", "data", "monitor")
+    avoid = "--robot.type=turtlebot3 --task.type=avoid --brain.type=avoidance"
+    record, evaluate = f"record {avoid} --dataset.root={tmp_path}/d", f"evaluate {avoid} --output_dir={tmp_path}/e"
+    done = run_beside(tmp_path, "mujoco", "3.8.1", COMMANDS, record, "train", evaluate, "replay", "data", "monitor")
     assert "Traceback" not in done.stderr
     refused = [line for line in done.stderr.splitlines() if line]
     assert len(refused) == 3  # a training looks at data alone, unless it evaluates
