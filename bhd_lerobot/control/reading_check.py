@@ -86,14 +86,14 @@ class MotionCheck:
         self._names, dof = arm.chain.joints, len(arm.chain.joints)
         self._period_s = 1.0 / control_hz
         self._last, self._since_ns = np.full((2, n, dof), np.nan), np.zeros(n, np.int64)
-        self._same, self._torque = np.zeros((2, n, dof), np.int64), np.zeros((2, n, dof))
+        self._same, self._torque = np.zeros((n, dof), np.int64), np.zeros((n, dof))
         self._off, self._way = np.zeros((2, n, dof))
         self._frozen_ticks = round(_FROZEN_S * control_hz)
         self._least_torque = _FROZEN_SHARE * np.asarray(arm.limits.effort[:dof])
 
     def forget(self, ids: NDArray[np.intp]) -> None:
         """Take the next readings of some arms for the first ones."""
-        self._last[:, ids], self._same[:, ids] = np.nan, 0
+        self._last[:, ids], self._same[ids] = np.nan, 0
         self._off[ids] = self._way[ids] = 0.0
 
     def find(self, reading: PlantReading, torque: Array, mode: NDArray[np.int8], now_ns: int) -> Mask | None:
@@ -120,13 +120,13 @@ class MotionCheck:
         self._way *= kept
         self._way += np.maximum(np.abs(step), np.abs(turned))
         contradicts = np.abs(self._off) > _CONTRADICTION_RAD + _CONTRADICTION_SHARE * self._way
-        same = (new == before) & driven[:, None]
+        same = (new[0] == before[0]) & driven[:, None]
         self._same += 1
         self._same *= same
         np.copyto(self._torque, torque, where=~same)
         frozen = (self._same >= self._frozen_ticks) & (np.abs(torque - self._torque) > self._least_torque)
         self._last[:] = new
-        wrong = contradicts | frozen.any(axis=0)
+        wrong = contradicts | frozen
         if not np.count_nonzero(wrong):
             return None
         if not self.problem:

@@ -33,6 +33,25 @@ def test_the_measurement_of_an_attack_is_not_blind(monkeypatch: pytest.MonkeyPat
     assert not attack(make("impedance", 2), "late", 50, 1).is_safe("late")
 
 
+def test_speeds_of_a_coarse_encoder_are_no_fault() -> None:
+    """They are the same number for long; that they are none of the positions' would be found all the same."""
+    arm = make("impedance", 4)
+    read = arm.cerebellum.plant.read
+
+    def coarse(out: PlantReading) -> None:
+        read(out)
+        out.position[:, :6] = np.round(out.position[:, :6], 5)
+        out.velocity[:, :6] = np.round(out.velocity[:, :6] / 0.005) * 0.005
+
+    arm.cerebellum.plant.read = coarse
+    first = arm.cerebellum.command.copy()
+    for frame in range(90):
+        action = first.copy()
+        action[:, :3] += 0.1 * (frame >= 25) * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 1, 1]])
+        arm.step(action)
+    assert (arm.modes == Mode.TRACKING).all(), arm.problem
+
+
 class DriftingPlant(Plant):
     """A plant whose positions and speeds drift from a moment on, all joints alike."""
 
