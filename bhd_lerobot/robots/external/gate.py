@@ -16,8 +16,11 @@ Vector = NDArray[np.float64]
 
 # Speeds as LeRobot's robots and plug-ins name them: x.vel, linear_velocity, mobile_base.vx, mobile_base.vtheta.
 _SPEED = re.compile(r"(^|[._])(vel|velocity|speed|v[xyz]|vtheta|[xyz]_?vel)$")
-# What closes on things: gripper.pos, left_gripper, panda_finger_joint1, index_flexor.
-_GRIPS = re.compile(r"(^|[._])(grip|jaw|claw|finger|thumb|index|middle|ring|pinky|suction|vacuum)(per)?s?\d*([._]|$)")
+# What closes on things: gripper.pos, left_gripper, rightGripper, panda_finger_joint1, index_flexor, hand.pos.
+_GRIPS = re.compile(
+    r"grip|(^|[._])(jaw|claw|clamp|hand|finger|thumb|index|middle|ring|pinky|suction|vacuum)s?\d*([._]|$)",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,17 @@ def test_no_change_by_name_is_no_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["gripper.pos", "left_gripper", "panda_finger_joint1.pos", "jaw.pos", "index_flexor.pos"]
+    "name",
+    [
+        "gripper.pos",
+        "left_gripper",
+        "rightGripper.pos",
+        "GRIPPER_L",
+        "hand.pos",
+        "panda_finger_joint1.pos",
+        "jaw.pos",
+        "index_flexor.pos",
+    ],
 )
 def test_what_grips_keeps_its_position_in_an_emergency_stop(name: str) -> None:
     gate = Gate(("wrist.pos", name, "x.vel"), GateConfig(), {})
