@@ -236,7 +236,7 @@ def _paired(given: ReportInput) -> str:
         else ("Newcombe's method 10", "that of McNemar's exact test, two-sided")
     )
     note = (
-        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: {rates} for paired rates, "
+        f"Every brain compared with {escape(baseline)}, episode by episode. Intervals: {rates} for paired rates, "
         f"Student's, corrected for skewness, for differences of means{more}. p is {p}; where it finds "
         "no difference, the interval of the rates holds 0. An interval that excludes the dashed line shows a "
         "difference beyond chance"

@@ -40,7 +40,7 @@ def sentences(results: EvalResults) -> list[str]:
             text += f", {began}: they are not independent, and the intervals are too narrow"
         pair = results.paired.get(label)
         if pair is not None and pair.episodes:
-            text += f"; beside {pair.baseline} {verdict(pair)}"
+            text += f"; compared with {pair.baseline} {verdict(pair)}"
         found.append(text + ".")
     return found
 

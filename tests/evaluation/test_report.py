@@ -209,7 +209,7 @@ def test_sentences_claim_a_difference_only_where_the_interval_leaves_out_nothing
     results = summarise({}, {}, {"old": worse, "new": better, "same": same}, 30, "old")
     text = dict(zip(results.brains, sentences(results), strict=True))
     assert "succeeded in 15 of 30" in text["old"]
-    assert "beside" not in text["old"]
+    assert "compared with" not in text["old"]
     assert "it succeeds more often (+50.0 points) and it has a higher score, 2.90 times" in text["new"]
     assert "no difference in success is certain" in text["same"]
 
