@@ -1,4 +1,4 @@
-"""Send one goal to a simulated UR5, wait, print feedback and result: the articles' test client.
+"""Send one goal to a simulated UR5, wait, print feedback and result.
 
     python examples/send_goal.py
     python examples/send_goal.py --position 0.3 0.2 0.4 --max-velocity 0.5

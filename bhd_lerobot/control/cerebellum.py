@@ -26,7 +26,7 @@ from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.control.reading_check import ReadingCheck
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
-MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
+MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
 
 # Requests and the modes that they apply in; resets lead to INACTIVE only, motion needs a separate activation.
 _TRANSITIONS = {

@@ -1,4 +1,4 @@
-"""The rule of the articles: drive until something is near in front, then turn left."""
+"""A rule: drive until something is near in front, then turn left."""
 
 import math
 from dataclasses import asdict, dataclass
