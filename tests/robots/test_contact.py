@@ -282,32 +282,6 @@ def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
     assert all(arm.cerebellum.request(one).accepted.all() for one in (Request.RESET, Request.ACTIVATE))
 
 
-@pytest.mark.parametrize("columns", [slice(1), slice(6)], ids=["one", "all"])
-def test_an_arm_whose_encoders_are_frozen_gives_way_by_its_efforts(columns: slice) -> None:
-    arm = UR5Simulation(UR5Config(), 3, threads=1)
-    arm.reset(np.arange(3), [TableScene("empty", (), arm.body.home)] * 3, range(3))
-    read, held = arm.cerebellum.plant.read, []
-
-    def frozen(out: Any) -> None:
-        read(out)
-        held[:] = held or [out.position[:, columns].copy()]
-        out.position[:, columns], out.velocity[:, columns] = held[0], 0.0
-
-    command = arm.cerebellum.command.copy()
-    arm.cerebellum.plant.read = frozen  # type: ignore[method-assign]
-    for _ in range(40):
-        command[:, 0] += 0.3 / 25
-        arm.step(command)
-    assert (arm.modes == Mode.FAULT).all()
-    wall = Wall(arm, np.array([[1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]]), 0.05, 2.0)
-    most = np.zeros(3)
-    for _ in range(75):
-        arm.step(None)
-        np.maximum(most, wall.force, out=most)
-    assert ((most > 0.0) & (most < 250.0)).all()
-    assert (wall.force < 65.0).all()
-
-
 def test_an_arm_in_hold_is_watched_after_reset_and_activate_before_any_command() -> None:
     for direction in (UP, DOWN, ASIDE, ASKEW):
         arm = UR5Simulation(UR5Config(), 1, threads=1)

@@ -32,7 +32,6 @@ _SETTLED_S = 0.04  # [s] what was stopped may swing back once
 _YIELD_S = 0.2  # [s] for which joints that do not come to rest are waited for where they were: something pushes them
 _PRESSED_N = 30.0  # [N] an arm that presses more is neither reset nor activated
 _GIVES = 0.5  # the least share of its largest torque that the servo of a blocked joint gives
-_CERTAIN_N = 60.0  # [N] what is felt of this is no mistake of a posture that was misread
 _ARRIVED_RAD = 2e-4  # [rad]
 _SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 _TINY = 1e-9
@@ -243,12 +242,10 @@ class ArmController(Controller):
         self._rest_ticks += 1
         self._rest_ticks *= self._stopped & ~self._yields & ~self.goals.following
         ready, dof = self._rest_ticks > 0, self.width - 1
-        misread = self._misread_joints(reading).any(axis=1)
+        known = (self._rest_ticks > self._settled_ticks) & ~self._blind & ~self._misread_joints(reading).any(axis=1)
         efforts = None
         if self.force is not None and reading.has_effort:
             efforts = self.force.torque, self.force.pressing
-            misread &= self.force.pressing < _CERTAIN_N
-        known = (self._rest_ticks > self._settled_ticks) & ~self._blind & ~misread
         self._blind[:] = False
         self._relief.run(ready, known, reading.position[:, :dof], efforts, self.command, self.velocity)
 

@@ -34,8 +34,7 @@ class ContactRelief:
     goes on is followed for as long as it goes on, a soft one until it is relaxed. A force that stays as it is however
     the arm gives way, such as a load's, stops that; one that changes later begins it anew.
 
-    The torques are those that the motors' efforts are more than the posture needs: encoders decide what that is, and no
-    more.
+    The torques are those that the motors' efforts are more than the posture needs: what encoders read decides nothing.
     Of a plant that measures no efforts they follow from the positions that were read; the way is then bounded.
 
     Args:
