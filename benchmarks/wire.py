@@ -426,6 +426,41 @@ def share(space: str, n: int) -> tuple[float, float]:
     return check, whole
 
 
+def impedance_table(streams: int, frames: int, seed: int) -> tuple[Table, int]:
+    """Attack impedance control; return a table of what came of it, and how many writes and attacks were not safe."""
+    unsafe = 0
+    forced = Table(title="Impedance control")
+    for column in (
+        "attack",
+        "streams",
+        "stopped",
+        "unsafe",
+        "tool",
+        "joint",
+        "motion after the stop",
+        "force",
+        "later",
+    ):
+        forced.add_column(column, justify="left" if column == "attack" else "right")
+    for kind in ATTACKS:
+        arm = make("impedance", streams)
+        judge = arm.cerebellum.plant = Judge(arm)
+        effect = attack(arm, kind, frames, seed)
+        unsafe += judge.unsafe + (not effect.is_safe(kind))
+        forced.add_row(
+            kind,
+            f"{streams:,}",
+            f"{100 * effect.stopped:.0f} %",
+            f"{judge.unsafe:,}",
+            f"{effect.speed:.2f} m/s",
+            f"{effect.joint_speed:.2f} rad/s",
+            f"{effect.moved:.3f} rad",
+            f"{effect.force:.0f} N",
+            f"{effect.pressed:.0f} N",
+        )
+    return forced, unsafe
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -474,36 +509,9 @@ def main(arguments: list[str] | None = None) -> int:
             numbers = (f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}")
             lies.add_row(space, lie, *numbers, f"{one.moved:.3f} rad", f"{one.faster:.2f}")
     console.print(lies)
-    forced = Table(title="Impedance control")
-    for column in (
-        "attack",
-        "streams",
-        "stopped",
-        "unsafe",
-        "tool",
-        "joint",
-        "motion after the stop",
-        "force",
-        "later",
-    ):
-        forced.add_column(column, justify="left" if column == "attack" else "right")
-    for kind in ATTACKS:
-        arm = make("impedance", options.streams)
-        judge = arm.cerebellum.plant = Judge(arm)
-        effect = attack(arm, kind, options.frames, options.seed)
-        unsafe += judge.unsafe + (not effect.is_safe(kind))
-        forced.add_row(
-            kind,
-            f"{options.streams:,}",
-            f"{100 * effect.stopped:.0f} %",
-            f"{judge.unsafe:,}",
-            f"{effect.speed:.2f} m/s",
-            f"{effect.joint_speed:.2f} rad/s",
-            f"{effect.moved:.3f} rad",
-            f"{effect.force:.0f} N",
-            f"{effect.pressed:.0f} N",
-        )
-    console.print(forced)
+    table, found = impedance_table(options.streams, options.frames, options.seed)
+    console.print(table)
+    unsafe += found
     compile_at_once()
     shares = Table(title="The share of the checks in a tick, physics and sensors included")
     for column in ("robot", "n", "check", "tick", "share"):

@@ -107,7 +107,8 @@ class Plant(Protocol):
     def set_mode(self, mode: NDArray[np.int8]) -> None:
         """Take the new `Mode` of each robot, shape (n,), before the first command that is given in it.
 
-        In a mode without motion, such as `SAFE_OFF`, the robot may switch its motors off.
+        In a mode without motion, such as `SAFE_OFF`, the robot may switch its motors off; an arm that takes torques has
+        to brake then, without the help of what it reads: nothing else stops it.
         """
         return
 
