@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import os
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -281,8 +282,9 @@ def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, 
 
 STOPPED = {  # what happens to the driver or to a process of ours; what is printed of it
     "protective stop": (("--on-usr1=safety", "--value=3"), "its safety status is STOPPED"),
-    "emergency stop": (("--on-usr1=safety", "--value=7"), "Emergency stop (the robot's own)"),
-    "silence": (("--on-usr1=silence",), "/joint_states has sent no message for"),
+    "emergency stop": (("--on-usr1=safety", "--value=7"), r"Emergency stop \(the robot's own\)"),
+    # A reading whose message came late is too old before its successor is missed.
+    "silence": (("--on-usr1=silence",), r"/joint_states has sent no message for|the newest reading was \d"),
     "node": ((), "The process of the ROS 2 node ended with status -9"),
     "cerebellum": ((), "The cerebellum's process was killed by signal 9"),
 }
@@ -311,7 +313,7 @@ def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cau
                 process = {"node": "ros2.live.process node", "cerebellum": "robots.host.process"}[what]
                 os.kill(recording.pid_of(process), signal.SIGKILL)
             assert recording.process.wait() != 0
-            assert cause in recording.text
+            assert re.search(cause, recording.text)
         before = log_of(log, "state")[-1]
         until(lambda: log_of(log, "state")[-1]["monotonic"] > before["monotonic"] + 0.5, "time passes")
         assert log_of(log, "state")[-1]["position"] == pytest.approx(before["position"], abs=1e-3)

@@ -25,7 +25,7 @@ from bhd_lerobot.ros2.live.clock_offset import ClockOffset
 from bhd_lerobot.ros2.live.graph import Endpoint
 from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.live.node import Node, Publisher, Received
-from bhd_lerobot.ros2.live.spec import NodeSpec
+from bhd_lerobot.ros2.live.spec import NodeSpec, silence_text
 from bhd_lerobot.ros2.messages.images import decode_image
 from bhd_lerobot.ros2.messages.scan import ScanReader, static_frames, static_topics
 from bhd_lerobot.ros2.messages.views import TF
@@ -304,8 +304,8 @@ class Receiver:
             return " ".join(mismatches)
         endpoints = [other for other in self._node.graph.endpoints() if other.is_publisher and not self._is_ours(other)]
         if any(other.topic == one.topic for other in endpoints):
-            so_long = f"for {silent_s:.1f} s" if heard else "yet"
-            return f"{one.topic} has a publisher and no message {so_long}."
+            so_long = silence_text(one.topic, silent_s) if heard else f"{one.topic} has sent no message yet"
+            return f"{so_long}, though it has a publisher."
         return f"Nobody publishes {one.topic} ({one.msgtype}){' any more' if heard else ''}. {_offers(one, endpoints)}"
 
     def _intrusion(self) -> str:

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos
 
 
+def silence_text(topic: str, silent_s: float) -> str:
+    """Return that a topic is silent, in the one wording of whoever notices it first: its node or the control loop."""
+    return f"{topic} has sent no message for {silent_s:.2f} s"
+
+
 class Reader(Protocol):
     """Takes numbers from messages of a type."""
 

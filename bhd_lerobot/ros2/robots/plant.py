@@ -13,7 +13,7 @@ from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import Ros2Config
-from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec
+from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec, silence_text
 from bhd_lerobot.ros2.messages.scan import ScanReader
 
 
@@ -84,11 +84,12 @@ class Ros2Plant(Plant):
         state = self.link.state
         silent_s = (time.monotonic_ns() - int(state["arrived_ns"][0])) / 1e9
         is_old = silent_s > self._silence_s
-        self.link.check(self._silence_s / 2 if is_old else self._silence_s)
+        # Of old readings the node is the cause only if it did not live for half of that time after the last of them.
+        self.link.check(silent_s - self._silence_s / 2 if is_old else self._silence_s)
         if problem := bytes(state["problem"]).decode(errors="ignore"):
             raise RealtimeError(problem)
         if is_old:
-            raise RealtimeError(f"{self.link.spec.inputs[0].topic} has sent no message for {silent_s:.2f} s.")
+            raise RealtimeError(f"{silence_text(self.link.spec.inputs[0].topic, silent_s)}.")
         return state
 
     def read(self, out: PlantReading) -> None:

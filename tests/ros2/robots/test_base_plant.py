@@ -125,7 +125,7 @@ def test_a_robot_that_is_gone_is_named(robot: Peer, plant: BasePlant) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["--silence", "scan:6"], "/scan has a publisher and no message for"),
+        (["--silence", "scan:6"], "/scan has sent no message for"),
         (
             ["--frame", "scan:laser"],
             "cannot be used: The scans of /scan are in the frame 'laser', whose rotation in the robot is not",
