@@ -1,9 +1,9 @@
 .DEFAULT_GOAL := help
-.PHONY: arm help demo test test-all sweep docs lint format bench bench-realtime results lock clean venv
+.PHONY: arm help demo quick test test-all sweep docs lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Three test processes by default, for two processors: a quarter of their time they wait. `make test WORKERS=0` runs
-# everything in one, for a debugger.
+# everything in one, for a debugger. Tests by the wall clock follow, by themselves.
 WORKERS ?= 3
 PYTEST_ARGS ?=
 BENCH ?=
@@ -16,11 +16,15 @@ help: ## show this list
 demo: venv ## record, replay, train and evaluate both robots
 	$(PYTHON_IN_VENV) -m bhd_lerobot.cli.demo
 
+quick: venv ## run the laws of every package, in a minute; CHANGED=1: what the changes since the last commit touch
+	$(PYTHON_IN_VENV) -m pytest --numprocesses=2 --dist=worksteal --thorough=no --quick=$(if $(CHANGED),changed,all) $(PYTEST_ARGS)
+
 test: venv ## run the tests of every behaviour; PYTEST_ARGS='-k name' narrows them down
-	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal --thorough=no $(PYTEST_ARGS)
+	@scripts/bootstrap.sh --browser
+	$(PYTHON_IN_VENV) -m tests --workers=$(WORKERS) --thorough=no $(PYTEST_ARGS)
 
 test-all: test ## run them, and then those that take long
-	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal --thorough=only $(PYTEST_ARGS)
+	$(PYTHON_IN_VENV) -m tests --workers=$(WORKERS) --thorough=only $(PYTEST_ARGS)
 
 sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
 	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/datasets/sweeps $(PYTEST_ARGS)

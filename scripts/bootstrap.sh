@@ -3,6 +3,7 @@
 #
 #   scripts/bootstrap.sh             make .venv ready; a few milliseconds when it already is
 #   scripts/bootstrap.sh --print-uv  print the uv to use, installing it into .uv when there is none
+#   scripts/bootstrap.sh --browser   see that there is a browser to test pages in: as root on Debian, install its package
 #
 # PYTHON=/path/to/python names the interpreter to create .venv with; `make clean` first to change that of an old one.
 set -euo pipefail
@@ -101,6 +102,19 @@ fingerprint() {
 if [ "${1:-}" = --print-uv ]; then
     find_uv
     exit
+fi
+
+if [ "${1:-}" = --browser ]; then
+    for name in chromium-headless-shell chromium chromium-browser google-chrome google-chrome-stable; do
+        if type -aP "$name" >/dev/null; then exit 0; fi
+    done
+    if [ "$(id -u)" = 0 ] && type -P apt-get >/dev/null; then
+        say "installing Debian's chromium-headless-shell, to test pages in"
+        export DEBIAN_FRONTEND=noninteractive
+        { apt-get -qq update && apt-get -qq install --no-install-recommends chromium-headless-shell; } \
+            </dev/null >/dev/null 2>&1 || say "the package cannot be installed here"
+    fi
+    exit 0
 fi
 
 runs=no

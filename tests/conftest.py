@@ -10,18 +10,17 @@ import os
 import shutil
 import signal
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-from tests import quick
+from tests import shortcuts
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     gc.disable()  # until everything is imported, or it is looked through again and again for what can go
-pytest_plugins = ["tests.recorded_datasets"]
+pytest_plugins = ["tests.recorded_datasets", "tests.selection"]
 
 _HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))
 
@@ -46,36 +45,12 @@ settings.register_profile("bhd", derandomize=True, deadline=None, database=None)
 settings.load_profile("bhd")
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--thorough",
-        choices=("no", "only", "all"),
-        default="all",
-        help="leave out the tests marked thorough, as `make test` does; run only them; or all (the default)",
-    )
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select by `--thorough`: of a test marked `thorough(but=n)` the first n examples are not thorough."""
-    if (wanted := config.getoption("--thorough")) == "all":
-        return
-    examples: Counter[str] = Counter()
-    chosen: dict[bool, list[pytest.Item]] = {True: [], False: []}
-    for item in items:
-        name = item.nodeid.partition("[")[0]
-        examples[name] += 1
-        marker = item.get_closest_marker("thorough")
-        chosen[marker is not None and examples[name] > marker.kwargs.get("but", 0)].append(item)
-    config.hook.pytest_deselected(items=chosen[wanted == "no"])
-    items[:] = chosen[wanted == "only"]
-
-
 def pytest_unconfigure() -> None:
     shutil.rmtree(_HF_HOME, ignore_errors=True)
 
 
 def pytest_collection_finish() -> None:
-    quick.install()
+    shortcuts.install()
     _freeze()
     gc.enable()
 
@@ -89,7 +64,7 @@ def _freeze() -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Draw charts for tests marked `figures` only. A hook, because fixtures of any scope train and record."""
-    quick.draw(item.get_closest_marker("figures") is not None)
+    shortcuts.draw(item.get_closest_marker("figures") is not None)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests import quick
+from tests import shortcuts
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 
@@ -83,5 +83,5 @@ def _run(
     file = os.open(output or os.devnull, os.O_WRONLY | os.O_APPEND)
     os.dup2(file, 1)
     os.dup2(file, 2)
-    quick.draw(False)
+    shortcuts.draw(False)
     sys.exit(function(*arguments))

@@ -20,7 +20,7 @@ from bhd_lerobot.hub import transfer
 from bhd_lerobot.ros2.messages.types import type_store
 from bhd_lerobot.training import train
 from bhd_lerobot.training.rl import train as rl
-from tests import quick
+from tests import shortcuts
 from tests.datasets import corruption_jobs, kill_jobs
 from tests.datasets.sweeps import faults
 
@@ -32,6 +32,6 @@ __all__ = [
 
 type_store()
 main._parser()  # imports every command
-quick.install()
+shortcuts.install()
 gc.collect()
 gc.freeze()  # or a child that collects garbage copies every page

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from playwright.sync_api import sync_playwright
 
 from bhd_lerobot.apps.view.packing import unpack
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from tests.apps.view.support import Served, served
 from tests.datasets.loader.support import FRONT, PHOTO, WRIST, images, length, record_ours, record_stock
+from tests.requirements import not_tested
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
@@ -26,8 +28,7 @@ ARGUMENTS = (
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api", reason="NOT TESTED: pip install playwright to test the page.")
-    with api.sync_playwright() as playwright:
+    with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=found_browser(), args=list(ARGUMENTS))
         yield chromium
         chromium.close()
@@ -36,7 +37,7 @@ def browser() -> Iterator[Any]:
 def found_browser() -> str:
     found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if found is None:
-        pytest.skip(f"NOT TESTED: no browser is installed. Install one of {', '.join(BROWSERS)} to test the page.")
+        not_tested(f"the page of bhd-data view; no browser is installed: install one of {', '.join(BROWSERS)}")
     return found
 
 

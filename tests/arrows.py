@@ -1,0 +1,137 @@
+"""Which package may import which."""
+
+from pathlib import Path
+
+PACKAGE = "bhd_lerobot"
+ROOT = Path(__file__).resolve().parents[1]
+
+# package -> what it may import of ours, besides itself and errors: the files of a package without its subpackages
+# ("control"), with them ("control.*"), or one module ("bodies.body").
+EVERYTHING = ("*",)
+_TASKS = ("options", "bodies", "control", "control.geometry")
+_DATASETS = ("datasets.format", "datasets.storage")
+ARROWS: dict[str, tuple[str, ...]] = {
+    "errors": (),
+    "versions": (),
+    "stock": (),
+    "options": (),
+    "bodies": ("options",),
+    "sim": ("versions", "bodies.body", "bodies.tabletop"),
+    "control": ("bodies.body",),
+    "control.geometry": ("versions", "bodies.body", "control"),
+    "control.motion": ("versions", "bodies.body", "control", "control.geometry"),
+    "control.base": ("bodies.body", "control"),
+    "control.arm": ("bodies.body", "control", "control.geometry", "control.motion"),
+    "realtime": ("bodies.body", "control.*"),
+    "tasks": _TASKS,
+    "robots.host": ("bodies.body", "sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
+    "robots.external": ("options", "bodies.body", "control", "datasets.format", "robots.host"),
+    "robots": ("tasks", "bodies", "sim", "control.*", "robots.host", "ros2.live.network"),
+    "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
+    "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
+    "policies": (*_TASKS, "datasets.format.features"),
+    "policies.mlp": ("control.geometry", "policies"),
+    "policies.cnn": ("bodies", "policies", "policies.mlp"),
+    "policies.learned": (
+        "__version__",
+        "options",
+        "control",
+        "datasets.storage",
+        "datasets.format.features",
+        "policies",
+        "policies.mlp",
+    ),
+    "policies.navigation": ("bodies", "policies"),
+    "policies.manipulation": (*_TASKS, "policies"),
+    "policies.perception": ("bodies", "policies", "policies.learned", "policies.manipulation"),
+    "policies.pixels": ("bodies", "policies", "policies.learned", "policies.mlp", "policies.perception"),
+    "policies.language": (*_TASKS, "policies", "policies.manipulation", "policies.perception"),
+    "policies.teleop": (*_TASKS, "policies", "policies.manipulation"),
+    "policies.topic": (*_TASKS, "policies", "ros2.live", "ros2.messages"),
+    "policies.dagger": (*_TASKS, "policies", "policies.manipulation", "policies.navigation"),
+    "datasets.storage": (),
+    "datasets.format": ("datasets.storage",),
+    "datasets.assembly": _DATASETS,
+    "datasets.edit": ("options", *_DATASETS, "datasets.assembly", "bodies", "tasks"),
+    "datasets.validate": (*_DATASETS, "control.geometry"),
+    "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
+    "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),
+    "datasets.remote": (*_DATASETS, "datasets.assembly", "datasets.edit"),
+    "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
+    "datasets.timing": (*_DATASETS, "control"),
+    "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),
+    "ros2.live": ("bodies", "control", "ros2.messages"),
+    "ros2.robots": ("bodies", "control", "ros2.live", "ros2.messages"),
+    "ros2.serve": (
+        *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
+        *("robots", "robots.host", "ros2.live", "ros2.messages"),
+    ),
+    "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
+    "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
+    "ros2.bag.importer": (
+        *("tasks", "bodies", "control", "datasets.format", "datasets.writer"),
+        *("ros2.messages", "ros2.bag.storage", "ros2.bag.exporter"),
+    ),
+    "rollout": (
+        *("__version__", "options", "registry"),
+        *("tasks", "bodies", "sim", "control", "robots.*", "policies.*"),
+        *(*_DATASETS, "datasets.writer"),
+    ),
+    "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
+    "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
+    "recording": (
+        *("options", "registry", "tasks", "bodies", "control", "robots.host", "robots.external"),
+        *("policies", "policies.teleop", "policies.topic", *_DATASETS, "datasets.writer"),
+        *("rollout", "teleoperators", "hub", "cluster"),
+    ),
+    "evaluation": (
+        *("tasks", "control", "robots.external", "robots.host"),
+        *("policies", "policies.learned", "policies.perception", "policies.teleop"),
+        "envs",  # registers our environments with LeRobot, for `--env.type`
+        *("datasets.format", "datasets.timing", "datasets.writer"),
+        *("options", "registry", "rollout", "cluster"),
+    ),
+    "teleoperators": (
+        *("bodies", "control", "control.geometry", "control.arm"),
+        *("policies.*", "robots", "registry"),
+    ),
+    "plugin": ("versions", "envs", "policies.*", "registry", "ros2.robots.config_robot", "teleoperators"),
+    "training": (
+        *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
+        *("options", "registry", "rollout", "hub"),
+    ),
+    "training.rl": (
+        *("registry", "plugin", "control", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
+        "options",
+    ),
+    "training.dagger": (
+        *("policies", "policies.dagger", "datasets.format", "datasets.storage", "datasets.edit"),
+        *("options", "rollout", "recording", "evaluation", "training"),
+    ),
+    "apps.view": (
+        "tasks",
+        "bodies",
+        "control",
+        "control.geometry",
+        *_DATASETS,
+        "datasets.assembly",
+        "datasets.edit",
+    ),
+    "apps.monitor": ("control", "control.motion", "realtime"),
+    "apps.doctor": (
+        "options",
+        "versions",
+        "tasks",
+        "policies",
+        "bodies",
+        "sim",
+        "realtime",
+        "datasets.format",
+    ),
+    "apps.demo": ("options", "rollout", "recording", "evaluation", "training"),
+    "api": (
+        *("options", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
+    ),
+    "cli": EVERYTHING,
+    "cli.data": EVERYTHING,
+}
