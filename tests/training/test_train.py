@@ -17,12 +17,12 @@ from bhd_lerobot.cli.train import main
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.log import MetricsFile
+from tests.fake_hub.hub import FakeHub
 from tests.forks import Fork
-from tests.hub_server.server import HubServer
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
 from tests.waiting import until
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +278,7 @@ def test_an_input_that_never_changes_is_warned_of_where_it_would_count(tmp_path:
 
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
 def test_a_policy_that_is_pushed_holds_no_path_of_this_machine(
-    data: Path, tmp_path: Path, hub: HubServer, policy: dict
+    data: Path, tmp_path: Path, hub: FakeHub, policy: dict
 ) -> None:
     run = tmp_path / "run"
     pushed = {"policy.repo_id": "me/p", "policy.push_to_hub": True}

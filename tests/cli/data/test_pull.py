@@ -11,10 +11,10 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.training.config import BhdTrainConfig
-from tests.hub_server.server import HubServer
+from tests.fake_hub.hub import FakeHub
 from tests.training.support import make_dataset
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
 
 
-def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+def test_some_episodes_by_number_and_by_outcome(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     assert main.main(["push", str(lesson), "me/d"]) == 0
     capsys.readouterr()
     assert main.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
@@ -36,7 +36,7 @@ def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tm
     assert not [one for one in tmp_path.iterdir() if "c" in one.name]
 
 
-def test_the_command_that_is_suggested_is_one_that_works(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+def test_the_command_that_is_suggested_is_one_that_works(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     """With the user's own values."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -58,7 +58,7 @@ def test_the_command_that_is_suggested_is_one_that_works(hub: HubServer, lesson:
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
 
-def test_odd_metadata_end_in_a_message(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+def test_odd_metadata_end_in_a_message(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     """Whatever lies there, no traceback: an error, or all of it as it is there, and that it is not valid."""
     assert main.main(["push", str(lesson), "me/d", "--no_card"]) == 0
     files = hub.dataset("me/d").files()

@@ -6,8 +6,6 @@ import re
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -25,14 +23,15 @@ from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.hub.transfer import repeat_line
 from tests.datasets.support import snapshot as content
-from tests.hub_server.server import Fault, HubServer
+from tests.fake_hub.hub import FakeHub, Fault, real_client
+from tests.forks import Fork
 from tests.recording.support import options as record_options
 from tests.recording.support import run_record
 from tests.training.support import MLP, curve, make_dataset, run_train
 from tests.training.support import options as train_options
 from tests.waiting import until
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +53,11 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def text_of(hub: HubServer, name: str, path: str = "README.md") -> str:
+def text_of(hub: FakeHub, name: str, path: str = "README.md") -> str:
     return hub.dataset(name).files()[path].content.decode()
 
 
-def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) -> None:
+def test_there_and_back(hub: FakeHub, recorded: Path, tmp_path: Path, capsys) -> None:
     before = content(recorded)
     assert main.main(["push", str(recorded), "me/avoid"]) == 0
     assert "me/avoid: 4 episodes\n  sent" in capsys.readouterr().out
@@ -79,7 +78,7 @@ def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) 
 
 
 @pytest.mark.figures
-def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) -> None:
+def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, recorded: Path) -> None:
     assert main.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
     card = text_of(hub, "me/avoid")
     assert is_generated(card.encode())
@@ -114,7 +113,7 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
 
 
 @pytest.mark.figures
-def test_images_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+def test_images_of_cameras_and_of_curves(hub: FakeHub, lesson: Path, tmp_path: Path) -> None:
     videos = make_dataset(tmp_path / "videos", episodes=2, camera=True)
     for root, caption in (
         (videos, "as `observation.images.front` saw it"),
@@ -125,7 +124,7 @@ def test_images_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path:
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
 
 
-def test_an_edited_card_is_kept_and_that_is_reported(hub: HubServer, lesson: Path, capsys) -> None:
+def test_an_edited_card_is_kept_and_that_is_reported(hub: FakeHub, lesson: Path, capsys) -> None:
     assert main.main(["push", str(lesson), "me/d"]) == 0
     card = hub.dataset("me/d").files()["README.md"]
     card.content = card.content.replace(b"# d", b"# A fine dataset")
@@ -186,7 +185,7 @@ def test_bad_arguments_are_refused_and_change_nothing(lesson: Path, empty: Path,
         assert list(empty.iterdir()) == []
 
 
-def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     hub.expired.add("hf_me")
     assert main.main(["push", str(lesson), "me/d", "--branch=b", "--private", "--tags=a b,c"]) == 2
     error = capsys.readouterr().err
@@ -204,30 +203,32 @@ def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: HubServer, lesson: P
     assert (tmp_path / "my e" / "meta/info.json").is_file()
 
 
-def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> None:
-    gate = threading.Event()
-    hub.faults = [Fault("^PUT", times=-1, wait=gate)]
-    environment = {**os.environ, "HF_HUB_DISABLE_XET": "1"}
-    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", "push", str(lesson), "me/d", "--no-card"]
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-    try:
-        until(lambda: hub.asked("^PUT"))
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate()
-    finally:
-        process.kill()
-        gate.set()
-    assert process.returncode == 130
+def push_to_a_hub_that_stalls(root: Path, asked: Path) -> int:
+    """Upload in a process of its own; a file appears as soon as the upload waits."""
+    hub = FakeHub()
+    hub.faults = [Fault("^PUT", times=-1, meanwhile=lambda: (asked.touch(), threading.Event().wait()))]
+    with real_client(hub):
+        try:
+            return main.main(["push", str(root), "me/d", "--no-card"])
+        finally:
+            assert list(hub.dataset("me/d").files()) == [".gitattributes"]
+
+
+def test_ctrl_c_ends_a_stalled_upload_at_once(lesson: Path, tmp_path: Path) -> None:
+    process = Fork(push_to_a_hub_that_stalls, lesson, tmp_path / "asked", output=tmp_path / "log")
+    until((tmp_path / "asked").exists)
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 130
+    error = (tmp_path / "log").read_text()
     assert f"Stopped; the dataset at {lesson} is unchanged" in error
     assert f"bhd-data push {lesson} me/d --no_card" in error
     assert "Traceback" not in error
-    assert list(hub.dataset("me/d").files()) == [".gitattributes"]
 
 
 # --- what uploads by itself
 
 
-def test_recording_uploads_by_the_same_code(hub: HubServer, tmp_path: Path, capsys) -> None:
+def test_recording_uploads_by_the_same_code(hub: FakeHub, tmp_path: Path, capsys) -> None:
     root = tmp_path / "d"
     short = {"dataset__repo_id": "me/avoid", "dataset__push_to_hub": "true", "dataset__num_episodes": 1}
     _, output = run_record(root, **short, dataset__private="true", dataset__tags="[avoid]")
@@ -242,7 +243,7 @@ def test_recording_uploads_by_the_same_code(hub: HubServer, tmp_path: Path, caps
     assert len(dataset_info(tmp_path / "e").episodes) == 1
 
 
-def test_recording_does_not_begin_what_cannot_be_uploaded(hub: HubServer, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_recording_does_not_begin_what_cannot_be_uploaded(hub: FakeHub, tmp_path: Path, monkeypatch, capsys) -> None:
     wanted = {"dataset__push_to_hub": "true", "dataset__num_episodes": 1}
     assert record_module.main(record_options(tmp_path / "d", **wanted, dataset__repo_id="avoid")) == 2
     assert "user/name" in capsys.readouterr().err
@@ -252,7 +253,7 @@ def test_recording_does_not_begin_what_cannot_be_uploaded(hub: HubServer, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: FakeHub, lesson: Path, tmp_path: Path) -> None:
     assert main.main(["push", str(lesson), "me/d"]) == 0
     assert main.main(["pull", "me/d", f"--root={tmp_path / 'pulled'}"]) == 0
     short = {"steps": 2, "log_freq": 1, "save_freq": 0, "save_checkpoint": "false"}
@@ -265,7 +266,7 @@ def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: HubServer, l
     assert curve(tmp_path / "two") == curve(tmp_path / "three") == wanted
 
 
-def test_a_policy_that_cannot_be_uploaded_is_kept(hub: HubServer, lesson: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_policy_that_cannot_be_uploaded_is_kept(hub: FakeHub, lesson: Path, tmp_path: Path, monkeypatch) -> None:
     short = {"steps": 1, "policy__push_to_hub": "true", "policy__repo_id": "me/brain"}
     result, _ = run_train(train_options(lesson, tmp_path / "good", MLP, **short))
     pushed = hub.repositories["models/me/brain"].files()
@@ -286,14 +287,12 @@ def test_a_policy_that_cannot_be_uploaded_is_kept(hub: HubServer, lesson: Path, 
 
 
 @pytest.mark.thorough
-def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkeypatch) -> None:
-    import datasets
+def test_streaming_gives_the_same_samples(hub: FakeHub, recorded: Path, monkeypatch) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 
     assert main.main(["push", str(recorded), "me/avoid"]) == 0
-    monkeypatch.setattr(datasets.config, "HF_ENDPOINT", hub.url)
-    monkeypatch.setattr(datasets.config, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("datasets.config.HF_HUB_OFFLINE", False)
     deltas = {"action": [0.0, 0.1, 0.2]}
     reference = LeRobotDataset("t/t", root=recorded, delta_timestamps=deltas)
     for where in ({"repo_id": "me/avoid"}, {"repo_id": "t/t", "root": recorded}):
@@ -310,7 +309,7 @@ def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkey
     shutil.rmtree(Path(os.environ["HF_LEROBOT_HOME"]) / "hub", ignore_errors=True)
 
 
-def test_a_name_that_could_be_a_folder_gets_a_warning(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
+def test_a_name_that_could_be_a_folder_gets_a_warning(hub: FakeHub, lesson: Path, empty: Path, capsys) -> None:
     """`store/c3` may be meant as the folder beside this one; nothing in its form says which."""
     (empty / "store").mkdir()
     assert main.main(["push", str(lesson), "store/c3"]) == 2
@@ -349,7 +348,7 @@ def test_the_command_to_repeat_has_all_options(tmp_path: Path) -> None:
     assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"
 
 
-def test_an_image_beside_the_dataset_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+def test_an_image_beside_the_dataset_is_on_the_card(hub: FakeHub, lesson: Path, tmp_path: Path) -> None:
     mine = Path(shutil.copytree(lesson, tmp_path / "d"))
     (mine / "preview.png").write_bytes(b"mine")
     assert main.main(["push", str(mine), "me/d"]) == 0

@@ -19,14 +19,13 @@ from bhd_lerobot.errors import (
 )
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
-from tests.hub_server.client import real_client
-from tests.hub_server.fixtures import EPISODES, send, stored
-from tests.hub_server.server import Fault, HubServer
+from tests.fake_hub.fixtures import EPISODES, send, stored
+from tests.fake_hub.hub import FakeHub, Fault, real_client
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
-def test_what_comes_back_is_what_was_recorded(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_what_comes_back_is_what_was_recorded(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     report = send(root)
     assert stored(hub) == content(root)
     assert (report.episodes, len(report.sent), report.kept) == (EPISODES, len(content(root)), 0)
@@ -37,14 +36,14 @@ def test_what_comes_back_is_what_was_recorded(hub: HubServer, root: Path, tmp_pa
     assert sorted(one.name for one in tmp_path.iterdir()) == ["d", "e"]  # nothing is left beside it
 
 
-def test_a_push_is_one_commit_with_the_tag_that_lerobot_looks_for(hub: HubServer, root: Path) -> None:
+def test_a_push_is_one_commit_with_the_tag_that_lerobot_looks_for(hub: FakeHub, root: Path) -> None:
     send(root)
     repository = hub.dataset("me/d")
     assert len(repository.commits) == 2  # the Hub's own first one, and the dataset
     assert repository.tags == {"v3.0": repository.branches["main"]}
 
 
-def test_a_second_push_and_a_second_pull_move_nothing(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_second_push_and_a_second_pull_move_nothing(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     pull(HubDataset("me/d"), tmp_path / "e")
     hub.reset()
@@ -53,7 +52,7 @@ def test_a_second_push_and_a_second_pull_move_nothing(hub: HubServer, root: Path
     assert hub.received == 0
 
 
-def test_a_longer_dataset_sends_only_what_differs_and_removes_what_is_old(hub: HubServer, root: Path) -> None:
+def test_a_longer_dataset_sends_only_what_differs_and_removes_what_is_old(hub: FakeHub, root: Path) -> None:
     send(root)
     with support.resume(root, video=True) as recorder:
         support.record(recorder, video=True)
@@ -66,7 +65,7 @@ def test_a_longer_dataset_sends_only_what_differs_and_removes_what_is_old(hub: H
     assert repository.tags["v3.0"] == repository.branches["main"]
 
 
-def test_files_that_no_episode_needs_any_more_go(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_files_that_no_episode_needs_any_more_go(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     with support.create(tmp_path / "small") as recorder:
         support.record(recorder)
@@ -75,7 +74,7 @@ def test_files_that_no_episode_needs_any_more_go(hub: HubServer, root: Path, tmp
     assert any(path.startswith("videos/") for path in report.deleted)
 
 
-def test_an_interrupted_upload_goes_on_where_it_was(hub: HubServer, root: Path) -> None:
+def test_an_interrupted_upload_goes_on_where_it_was(hub: FakeHub, root: Path) -> None:
     hub.faults = [Fault("^PUT", times=-1, after=2, after_bytes=100)]
     with pytest.raises(TransferError, match="connection was lost"):
         send(root)
@@ -88,7 +87,7 @@ def test_an_interrupted_upload_goes_on_where_it_was(hub: HubServer, root: Path) 
     assert hub.received == sum(len(one) for one in hub.dataset("me/d").objects.values())  # no object came twice
 
 
-def test_an_interrupted_download_goes_on_where_it_was(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_an_interrupted_download_goes_on_where_it_was(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     target = tmp_path / "e"
     hub.reset()
@@ -106,7 +105,7 @@ def test_an_interrupted_download_goes_on_where_it_was(hub: HubServer, root: Path
     assert not again & arrived
 
 
-def test_the_reason_why_a_user_may_not_write_is_named(running_hub: HubServer, root: Path) -> None:
+def test_the_reason_why_a_user_may_not_write_is_named(root: Path) -> None:
     before = content(root)
     for token, name, reason in (
         (None, "me/d", "no token"),
@@ -114,13 +113,12 @@ def test_the_reason_why_a_user_may_not_write_is_named(running_hub: HubServer, ro
         ("hf_me", "other/d", "no permission"),
         ("nonsense", "me/d", "expired or was revoked"),
     ):
-        running_hub.repositories.clear()
-        with real_client(running_hub, token), pytest.raises(TransferError, match=reason):
+        with real_client(FakeHub(), token), pytest.raises(TransferError, match=reason):
             push(root, HubDataset(name, create=True))
         assert content(root) == before
 
 
-def test_a_token_that_expires_in_the_middle(hub: HubServer, root: Path) -> None:
+def test_a_token_that_expires_in_the_middle(hub: FakeHub, root: Path) -> None:
     hub.faults = [Fault("/commit/", status=401)]
     with pytest.raises(TransferError, match="expired or was revoked"):
         send(root)
@@ -128,7 +126,7 @@ def test_a_token_that_expires_in_the_middle(hub: HubServer, root: Path) -> None:
     assert stored(hub) == content(root)
 
 
-def test_what_is_not_there_is_named(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_what_is_not_there_is_named(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     with pytest.raises(TransferError, match="no such repository"):
         pull(HubDataset("me/none"), tmp_path / "e")
@@ -140,8 +138,8 @@ def test_what_is_not_there_is_named(hub: HubServer, root: Path, tmp_path: Path) 
     assert not (tmp_path / "e").exists()
 
 
-def test_without_network(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+def test_without_network(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
+    hub.is_down = True
     with pytest.raises(TransferError, match=r"cannot be reached.*HF_ENDPOINT"):
         send(root)
     with pytest.raises(TransferError, match="cannot be reached"):
@@ -151,7 +149,7 @@ def test_without_network(hub: HubServer, root: Path, tmp_path: Path, monkeypatch
         send(root)
 
 
-def test_a_private_repository_stays_so(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_private_repository_stays_so(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
     push(root, HubDataset("me/d", create=True, private=True))
     send(root)  # says nothing about it: fine
     with pytest.raises(TransferError, match="is private; public was requested"):
@@ -161,7 +159,7 @@ def test_a_private_repository_stays_so(hub: HubServer, root: Path, tmp_path: Pat
         pull(HubDataset("me/d"), tmp_path / "e")
 
 
-def test_branches_and_tags(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_branches_and_tags(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     first = stored(hub)
     with support.resume(root, video=True) as recorder:
@@ -181,7 +179,7 @@ def test_branches_and_tags(hub: HubServer, root: Path, tmp_path: Path) -> None:
         send(root, "seven")
 
 
-def test_two_pushes_at_once_do_not_mix(hub: HubServer, root: Path, monkeypatch) -> None:
+def test_two_pushes_at_once_do_not_mix(hub: FakeHub, root: Path, monkeypatch) -> None:
     send(root)
     remote = HubDataset("me/d", create=True)
     files = remote.files
@@ -198,7 +196,7 @@ def test_two_pushes_at_once_do_not_mix(hub: HubServer, root: Path, monkeypatch) 
         push(root, remote)
 
 
-def test_damage_on_the_way_is_noticed(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_damage_on_the_way_is_noticed(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     blob = next(blob for path, blob in hub.dataset("me/d").files().items() if path.startswith("data/"))
     honest = type(blob).sha256
@@ -222,7 +220,7 @@ def test_names() -> None:
 
 
 def test_loading_by_name_downloads_only_the_wanted_episodes(
-    hub: HubServer, root: Path, tmp_path: Path, monkeypatch
+    hub: FakeHub, root: Path, tmp_path: Path, monkeypatch
 ) -> None:
     send(root)
     hub.reset()
@@ -234,7 +232,7 @@ def test_loading_by_name_downloads_only_the_wanted_episodes(
     assert set(content(tmp_path / "two")) & recorded == files_of(root, [EPISODES - 1]) & recorded
 
 
-def test_loading_by_name_says_what_is_wrong(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_loading_by_name_says_what_is_wrong(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no such repository"):
         local_metadata("me/d", tmp_path / "e")
     send(root)
@@ -244,7 +242,7 @@ def test_loading_by_name_says_what_is_wrong(hub: HubServer, root: Path, tmp_path
         local_metadata("me/d", root, revision="main")
 
 
-def test_a_tag_of_a_release_does_not_move(hub: HubServer, root: Path) -> None:
+def test_a_tag_of_a_release_does_not_move(hub: FakeHub, root: Path) -> None:
     push(root, HubDataset("me/d", create=True, tag="one"))
     push(root, HubDataset("me/d", create=True, tag="one"))  # the same again
     with support.resume(root, video=True) as recorder:
@@ -254,9 +252,7 @@ def test_a_tag_of_a_release_does_not_move(hub: HubServer, root: Path) -> None:
     assert stored(hub) == stored(hub, "one") != content(root)
 
 
-def test_files_that_the_repository_ignores_are_named(
-    hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_the_repository_ignores_are_named(hub: FakeHub, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from huggingface_hub import HfApi
 
     preupload = HfApi.preupload_lfs_files
@@ -280,7 +276,7 @@ BROKEN: list[bytes | tuple[str, object]] = [
 ]  # fmt: skip
 
 
-def test_an_info_of_another_shape_is_refused_with_the_reason(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_an_info_of_another_shape_is_refused_with_the_reason(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     info = hub.dataset("me/d").files()[layout.INFO]
     whole = info.content

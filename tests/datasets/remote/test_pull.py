@@ -24,13 +24,13 @@ from bhd_lerobot.errors import (
 )
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
-from tests.hub_server.fixtures import EPISODES, send
-from tests.hub_server.server import Fault, HubServer
+from tests.fake_hub.fixtures import EPISODES, send
+from tests.fake_hub.hub import FakeHub, Fault
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
-def test_some_episodes_bring_only_their_files_and_load(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_some_episodes_bring_only_their_files_and_load(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     send(root)
@@ -55,14 +55,14 @@ def test_some_episodes_bring_only_their_files_and_load(hub: HubServer, root: Pat
     assert support.verify(target, EPISODES, video=True) == EPISODES
 
 
-def test_episodes_that_do_not_exist(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_episodes_that_do_not_exist(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     with pytest.raises(DatasetError, match=r"no episode 6.*from 0 to 5"):
         pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [6])
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_a_changed_dataset_is_not_overwritten_without_replace(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_changed_dataset_is_not_overwritten_without_replace(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     target = tmp_path / "e"
     pull(HubDataset("me/d"), target)
@@ -78,7 +78,7 @@ def test_a_changed_dataset_is_not_overwritten_without_replace(hub: HubServer, ro
     assert content(target) == content(root) | {"notes.txt": b"mine"}
 
 
-def test_folders_that_hold_something_else_are_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_folders_that_hold_something_else_are_never_replaced(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     (tmp_path / "like/data/chunk-000").mkdir(parents=True)
     (tmp_path / "like/data/chunk-000/file-777.parquet").write_text("mine")
@@ -96,7 +96,7 @@ def test_folders_that_hold_something_else_are_never_replaced(hub: HubServer, roo
         pull(HubDataset("me/d"), tmp_path / "file" / "below")
 
 
-def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_full_disk_is_seen_before_and_during(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
     send(root)
     usage = shutil.disk_usage(tmp_path)
     with monkeypatch.context() as patch:
@@ -116,7 +116,7 @@ def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_p
     assert content(tmp_path / "e") == content(root)
 
 
-def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     files = dict(hub.dataset("me/d").files())
     lost = next(path for path in files if path.startswith("videos/"))
@@ -133,7 +133,7 @@ def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: HubServer, 
     assert not hub.asked("GET .*/resolve/.*/data/")  # refused before everything was fetched
 
 
-def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_what_belongs_to_no_dataset_survives_an_exchange(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     """A dataset under version control, with links and folders of its own."""
     send(root)
     target = tmp_path / "e"
@@ -156,7 +156,7 @@ def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: P
     assert not (target / ".bhd-pull").exists()
 
 
-def test_files_that_hold_all_episodes_are_the_dataset(hub: HubServer, tmp_path: Path) -> None:
+def test_files_that_hold_all_episodes_are_the_dataset(hub: FakeHub, tmp_path: Path) -> None:
     packed, target = tmp_path / "packed", tmp_path / "e"
     with support.create(packed) as recorder:
         for _ in range(3):
@@ -170,7 +170,7 @@ def test_files_that_hold_all_episodes_are_the_dataset(hub: HubServer, tmp_path: 
     assert content(target) == content(packed)
 
 
-def test_another_pull_of_the_same_folder_is_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_another_pull_of_the_same_folder_is_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     (tmp_path / ".e.pull").mkdir()
     lock = RootLock(tmp_path / ".e.pull")
@@ -181,7 +181,7 @@ def test_another_pull_of_the_same_folder_is_refused(hub: HubServer, root: Path, 
     assert content(tmp_path / "e") == content(root)
 
 
-def test_metadata_without_the_files_of_episodes_are_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_metadata_without_the_files_of_episodes_are_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     files = hub.dataset("me/d").files()
     path = next(path for path in files if path.startswith("meta/episodes/"))
@@ -196,7 +196,7 @@ def test_metadata_without_the_files_of_episodes_are_refused(hub: HubServer, root
     assert not (tmp_path / "e").exists()
 
 
-def break_off(hub: HubServer, target: Path, path: str) -> None:
+def break_off(hub: FakeHub, target: Path, path: str) -> None:
     """Pull over what is there, and fail at one file."""
     hub.faults = [Fault(f"^(GET|HEAD) .*/resolve/.*/{path}", times=-1, status=403)]
     with pytest.raises(TransferError):
@@ -205,7 +205,7 @@ def break_off(hub: HubServer, target: Path, path: str) -> None:
 
 
 def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
-    hub: HubServer, root: Path, tmp_path: Path
+    hub: FakeHub, root: Path, tmp_path: Path
 ) -> None:
     send(root)
     target, old = tmp_path / "e", content(root)
@@ -223,7 +223,7 @@ def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
     assert content(target) == old
 
 
-def test_episodes_of_a_replaced_dataset_are_not_requested(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_episodes_of_a_replaced_dataset_are_not_requested(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     target = tmp_path / "e"
     pull(HubDataset("me/d"), target, select=lambda folder: [5])
@@ -235,7 +235,7 @@ def test_episodes_of_a_replaced_dataset_are_not_requested(hub: HubServer, root: 
     assert target.stat().st_mode & 0o777 == 0o700  # the permissions are kept
 
 
-def test_a_folder_named_by_dots_is_the_folder(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_folder_named_by_dots_is_the_folder(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
     send(root)
     pull(HubDataset("me/d"), tmp_path / "e")
     (tmp_path / "e" / layout.STATS).write_text("{}")

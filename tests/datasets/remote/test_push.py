@@ -1,7 +1,6 @@
 """What is pushed and what is not: the dataset that is checked before, and its card. To a Hub on this machine."""
 
 import shutil
-import threading
 from pathlib import Path
 
 import pytest
@@ -20,32 +19,26 @@ from bhd_lerobot.errors import (
 )
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
-from tests.hub_server.fixtures import send, stored
-from tests.hub_server.server import Fault, HubServer
+from tests.fake_hub.fixtures import send, stored
+from tests.fake_hub.hub import FakeHub, Fault
 
-pytest_plugins = ["tests.hub_server.fixtures"]
+pytest_plugins = ["tests.fake_hub.fixtures"]
 
 
-def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: HubServer, root: Path) -> None:
-    gate = threading.Event()
-    hub.faults = [Fault("^PUT", wait=gate)]
-
+def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: FakeHub, root: Path) -> None:
     def change() -> None:
         path = root / layout.STATS
         path.write_bytes(path.read_bytes() + b" ")
-        gate.set()
 
-    timer = threading.Timer(0.3, change)
-    timer.start()
+    hub.faults = [Fault("^PUT", meanwhile=change)]
     with pytest.raises(DatasetError, match=r"changed by another program.*meta/stats\.json"):
         send(root)
-    timer.join()
     assert stored(hub) == {}
     send(root)
     assert stored(hub) == content(root)
 
 
-def test_a_dataset_in_use_is_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_dataset_in_use_is_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     lock = RootLock(root)
     with pytest.raises(DatasetLockedError, match="in use"):
         send(root)
@@ -59,7 +52,7 @@ def test_a_dataset_in_use_is_refused(hub: HubServer, root: Path, tmp_path: Path)
     lock.release()
 
 
-def test_a_recording_is_refused_until_it_is_finalised(hub: HubServer, tmp_path: Path) -> None:
+def test_a_recording_is_refused_until_it_is_finalised(hub: FakeHub, tmp_path: Path) -> None:
     recorder = support.create(tmp_path / "d")
     support.record(recorder)
     with pytest.raises(DatasetLockedError, match="in use"):
@@ -72,7 +65,7 @@ def test_a_recording_is_refused_until_it_is_finalised(hub: HubServer, tmp_path: 
     assert stored(hub) == content(tmp_path / "d")
 
 
-def test_damaged_and_empty_datasets_are_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_damaged_and_empty_datasets_are_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     next((root / "data").rglob("*.parquet")).unlink()
     with pytest.raises(DatasetCorruptError, match="parquet"):
         send(root)
@@ -84,7 +77,7 @@ def test_damaged_and_empty_datasets_are_refused(hub: HubServer, root: Path, tmp_
     assert not hub.repositories
 
 
-def test_hidden_files_and_leftovers_stay_here(hub: HubServer, root: Path) -> None:
+def test_hidden_files_and_leftovers_stay_here(hub: FakeHub, root: Path) -> None:
     (root / ".cache").mkdir()
     (root / ".cache" / "x").write_text("x")
     (root / "notes.md").write_text("mine")
@@ -104,7 +97,7 @@ def made(text: str = "# made\n") -> MakeCard:
     return lambda state, has_image: card(f"{text}{has_image}")
 
 
-def test_a_generated_card_is_renewed_and_another_one_is_kept(hub: HubServer, root: Path) -> None:
+def test_a_generated_card_is_renewed_and_another_one_is_kept(hub: FakeHub, root: Path) -> None:
     send(root, make_card=made())
     assert stored(hub)["preview.png"] == b"image"
     assert not send(root, make_card=made("# made anew\n")).kept_card
@@ -116,7 +109,7 @@ def test_a_generated_card_is_renewed_and_another_one_is_kept(hub: HubServer, roo
         assert stored(hub)["README.md"] == edited
 
 
-def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_card_beside_the_dataset_is_the_card(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     for text, theirs in (("# my own\n", card().text), ("# newer\n", "# my own\n"), ("# newer\n", "# of somebody\n")):
         if hub.repositories:
             hub.dataset("me/d").files()["README.md"].content = theirs.encode()
@@ -132,7 +125,7 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_p
 
 
 def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
-    hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hub: FakeHub, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is not seen must not be removed at the other end."""
     copied = Path(shutil.copytree(root, tmp_path / "copied"))
@@ -148,7 +141,7 @@ def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
 
 
 @pytest.mark.parametrize("where", ["notes.txt", "data/chunk-000/file-000.parquet", "meta/info.json"])
-def test_a_link_to_the_outside_is_refused(hub: HubServer, root: Path, tmp_path: Path, where: str) -> None:
+def test_a_link_to_the_outside_is_refused(hub: FakeHub, root: Path, tmp_path: Path, where: str) -> None:
     """A copy would contain a file that is no part of the dataset, or lack one that is."""
     secret = tmp_path / "outside"
     if (root / where).exists():
@@ -167,7 +160,7 @@ def test_a_link_to_the_outside_is_refused(hub: HubServer, root: Path, tmp_path: 
     send(whole)
 
 
-def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_link_within_the_dataset_is_followed(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     (root / "notes.txt").write_text("mine")
     (root / "same.txt").symlink_to("notes.txt")
     root.rename(tmp_path / "real")
@@ -176,7 +169,7 @@ def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_p
     assert stored(hub)["same.txt"] == b"mine"
 
 
-def test_the_checksums_of_version_0_2_are_not_copied_and_go(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_the_checksums_of_version_0_2_are_not_copied_and_go(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     shelf = tmp_path / "shelf"
     push(root, StoreDataset(f"file://{shelf}"))
     (shelf / MANIFEST).write_text("{}")

@@ -19,7 +19,7 @@ from tests.datasets import support
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
 from tests.datasets.support import snapshot as content
 
-pytest_plugins = ["tests.datasets.remote.store_fixtures", "tests.hub_server.fixtures"]
+pytest_plugins = ["tests.datasets.remote.store_fixtures", "tests.fake_hub.fixtures"]
 
 
 @pytest.fixture

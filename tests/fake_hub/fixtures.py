@@ -1,10 +1,8 @@
 """Fixtures around the Hub of the tests; a test module takes them by `pytest_plugins`."""
 
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,30 +11,17 @@ from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.push import PushReport, push
 from bhd_lerobot.datasets.storage import layout
 from tests.datasets import support
-from tests.hub_server.client import real_client
-from tests.hub_server.server import HubServer
+from tests.fake_hub.hub import FakeHub, real_client
 
 EPISODES = 6
 
 
-@pytest.fixture(scope="session")
-def running_hub() -> Iterator[HubServer]:
-    """One server for all tests, with what they left there."""
-    with HubServer() as one:
-        yield one
-
-
 @pytest.fixture
-def hub(running_hub: HubServer) -> Iterator[HubServer]:
-    """An empty server, to which the real client is pointed; the client does not wait before it tries again."""
-    running_hub.reset()
-    running_hub.repositories.clear()
-    with real_client(running_hub) as patch:
-        # In the client alone: the tests themselves do wait.
-        hasty = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: None})
-        for module in ("utils._http", "file_download"):
-            patch.setattr(f"huggingface_hub.{module}.time", hasty)
-        yield running_hub
+def hub() -> Iterator[FakeHub]:
+    """An empty Hub, to which the real client speaks."""
+    made = FakeHub()
+    with real_client(made):
+        yield made
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +49,7 @@ def send(root: Path, branch: str | None = None, **options: Any) -> PushReport:
     return push(root, HubDataset("me/d", branch, create=True), **options)
 
 
-def stored(hub: HubServer, revision: str = "main") -> dict[str, bytes]:
+def stored(hub: FakeHub, revision: str = "main") -> dict[str, bytes]:
     """Return every file there but the one that the Hub makes."""
     files = hub.dataset("me/d").files(revision)
     return {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
