@@ -1,16 +1,4 @@
-from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-
-
-def test_every_reason_has_an_explanation_of_its_own() -> None:
-    explanations = {reason.explanation for reason in Reason}
-    assert len(explanations) == len(Reason)
-    assert min(map(len, explanations)) > 5
-
-
-def test_a_latch_is_explained_with_the_way_out_of_it() -> None:
-    for reason in (Reason.ESTOP, Reason.FAULT, Reason.NOT_ACTIVE):
-        assert "reset()" in reason.explanation
-        assert "activate()" in reason.explanation
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 
 
 def test_recorded_enum_values_are_stable() -> None:
