@@ -116,6 +116,11 @@ class Rig:
         if self._stopped:
             assert broken_limit(np.array(self._rows), np.array(self._stopped)) == ""
 
+    def bring_to_rest(self) -> None:
+        """Bring the arms to rest by other means, which no limit is held against."""
+        self.velocity[:] = self.acceleration[:] = 0.0
+        self._rows, self._stopped = [np.stack(self.reference)], []
+
     @property
     def history(self) -> Array:
         """Position, velocity and acceleration at each tick, shape (T, 3, n, 7)."""

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import pytest
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
@@ -51,7 +49,7 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
     one = KERNELS[name]
     kinds = re.findall(r"\w+(?:\[[^\]]*\])?", one.signature.partition("(")[2])
     rng = np.random.default_rng(0)
-    for _ in range(300):
+    for _ in range(100):
         plain = [drawn(kind, rng) for kind in kinds]
         compiled = [value.copy() if isinstance(value, np.ndarray) else value for value in plain]
         with np.errstate(all="ignore"):
@@ -140,12 +138,6 @@ def test_arrays_of_a_reading_are_not_replaced() -> None:
         reading.position = np.zeros((1, 3))
 
 
-def test_limits_may_be_whole_numbers() -> None:
-    body = turtlebot3_burger()
-    whole = replace(body, limits=replace(body.limits, velocity=(1, 2)))
-    assert BaseController(whole, 1, 100).command.tolist() == [[0.0, 0.0]]
-
-
 def start(cache: Path, **environment: str) -> subprocess.Popen:
     program = (
         "import numpy as np\n"
@@ -165,15 +157,12 @@ def start(cache: Path, **environment: str) -> subprocess.Popen:
 
 
 def test_processes_that_start_together_with_an_empty_cache_fill_it_once(tmp_path: Path) -> None:
-    outputs = [one.communicate() for one in [start(tmp_path) for _ in range(3)]]
+    outputs = [one.communicate() for one in [start(tmp_path) for _ in range(2)]]
     assert len({out for out, _ in outputs}) == 1
     assert outputs[0][0].startswith("[[0.03")
     assert all("Compiling the control loop" in err for _, err in outputs)
     assert start(tmp_path).communicate() == (outputs[0][0], "")  # it is loaded
-
-
-def test_without_a_cache_folder_it_compiles_and_as_plain_python_it_does_not(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
+    (tmp_path / "file").touch()  # no folder for a cache
     out, err = start(tmp_path / "file").communicate()
-    assert (out[:6], err.count("\n")) == ("[[0.03", 1)
+    assert (out, err.count("\n")) == (outputs[0][0], 1)
     assert start(tmp_path / "file", NUMBA_DISABLE_JIT="1").communicate() == (out, "")

@@ -20,7 +20,7 @@ PERIOD_S, FRAME_S = 1 / 500, 1 / 25
 
 def punctual(frames: int) -> FrameTiming:
     zeros = np.zeros(frames, np.float32)
-    return FrameTiming(np.arange(frames) * FRAME_S, zeros, zeros, np.zeros(frames, np.int64))
+    return FrameTiming(1000.0 + np.arange(frames) * FRAME_S, zeros, zeros, np.zeros(frames, np.int64))
 
 
 def changed(column: str, frame: int, value: float, frames: int = 10) -> FrameTiming:
@@ -67,13 +67,8 @@ def test_a_slow_sensor_is_no_fault() -> None:
 @pytest.mark.parametrize(("shift", "late"), [(0.49, []), (-0.49, []), (0.51, [6, 7]), (-0.51, [6, 7])])
 def test_a_frame_out_of_place_is_late_and_so_is_the_one_after(shift: float, late: list[int]) -> None:
     """An observation that is half a frame off makes the interval before it long and the one after it short."""
-    frames = changed("time", 6, (6 + shift) * FRAME_S)
+    frames = changed("time", 6, 1000.0 + (6 + shift) * FRAME_S)
     assert np.flatnonzero(late_frames(frames, TimingTolerance(), RATES)).tolist() == late
-
-
-def test_the_start_of_an_episode_is_no_jitter() -> None:
-    frames = replace(punctual(10), time=1000.0 + np.arange(10) * FRAME_S)
-    assert not late_frames(frames, TimingTolerance(), RATES).any()
 
 
 @given(
@@ -134,19 +129,15 @@ def test_an_episode_is_bad_above_the_share_and_not_at_it(share: float, frames: i
 
 
 def test_the_verdict_names_excess_and_remedy() -> None:
-    message = verdict(summary(9, 100, lateness_max=0.0123, age_max=0.002, skipped=14), TimingTolerance())
-    assert message is not None
-    assert "late by 12.30 ms (tolerated 1.00 ms)" in message
-    assert "14 control ticks were skipped" in message
-    assert "old by" not in message  # it was not exceeded
-    assert "bhd-doctor" in message
-    assert "--timing." in message
-    message = verdict(summary(9, 100, age_max=0.2), TimingTolerance())
-    assert message is not None
-    assert "old by 200.00 ms (tolerated 40.00 ms)" in message
-    message = verdict(summary(9, 100), TimingTolerance())
-    assert message is not None
-    assert "uneven intervals" in message
+    late = "late by 12.30 ms (tolerated 1.00 ms); 14 control ticks were skipped. Give"
+    for worst, words in (
+        ({"lateness_max": 0.0123, "age_max": 0.002, "skipped": 14}, late),  # the age was not exceeded
+        ({"age_max": 0.2}, "old by 200.00 ms (tolerated 40.00 ms)"),
+        ({}, "uneven intervals"),
+    ):
+        message = verdict(summary(9, 100, **worst), TimingTolerance())
+        assert message is not None
+        assert words in message
 
 
 def test_no_frames_and_no_wall_clock_are_never_bad() -> None:

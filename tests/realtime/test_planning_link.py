@@ -1,23 +1,21 @@
 """Plans from another process: what is asked for is what is planned, and what is played is never overwritten."""
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.body import HELD, Capsule
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
-from bhd_lerobot.control.motion.planning import MIN_LEAD
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
-from tests.control.goal_rig import ARM, HOME, HZ, Rig, joints, moved
-from tests.control.motion.test_goal_properties import actions, follow
+from tests.cases import each_case
+from tests.control.goal_rig import ARM, HOME, HZ, joints, moved
 from tests.control.support import shared_block
 from tests.forks import Fork
 from tests.realtime.mail_support import DURATION_S, RampPlanner, serve_plans
@@ -129,13 +127,18 @@ def test_a_trajectory_that_is_too_long_for_the_memory_is_a_failure() -> None:
             assert "there is room for 6 s" in plan.message
 
 
-def test_what_is_dropped_is_not_planned() -> None:
+def test_what_is_dropped_or_replaced_is_not_planned() -> None:
     link, server, planner, _ = linked()
     link.request(0, ramp(3), STATE, None, 0)
     link.drop(0)
     assert server.serve_once()
     assert planner.planned == []
     assert link.poll(0) is None
+    for ticks in (3, 5):
+        link.request(0, ramp(ticks), STATE, None, 0)
+    assert server.serve_once()
+    assert answer(link).trajectory.ticks == 5
+    assert len(planner.planned) == 1
 
 
 def test_an_answer_to_an_older_request_is_ignored() -> None:
@@ -157,17 +160,8 @@ def test_an_answer_to_an_older_request_is_ignored() -> None:
     assert len(planner.planned) == 2
 
 
-def test_a_newer_request_takes_the_place_of_one_that_was_not_dropped() -> None:
-    link, server, planner, _ = linked()
-    for ticks in (3, 5):
-        link.request(0, ramp(ticks), STATE, None, 0)
-    assert server.serve_once()
-    assert answer(link).trajectory.ticks == 5
-    assert len(planner.planned) == 1
-
-
-@pytest.mark.parametrize("number", [2**62, 2**63 - 1, -(2**63)])
-@pytest.mark.parametrize("field", ["request", "dropped", "answered"])
+@each_case("number", [2**62, 2**63 - 1, -(2**63)])
+@each_case("field", ["request", "dropped", "answered"])
 def test_numbers_that_another_process_wrote_cost_one_request_at_the_most(field: str, number: int) -> None:
     link, server, _, _ = linked()
     link.request(0, ramp(3), STATE, None, 0)
@@ -278,59 +272,12 @@ def test_another_process_plans(tmp_path: Path) -> None:
     assert process.wait() == 0
 
 
-class Scribbler(PlanServer):
-    """A planner's side that leaves garbage where it may write."""
-
-    def _plan(self, request: Any, capacity: int) -> Plan | PlanFailure:
-        self._memory.rows[int(request["block"])] = np.nan
-        return super()._plan(request, capacity)
-
-
-class LateLink(PlanningLink):
-    """A link whose planner answers at the k-th poll after a request."""
-
-    def __init__(self, latencies: list[int], lead: int) -> None:
-        block = bytearray(PlanningLink.nbytes(6, HZ, 6.0))
-        super().__init__(block, 6, HZ, lead_s=lead / HZ, timeout_s=0.4, duration_s=6.0)
-        self.server, self.latencies, self.left = Scribbler(block, PLANNER, duration_s=6.0), iter(latencies), 0
-
-    def request(self, *arguments: Any) -> None:
-        self.left = next(self.latencies, 1)
-        super().request(*arguments)
-
-    def poll(self, sim: int) -> Plan | PlanFailure | None:
-        self.left -= 1
-        if self.left <= 0:
-            self.server.serve_once()
-        return super().poll(sim)
-
-
-@settings(max_examples=30)
-@given(st.lists(actions, min_size=1, max_size=7), st.lists(st.integers(0, 300), max_size=10), st.integers(MIN_LEAD, 40))
-def test_whatever_happens_while_another_process_plans(script: list, latencies: list[int], lead: int) -> None:
-    rig = Rig(planning=LateLink(latencies, lead))
-    due = follow(rig, 0, script)
-    rig.run()  # checks position, speed, acceleration and jerk at every tick
-    results = rig.taken + rig.manager.take_results(0)
-    assert Counter(result.task_id for result in results) == +due
-    assert all(result.message for result in results)
-    assert not rig.velocity.any()
-
-
-def test_another_process_plans_for_one_arm_only() -> None:
+def test_what_cannot_be_is_refused() -> None:
     link, _, _, _ = linked()
     with pytest.raises(ConfigError, match="arm 1"):
         link.request(1, ramp(3), STATE, None, 0)
-
-
-def test_the_block_of_memory_has_the_stated_size() -> None:
-    size = PlanningLink.nbytes(6, 100, 2.0)
-    PlanningLink(bytearray(size), 6, 100, duration_s=2.0)
     with pytest.raises(ValueError, match="buffer"):
-        PlanningLink(bytearray(size - 1), 6, 100, duration_s=2.0)
-
-
-@pytest.mark.parametrize("timeout_s", [0.0, -1.0, np.nan, np.inf])
-def test_a_timeout_is_positive(timeout_s: float) -> None:
-    with pytest.raises(ConfigError, match="time-out is"):
-        PlanningLink(bytearray(PlanningLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)
+        PlanningLink(bytearray(PlanningLink.nbytes(6, 100, 2.0) - 1), 6, 100, duration_s=2.0)
+    for timeout_s in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match="time-out is"):
+            PlanningLink(bytearray(PlanningLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)

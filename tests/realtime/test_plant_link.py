@@ -59,21 +59,19 @@ class Rig:
         assert self.check(21) == PlantPhase.STOPPED
 
 
-def test_the_plant_gets_the_mode_with_the_commands() -> None:
-    rig = Rig()
-    for mode in (Mode.TRACKING, Mode.FAULT):
-        rig.remote.set_mode(np.array([mode], np.int8))
-        rig.send()
-        rig.check(1)
-        assert rig.guard.mode.tolist() == [mode]
-
-
-def test_a_plant_waits_until_it_is_commanded() -> None:
+def test_a_plant_waits_until_it_is_commanded_in_this_segment_and_gets_the_mode_with_the_commands() -> None:
     rig = Rig()
     assert [rig.check(5) for _ in range(10)] == [PlantPhase.WAITING] * 10
-    rig.send(3.0)
-    assert rig.check(1) == PlantPhase.DRIVEN
-    assert rig.guard.actuators.tolist() == [[3.0, 3.0]]
+    rig.send()
+    for mode in (Mode.TRACKING, Mode.FAULT):
+        rig.now += 5000 * MS  # a pause is no absence
+        rig.guard.begin()
+        assert rig.check(1) == PlantPhase.WAITING
+        rig.remote.set_mode(np.array([mode], np.int8))
+        rig.send(3.0)
+        assert rig.check(1) == PlantPhase.DRIVEN
+        assert rig.guard.actuators.tolist() == [[3.0, 3.0]]
+        assert rig.guard.mode.tolist() == [mode]
     assert rig.guard.stops == 0
 
 
@@ -108,6 +106,8 @@ def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
     assert rig.publish_state().safety.tolist() == [SafetyStatus.NORMAL]
     assert rig.check(1) == PlantPhase.STOPPED  # the commands so far acknowledge nothing
     rig.send()
+    assert rig.check(21) == PlantPhase.STOPPED  # nor do old ones
+    rig.send()
     assert rig.check(1) == PlantPhase.DRIVEN
     assert rig.guard.stops == 1
 
@@ -123,15 +123,6 @@ def test_a_command_from_the_future_drives_nothing_and_never_grows_fresh() -> Non
     assert rig.check(TIMEOUT / MS) == PlantPhase.STOPPED
 
 
-def test_an_old_command_acknowledges_nothing() -> None:
-    rig = Rig()
-    rig.stop()
-    rig.publish_state()
-    rig.remote.recover()
-    rig.send()
-    assert rig.check(21) == PlantPhase.STOPPED
-
-
 def test_an_acknowledgement_is_for_the_stops_that_were_seen() -> None:
     rig = Rig()
     rig.publish_state()
@@ -139,17 +130,6 @@ def test_an_acknowledgement_is_for_the_stops_that_were_seen() -> None:
     rig.stop()
     rig.send()
     assert rig.check(1) == PlantPhase.STOPPED
-
-
-def test_commands_of_an_earlier_segment_do_not_drive() -> None:
-    rig = Rig()
-    rig.send()
-    rig.guard.begin()
-    assert rig.check(1) == PlantPhase.WAITING
-    rig.send()
-    assert rig.check(1) == PlantPhase.DRIVEN
-    rig.guard.begin()
-    assert rig.check(1) == PlantPhase.WAITING
 
 
 def test_a_stop_outlasts_a_pause_and_ends_with_a_new_scene() -> None:
@@ -183,16 +163,6 @@ def test_a_plant_that_was_away_itself_stops_although_commands_are_fresh() -> Non
     assert rig.check() == PlantPhase.STOPPED
 
 
-def test_a_pause_is_no_absence() -> None:
-    rig = Rig()
-    rig.send()
-    rig.check()
-    rig.now += 5000 * MS
-    rig.guard.begin()
-    rig.send()
-    assert rig.check() == PlantPhase.DRIVEN
-
-
 def test_the_newest_plant_state_is_read_and_a_silent_plant_is_a_fault() -> None:
     rig = Rig()
     reading = PlantReading(1, 2, 3)
@@ -215,17 +185,7 @@ def test_reading_and_writing_never_wait_for_the_other_side() -> None:
     assert rig.guard.number == 80
 
 
-def test_sections_are_as_large_as_the_rings_need() -> None:
-    sizes = SHAPE.sections()
-    memory = {name: bytearray(size) for name, size in sizes.items()}
-    link = PlantLink(SHAPE, memory["plant_commands"], memory["plant_states"])
-    RemotePlant(link).write(np.ones((1, 2)))
-    again = PlantLink(PlantShape(**SHAPE.as_dict()), memory["plant_commands"], memory["plant_states"])
-    assert again.commands.latest()["actuators"].tolist() == [[1.0, 1.0]]  # type: ignore[index]
-    assert set(sizes) == {"plant_commands", "plant_states"}
-
-
-COUNT = 20_000
+COUNT = 5000
 
 
 def memory_of(path: Path) -> tuple[memoryview, memoryview]:
@@ -272,12 +232,13 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
     assert remote.refresh()["command"] == COUNT
 
 
-@pytest.mark.parametrize("misses", [0.02, 0.1, 0.3])
+@pytest.mark.thorough(but=1)
+@pytest.mark.parametrize("misses", [0.3, 0.1, 0.02])
 def test_a_plant_that_misses_commands_makes_them_up_gradually(misses: float) -> None:
     """An arm that sways near its largest speed; the plant does not look in some of the ticks."""
     arm, period = ur5(), 2 * MS
     limits = WireLimits.of(arm, 500)
-    for seed in range(10):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         link, clock = PlantLink(replace(SHAPE, joints=7)), [1000 * MS]
         remote = RemotePlant(link, lambda clock=clock: clock[0])  # type: ignore[misc]

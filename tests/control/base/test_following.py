@@ -9,6 +9,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.messages import Watchdog
 from bhd_lerobot.control.plant import PlantReading
+from tests.cases import each_case
 
 HZ, SECOND = 200, 1_000_000_000
 
@@ -62,24 +63,25 @@ def stop_at(
     return np.inf, controller
 
 
-@pytest.mark.parametrize(("latency", "motor"), [(0, 0), (0.1, 0.1), (0.2, 0.1), (0.3, 0.0), (0.05, 0.2), (0.2, 0.0)])
-@pytest.mark.parametrize("read_hz", [5, 20, 100])
+@each_case(("latency", "motor"), [(0, 0), (0.1, 0.1), (0.2, 0.1), (0.3, 0.0), (0.05, 0.2), (0.2, 0.0)])
+@each_case("read_hz", [5, 20, 100])
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_base_that_follows_within_its_latency_is_never_blocked(
     latency: float, motor: float, read_hz: float, seed: int
 ) -> None:
-    assert stop_at(30, latency=latency, motor=motor, read_hz=read_hz, seed=seed)[0] == np.inf
+    assert stop_at(20, latency=latency, motor=motor, read_hz=read_hz, seed=seed)[0] == np.inf
 
 
-@pytest.mark.parametrize("silence", [0.3, 0.35, 0.4, 0.45])
-@pytest.mark.parametrize("motor", [0.05, 0.1])
-@pytest.mark.parametrize("allowed", [0.0, 0.3])
+@each_case("silence", [0.3, 0.35, 0.4, 0.45])
+@each_case("motor", [0.05, 0.1])
+@each_case("allowed", [0.0, 0.3])
 def test_while_nothing_is_read_nothing_is_blocked(silence: float, motor: float, allowed: float) -> None:
-    assert stop_at(30, motor=motor * bool(allowed), allowed=allowed, silent=(1.5, silence))[0] == np.inf
+    assert stop_at(15, motor=motor * bool(allowed), allowed=allowed, silent=(1.5, silence))[0] == np.inf
 
 
-@pytest.mark.parametrize("allowed", [0.0, 0.1, 0.3, 0.6])
-@pytest.mark.parametrize("stamped", [True, False])
+@each_case("allowed", [0.0, 0.1, 0.3, 0.6])
+@each_case("stamped", [True, False])
 def test_wheels_that_stand_are_found_after_the_latency(allowed: float, stamped: bool) -> None:
     """From the first command on, which is 6 rad/s for 0.4 s; its ramp takes 0.1 s."""
     at, controller = stop_at(5, allowed=allowed, blocked_from=0.0, stamped=stamped, read_hz=HZ)

@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -45,6 +45,7 @@ def test_change(requested: np.ndarray, previous: np.ndarray, largest: np.ndarray
     assert in_place.tobytes() == out.tobytes()
 
 
+@settings(max_examples=50)
 @given(requested=NEAR, start=NEAR, largest=arrays(np.float64, (N, 2), elements=st.floats(0.05, 1)))
 def test_change_arrives_exactly_after_the_ticks_that_it_takes(
     requested: np.ndarray, start: np.ndarray, largest: np.ndarray
@@ -57,6 +58,7 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
     assert command.tobytes() == requested.tobytes()
 
 
+@settings(max_examples=25)
 @given(
     targets=arrays(np.float64, (6, N, 2), elements=st.sampled_from([-0.3, 0.0, 0.3]) | st.floats(-0.3, 0.3)),
     ticks=st.integers(1, 60),

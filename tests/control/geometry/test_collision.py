@@ -104,12 +104,9 @@ def test_distances_do_not_depend_on_the_batch() -> None:
         np.testing.assert_array_equal(grid.ravel(), all_)
 
 
-def test_an_empty_collision_check_returns_infinity() -> None:
+def test_without_capsules_nothing_is_near_and_unknown_ones_are_refused() -> None:
     nothing = CollisionModel(dataclasses.replace(CHAIN, capsules=(), disjoint=()))
     assert [float(distance) for distance in nothing.distances(HOME)] == [math.inf, math.inf]
-
-
-def test_unknown_capsules_are_refused() -> None:
     chain: ArmChain = dataclasses.replace(CHAIN, disjoint=(("base", "forarm"),))
     with pytest.raises(ConfigError, match=r"'forarm'.*Did you mean 'forearm'"):
         CollisionModel(chain)

@@ -15,6 +15,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 ARM = ur5(actuation="torque")
 DYNAMICS = ArmDynamics(ARM)
@@ -50,18 +51,9 @@ def test_it_agrees_with_the_engine(opening: float) -> None:
             terms.gravity[k], engine_at(POSTURES[k], 0 * SPEEDS[k], opening).qfrc_bias[:6], atol=1e-10
         )
     np.testing.assert_array_equal(still.coriolis @ np.ones(6), np.zeros((40, 6)))
-
-
-def test_it_agrees_with_the_closed_form_kinematics() -> None:
     kinematics = ArmKinematics(ARM.chain, ARM.limits)
-    np.testing.assert_allclose(TERMS.tool, kinematics.tool(POSTURES), atol=1e-12)
-    np.testing.assert_allclose(TERMS.jacobian, kinematics.jacobian(POSTURES), atol=1e-12)
-
-
-def test_the_mass_matrix_is_symmetric_and_heavier_than_the_rotors() -> None:
-    np.testing.assert_array_equal(TERMS.mass, TERMS.mass.swapaxes(1, 2))
-    links = TERMS.mass - np.diag([0.5, 0.5, 0.5, 0.15, 0.15, 0.15])
-    assert np.linalg.eigvalsh(links).min() > 0
+    np.testing.assert_allclose(terms.tool, kinematics.tool(POSTURES), atol=1e-12)
+    np.testing.assert_allclose(terms.jacobian, kinematics.jacobian(POSTURES), atol=1e-12)
 
 
 def test_the_coriolis_matrix_is_half_of_how_the_mass_matrix_changes() -> None:
@@ -90,19 +82,18 @@ def test_the_damped_mobility_has_an_inverse_in_a_singular_posture() -> None:
     assert np.linalg.eigvalsh(terms.mobility(1e-3)).min() == pytest.approx(1e-3, rel=1e-3)
 
 
-@pytest.mark.parametrize("opening", [-0.01, 0.1, float("nan")])
-def test_an_impossible_opening_is_refused(opening: float) -> None:
-    with pytest.raises(ConfigError, match="opening"):
-        ArmDynamics(at_home_open(opening))
-
-
-def test_a_body_that_does_not_fit_its_chain_is_refused() -> None:
-    with pytest.raises(ConfigError, match="it needs"):
-        ArmDynamics(replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="large"', 'name="knee" class="large"')))
-    with pytest.raises(ConfigError, match="not valid"):
-        ArmDynamics(replace(ARM, mjcf="<mujoco"))
-    with pytest.raises(ConfigError, match="has no site 'tool'"):
-        ArmDynamics(replace(ARM, mjcf=ARM.mjcf.replace('<site name="tool"', '<site name="tip"')))
+@each_case(
+    ("body", "message"),
+    [
+        *((at_home_open(opening), "opening") for opening in (-0.01, 0.1, float("nan"))),
+        (replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="large"', 'name="knee" class="large"')), "it needs"),
+        (replace(ARM, mjcf="<mujoco"), "not valid"),
+        (replace(ARM, mjcf=ARM.mjcf.replace('<site name="tool"', '<site name="tip"')), "has no site 'tool'"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(body: Arm, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ArmDynamics(body)
 
 
 def test_it_is_the_same_with_version_3_of_pinocchio(monkeypatch: pytest.MonkeyPatch) -> None:

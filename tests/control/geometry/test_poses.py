@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +26,7 @@ def wxyz(rotations: Rotation) -> np.ndarray:
     return np.roll(np.atleast_2d(rotations.as_quat()), 1, axis=1)
 
 
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_numbers_and_matrices_are_the_same_pose(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -34,6 +35,7 @@ def test_numbers_and_matrices_are_the_same_pose(seed: int) -> None:
     vectors = pose_vectors(matrices(rotations, positions))
     assert np.array_equal(vectors[:, :3], positions)
     assert np.allclose(np.linalg.norm(vectors[:, 3:], axis=1), 1, atol=1e-12)
+    assert (vectors[:, 3:] @ DOWN >= 0).all()
     assert np.abs((vectors[:, 3:] * wxyz(rotations)).sum(axis=1)) == pytest.approx(np.ones(50), abs=1e-12)
     for vector, matrix in zip(vectors, matrices(rotations, positions), strict=True):
         assert np.allclose(Pose(tuple(vector[:3]), tuple(vector[3:])).matrix(), matrix, atol=1e-12)
@@ -50,11 +52,6 @@ def test_no_turn_loses_precision() -> None:
         assert np.allclose(back, expected, atol=1e-12)
 
 
-def test_the_quaternion_is_in_the_half_space_of_a_tool_that_points_down() -> None:
-    rng = np.random.default_rng(0)
-    assert (pose_vectors(matrices(Rotation.random(500, rng=rng)))[:, 3:] @ DOWN >= 0).all()
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_near_the_tool_that_points_down_the_numbers_do_not_jump(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -64,12 +61,6 @@ def test_near_the_tool_that_points_down_the_numbers_do_not_jump(seed: int) -> No
     path = Rotation.from_rotvec(ends[0] + np.linspace(0, 1, 500)[:, None] * (ends[1] - ends[0]))
     vectors = pose_vectors(matrices(Rotation.from_euler("x", np.pi) * path))
     assert np.abs(np.diff(vectors[:, 3:], axis=0)).max() < 0.01
-
-
-def test_the_sign_flips_once_in_a_whole_turn() -> None:
-    yaw = np.linspace(-np.pi + 1e-3, np.pi - 1e-3, 1001)
-    path = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_euler("x", np.pi)
-    assert np.abs(np.diff(pose_vectors(matrices(path))[:, 3:], axis=0)).max() < 0.01
 
 
 def test_orientations_on_the_border_have_one_sign_only() -> None:

@@ -66,7 +66,7 @@ def follow(rig: Rig, sim: int, script: list) -> Counter:
     return due
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.lists(actions, min_size=1, max_size=6))
 @example([(("goal", {"joint_target": tuple(HOME[:6] + 0.3), "preempt": False}), 3), (("goal", {"gripper": 0.0}), 0)])
 def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:
@@ -82,7 +82,7 @@ def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:
     assert rig.manager.feedback(0) is None
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.lists(actions, min_size=1, max_size=4), st.lists(actions, min_size=1, max_size=3))
 def test_an_arm_moves_the_same_whatever_the_others_do(script: list, other: list) -> None:
     alone, crowding = Rig(), Rig(5)

@@ -18,7 +18,7 @@ BOX = np.array([[0.30, -0.35, 0.10], [0.65, 0.35, 0.50]])  # [m]
 
 def test_random_lines_keep_every_limit_and_are_nearly_as_quick_as_one_without_a_limit_of_the_jerk() -> None:
     rng, posture, ratios = np.random.default_rng(1), HOME, []
-    while len(ratios) < 16:
+    while len(ratios) < 10:
         goal = KINEMATICS.tool(posture)
         goal[:3, 3] = rng.uniform(*BOX)
         tool = ToolLimits(MAX_TOOL_SPEED, MAX_TOOL_ACCELERATION)

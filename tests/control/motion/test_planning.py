@@ -211,13 +211,11 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig.manager.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, "a setpoint")
         due = [("b", ResultCode.REPLACED_BY_SETPOINT)]
         assert not rig.manager.following.any()
-        rig.velocity[:] = rig.acceleration[:] = 0.0  # what follows setpoints brings it to rest
-        rig._rows, rig._stopped = [np.stack(rig.reference)], []
+        rig.bring_to_rest()  # as what follows setpoints does
     elif way == "restart":
         rig.manager.restart(np.array([0]))
         due = []
-        rig.velocity[:] = rig.acceleration[:] = 0.0
-        rig._rows, rig._stopped = [np.stack(rig.reference)], []
+        rig.bring_to_rest()
     elif way == "preempt":
         rig.go("c", joint_target=NEAR, preempt=True)
         due = [("b", ResultCode.PREEMPTED)]
@@ -245,10 +243,9 @@ def test_a_goal_in_a_brake_waits_for_its_end_or_preempts_it(preempt: bool) -> No
     rig, planning = rig_of(1, ticks=100)
     rig.manager.cancel(0, "a")
     rig.tick()
-    brake = rig.manager._player.remaining(0)
     rig.go("b", joint_target=NEAR, preempt=preempt)
     rig.tick(LEAD + 1)
-    assert brake > LEAD + 1
+    assert rig.velocity.any()  # the brake is longer
     assert (rig.phase == GoalPhase.EXECUTING and len(planning.states) == 2) == preempt
     rig.run()
     code = ResultCode.PREEMPTED if preempt else ResultCode.CANCELLED
@@ -258,7 +255,7 @@ def test_a_goal_in_a_brake_waits_for_its_end_or_preempts_it(preempt: bool) -> No
 latencies = st.lists(st.integers(1, 30) | st.integers(1, 2 * TIMEOUT) | st.just(NEVER), max_size=12)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.lists(actions, min_size=1, max_size=6), latencies, st.integers(MIN_LEAD, 40))
 def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     script: list, latencies: list[int], lead: int
@@ -276,7 +273,7 @@ def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     assert planning.out == {}
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(st.lists(actions, min_size=1, max_size=4), st.lists(actions, min_size=1, max_size=3), latencies)
 def test_arms_are_planned_for_independently_of_each_other(script: list, other: list, latencies: list[int]) -> None:
     rig = Rig(2, planning=LatePlanning(latencies))  # type: ignore[arg-type]
@@ -288,7 +285,7 @@ def test_arms_are_planned_for_independently_of_each_other(script: list, other: l
     assert Counter(result.task_id for result in rig.taken + rig.manager.take_results(0)) == +due
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.lists(actions, min_size=1, max_size=5))
 def test_inline_planning_is_the_default(script: list) -> None:
     plain, inline = Rig(), Rig(planning=InlinePlanning(PLANNER))
@@ -331,14 +328,8 @@ def test_a_goal_that_comes_while_setpoints_are_followed_begins_with_a_brake(late
     assert broken_limit(np.array(rows), np.zeros((len(rows) - 1, 1), np.bool_)) == ""
 
 
-@pytest.mark.parametrize(
-    ("hz", "lead_s", "ticks"), [(1000, 0.025, 25), (500, 0.025, 13), (100, 0.025, 5), (500, 1, 500)]
-)
-def test_a_lead_is_a_whole_number_of_ticks(hz: int, lead_s: float, ticks: int) -> None:
-    assert lead_ticks(hz, lead_s) == ticks
-
-
-@pytest.mark.parametrize("lead_s", [0.0, -1.0, np.nan, np.inf])
-def test_a_lead_is_positive(lead_s: float) -> None:
-    with pytest.raises(ConfigError, match="lead is"):
-        lead_ticks(500, lead_s)
+def test_a_lead_is_a_positive_whole_number_of_ticks() -> None:
+    assert [lead_ticks(*one) for one in ((1000, 0.025), (500, 0.025), (100, 0.025), (500, 1))] == [25, 13, 5, 500]
+    for lead_s in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match="lead is"):
+            lead_ticks(500, lead_s)

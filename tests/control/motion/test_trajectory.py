@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.motion import line as line_module
-from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
+from bhd_lerobot.control.motion.line import ToolLimits, along_line
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
 from bhd_lerobot.control.motion.trajectory import (
     MotionLimits,
@@ -89,7 +88,7 @@ def test_braking_keeps_the_limits_and_is_as_short_as_they_allow(start: State, ha
     assert trajectory.ticks <= np.ceil(bound.max() * HZ) + 1
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(states, postures, st.sampled_from((0.2, 0.5, 1.0)))
 def test_samples_agree_with_ruckig(start: State, target: Array, share: float) -> None:
     request = ruckig.InputParameter(6)
@@ -108,12 +107,9 @@ def test_samples_agree_with_ruckig(start: State, target: Array, share: float) ->
         assert np.abs(own - mine).max() < 1e-9
 
 
-def test_all_joints_arrive_together() -> None:
+def test_all_joints_arrive_together_and_an_arm_that_is_there_already_needs_one_tick() -> None:
     trajectory = planned(to_target(State.at_rest(np.zeros(6)), [1.0, 0.5, -0.3, 0.1, 2.0, 0.01], ARM, HZ))
     assert (trajectory.velocity[-2] != 0).all()
-
-
-def test_an_arm_that_is_there_already_needs_one_tick() -> None:
     trajectory = planned(to_target(State.at_rest(HOME[:6]), HOME[:6], ARM, HZ))
     assert trajectory.ticks == 1
     assert np.array_equal(trajectory.position, HOME[None, :6])
@@ -161,7 +157,7 @@ def test_a_trajectory_planned_anew_from_its_own_state_is_not_later() -> None:
     # The smallest case: its acceleration falls to zero at the limit of the speed.
     limits = MotionLimits(*(np.array([value]) for value in (1.0, 8.0, 80.0, -10.0, 10.0)))
     check(lambda state: to_target(state, [2.0], limits, HZ), State.at_rest([0.0]))
-    for number in range(150):
+    for number in range(50):
         dof = (1, 6)[number % 2]
         limits = random_limits(random, dof) if number % 3 else ARM[:dof].scaled(*random.uniform(0.1, 1.0, 2))
         goal = random.uniform(-3, 3, dof)
@@ -169,13 +165,13 @@ def test_a_trajectory_planned_anew_from_its_own_state_is_not_later() -> None:
         for start in begins:
             check(lambda state: to_target(state, goal, limits, HZ), start, 8)  # noqa: B023  used at once
         check(lambda state: to_rest(state, limits, HZ), begins[1], 4)  # noqa: B023
-    assert checked > 3000
+    assert checked > 1000
 
 
 def test_what_was_straight_is_straight_when_planned_anew() -> None:
     random = np.random.default_rng(1)
     straight = 0
-    for _ in range(40):
+    for _ in range(20):
         start, goal = random.uniform(-2, 2, (2, 6))
         way = (goal - start) / np.abs(goal - start).max()
         lead = int(np.abs(way).argmax())
@@ -194,7 +190,7 @@ def test_what_was_straight_is_straight_when_planned_anew() -> None:
             assert off(again) < 1e-6
             assert excess(state, again, ARM) < 1e-6
             assert np.array_equal(again.target, goal)
-    assert straight > 10
+    assert straight > 5
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -207,7 +203,7 @@ def test_non_finite_numbers_return_a_failure(bad: float) -> None:
         assert answer.message
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(*[st.floats(-1, 1)] * 4)
 def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: float, turn: float) -> None:
     goal = moved(0.2 * x, 0.3 * y, 0.15 * z, turn).matrix()
@@ -238,28 +234,13 @@ def test_a_line_keeps_the_jerk_of_joints_that_must_move_gently() -> None:
     gentle = dataclasses.replace(ARM, jerk=ARM.jerk / 5)
     random = np.random.default_rng(0)
     made = 0
-    for _ in range(40):
+    for _ in range(12):
         goal = KINEMATICS.tool(HOME[:6] + random.uniform(-1, 1, 6) * (2.0, 0.3, 0.6, 0.8, 1.2, 1.0))
         answer = along_line(HOME[:6], goal, KINEMATICS, (gentle, TOOL_LIMITS), HZ)
         if isinstance(answer, Trajectory):
             made += 1
             assert excess(State.at_rest(HOME[:6]), answer, gentle) < 1e-9
-    assert made > 20
-
-
-def test_a_line_takes_as_many_poses_as_it_needs_to_be_straight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_module, "_STEP", 1.0)
-    monkeypatch.setattr(line_module, "_TURN", 10.0)
-    line = Line(TOOL, moved(0.05, 0.25, 0.1, 1.0).matrix())
-    tools = KINEMATICS.tool(planned(along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).position)
-    way = (line.goal - line.start)[:3, 3] / line.length
-    beside = tools[:, :3, 3] - TOOL[:3, 3]
-    assert np.linalg.norm(beside - np.outer(beside @ way, way), axis=1).max() < 5e-5
-    # Where no number of poses suffices, the line is refused.
-    monkeypatch.setattr(line_module, "_DEVIATION", 0.0)
-    answer = along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
-    assert isinstance(answer, PlanFailure)
-    assert answer.code == ResultCode.SINGULAR
+    assert made > 6
 
 
 def test_a_slow_line_keeps_the_speed_of_the_tool() -> None:
@@ -282,7 +263,7 @@ def numbered(ticks: int, first: float) -> Trajectory:
     return Trajectory(rows, rows + 1000, rows + 2000)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 3000), st.integers(0, 2000)), max_size=12))
 def test_every_row_is_played_once_and_in_order(script: list[tuple[int, int, int]]) -> None:
     player = TrajectoryPlayer(4, 2)
