@@ -118,13 +118,10 @@ def one_cpu() -> tuple[int, ...]:
     return (min(os.sched_getaffinity(0)),)
 
 
-@pytest.mark.parametrize("priority", [0, 100, -1, True, 80.0])
-def test_a_priority_that_there_is_not_is_refused(priority: Any) -> None:
-    with pytest.raises(ConfigError, match=f"{priority!r}; it must be a whole number from 1 to 99"):
-        RealtimeSettings(priority=priority)
-
-
-def test_a_processor_that_there_is_not_is_refused() -> None:
+def test_a_priority_or_a_processor_that_there_is_not_is_refused() -> None:
+    for priority in (0, 100, -1, True, 80.0):
+        with pytest.raises(ConfigError, match=f"{priority!r}; it must be a whole number from 1 to 99"):
+            RealtimeSettings(priority=priority)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"processor\(s\) 4096; this process may run on .*Leave the affinity empty"):
         RealtimeSettings(affinity=(*one_cpu(), 4096))
 
@@ -202,7 +199,7 @@ def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(
     kernel: FakeKernel, settings: dict[str, Any], refused: set[str], parts: tuple[str, ...]
 ) -> None:
     with Privileges(kernel) as privileges:
-        grants = privileges.acquire(RealtimeSettings(**settings))
+        grants = privileges.acquire(RealtimeSettings(freeze_collector=False, **settings))
         assert {grant.name for grant in grants if not grant.granted} == refused
         assert all(bool(grant.remedy) != grant.granted for grant in grants)
         said = "\n".join(f"{grant.detail} {grant.remedy}" for grant in grants if not grant.granted)
@@ -212,37 +209,33 @@ def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(
     assert kernel.state == INITIAL
 
 
-def test_a_required_and_refused_scheduler_is_an_error_and_everything_is_given_back() -> None:
-    kernel = FakeKernel("scheduler", capabilities=())
-    with pytest.raises(RealtimeError, match=r"SCHED_FIFO priority 80.*refused.*setcap.*require_realtime = false"):
+class Broken(FakeKernel):
+    def timer_slack(self) -> int:
+        raise RuntimeError("planted")
+
+
+REQUIRED = r"SCHED_FIFO priority 80.*refused.*setcap.*require_realtime = false"
+
+
+@each_case(
+    ("kernel", "error"),
+    [(FakeKernel("scheduler", capabilities=()), (RealtimeError, REQUIRED)), (Broken(), (RuntimeError, "planted"))],
+)
+def test_after_an_error_everything_is_given_back(kernel: FakeKernel, error: tuple[type[Exception], str]) -> None:
+    with pytest.raises(error[0], match=error[1]):
         Privileges(kernel).acquire(RealtimeSettings(require=True))
     assert kernel.state == INITIAL
 
 
-def test_after_an_unexpected_error_everything_is_given_back() -> None:
-    class Broken(FakeKernel):
-        def timer_slack(self) -> int:
-            raise RuntimeError("planted")
-
-    kernel = Broken()
-    with pytest.raises(RuntimeError, match="planted"):
-        Privileges(kernel).acquire(RealtimeSettings())
-    assert kernel.state == INITIAL
-
-
 def test_acquiring_twice_is_an_error_and_again_after_a_release_is_not() -> None:
-    with Privileges(FakeKernel()) as privileges:
+    kernel = FakeKernel("clear the flag")
+    with Privileges(kernel) as privileges:
         privileges.acquire(RealtimeSettings())
         with pytest.raises(RealtimeError, match="call release"):
             privileges.acquire(RealtimeSettings())
         privileges.release()
         assert privileges.acquire(RealtimeSettings())[-1].granted
-
-
-def test_release_without_the_right_to_clear_the_flag() -> None:
-    kernel = FakeKernel("clear the flag")
-    with Privileges(kernel) as privileges:
-        privileges.acquire(RealtimeSettings())
+    # Without the right to clear it, a flag stays.
     assert kernel.state["scheduler"] == (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, 0)
 
 

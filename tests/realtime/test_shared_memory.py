@@ -2,10 +2,8 @@
 
 import os
 import shutil
-import signal
 import socket
-import subprocess
-import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,16 +13,8 @@ import pytest
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime import shared_memory
 from bhd_lerobot.realtime.shared_memory import SharedBlock, check_platform, names, sweep
-
-HOLD = """
-import sys, time
-from bhd_lerobot.realtime.shared_memory import SharedBlock
-block = SharedBlock.{how}
-memory = block.section("a")
-memory[0] = 7
-print("ready", flush=True)
-time.sleep(60)
-"""
+from tests.forks import Fork
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -37,16 +27,27 @@ def files(name: str) -> list[Path]:
     return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
 
 
-def hold(name: str, how: str) -> subprocess.Popen[str]:
-    process = subprocess.Popen([sys.executable, "-c", HOLD.format(how=how)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
+def hold_block(name: str, is_new: bool, begin: Path) -> None:
+    """Hold a block until this process is killed; say whether that was possible."""
+    until(begin.exists, "it may begin")
+    try:
+        block = SharedBlock.create(name, {"a": 8}, {}) if is_new else SharedBlock.attach(name)
+        block.section("a")[0] = 7
+        print("made", flush=True)
+    except RealtimeError as error:
+        print(error, flush=True)
+    time.sleep(600)
 
 
-def kill(process: subprocess.Popen[str]) -> None:
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+def held(name: str, folder: Path, *, is_new: bool = True, count: int = 1) -> Iterator[tuple[Fork, str]]:
+    """Yield processes that hold a block, and what they said, all of which began at once."""
+    number = len(list(folder.iterdir()))
+    begin, logs = folder / f"begin{number}", [folder / f"log{number}_{k}" for k in range(count)]
+    processes = [Fork(hold_block, name, is_new, begin, output=log) for log in logs]
+    begin.touch()
+    for process, log in zip(processes, logs, strict=True):
+        until(lambda log=log: log.read_text().endswith("\n"), "it has tried")
+        yield process, log.read_text()
 
 
 def test_sections_are_separate_zeroed_and_shared(name: str) -> None:
@@ -72,14 +73,14 @@ def test_sections_are_separate_zeroed_and_shared(name: str) -> None:
     assert not files(name)
 
 
-def test_a_block_survives_its_maker_and_is_swept_after_its_last_holder(name: str) -> None:
-    maker = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
-    other = hold(name, f"attach({name!r})")
-    kill(maker)
+def test_a_block_survives_its_maker_and_is_swept_after_its_last_holder(name: str, tmp_path: Path) -> None:
+    [(maker, _)] = held(name, tmp_path)
+    [(other, _)] = held(name, tmp_path, is_new=False)
+    maker.kill()
     assert sweep() == []
     with pytest.raises(RealtimeError, match="running already"):
         SharedBlock.create(name, {"a": 8}, {})
-    kill(other)
+    other.kill()
     assert len(files(name)) == 1
     assert name not in names()
     assert name in sweep()
@@ -155,12 +156,12 @@ def test_files_of_others_are_neither_read_nor_removed(name: str) -> None:
     real.close()
 
 
-def test_blocks_of_killed_runs_are_removed_and_live_blocks_stay(name: str) -> None:
+def test_blocks_of_killed_runs_are_removed_and_live_blocks_stay(name: str, tmp_path: Path) -> None:
     old = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-old"  # as version 0.1 called it
     other = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-notes"  # another program's
-    dead, living = (hold(f"{name}-{what}", f"create({f'{name}-{what}'!r}, {{'a': 8}}, {{}})") for what in "dl")
+    [(dead, _)], [(living, _)] = (list(held(f"{name}-{what}", tmp_path)) for what in "dl")
     try:
-        kill(dead)
+        dead.kill()
         (left,) = files(f"{name}-d")
         shutil.copy(left, old)
         old.chmod(0o600)
@@ -176,25 +177,14 @@ def test_blocks_of_killed_runs_are_removed_and_live_blocks_stay(name: str) -> No
         attached.close()
         block.close()
     finally:
-        kill(living)
+        living.kill()
         other.unlink(missing_ok=True)
 
 
-def test_of_several_simultaneous_creators_at_most_one_gets_the_name(name: str) -> None:
-    code = (
-        "import sys\nfrom bhd_lerobot.realtime.shared_memory import SharedBlock\nfrom bhd_lerobot.errors import "
-        "RealtimeError\nsys.stdin.read(1)\ntry:\n    block = SharedBlock.create(sys.argv[1], {'a': 8}, {})\n"
-        "    print('made', flush=True)\nexcept RealtimeError as error:\n    print(error, flush=True)\nsys.stdin.read(1)"
-    )
-    command = [sys.executable, "-c", code, name]
-    started = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(4)]
-    for process in started:
-        assert process.stdin is not None
-        process.stdin.write("x")
-        process.stdin.flush()
-    replies = [process.stdout.readline() if process.stdout else "" for process in started]
+def test_of_several_simultaneous_creators_at_most_one_gets_the_name(name: str, tmp_path: Path) -> None:
+    processes, replies = zip(*held(name, tmp_path, count=4), strict=True)
     assert replies.count("made\n") <= 1
     assert len(files(name)) == replies.count("made\n")
     assert all("running already" in line or line == "made\n" for line in replies), replies
-    for process in started:
-        process.communicate()
+    for process in processes:
+        process.kill()
