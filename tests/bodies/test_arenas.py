@@ -17,14 +17,13 @@ from bhd_lerobot.bodies.arenas import (
     Arena,
     make_arena,
     random_arena,
-    turtlebot3_world,
 )
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.scene import POOL_SIZE
 from tests.cases import each_case
 
-SEEDS = (*range(10), 2**31, 2**62 + 12345)
+SEEDS = (*range(5), 2**62 + 12345)
 made = functools.cache(random_arena)
 EVERY_ARENA = [("random", seed) for seed in SEEDS] + [(name, 0) for name in ARENAS if name != "random"]
 
@@ -66,26 +65,19 @@ def inner_corners(arena: Arena) -> np.ndarray:
     return np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
 
 
-@each_case("seed", SEEDS)
-def test_equal_seeds_give_equal_arenas(seed: int) -> None:
-    assert random_arena(seed) == made(seed)
-
-
-def test_different_seeds_give_different_arenas() -> None:
-    assert len({made(seed).shapes for seed in range(40)}) == 40
-    assert len({made(seed).start for seed in range(40)}) == 40
-
-
-@each_case(("name", "seed"), EVERY_ARENA)
-def test_it_fits_into_the_pool_of_a_world(name: str, seed: int) -> None:
-    arena = arena_of(name, seed)
-    assert len(arena.shapes) <= POOL_SIZE
+def test_equal_seeds_give_equal_arenas_and_others_do_not() -> None:
+    assert all(random_arena(seed) == made(seed) for seed in SEEDS)
+    for part in ("shapes", "start"):
+        assert len({getattr(made(seed), part) for seed in range(40)}) == 40
+    with pytest.raises(ConfigError, match="Did you mean 'turtlebot3_world'"):
+        make_arena("turtlebot_world", 0)
 
 
 @each_case(("name", "seed"), EVERY_ARENA)
-def test_it_is_closed(name: str, seed: int) -> None:
+def test_it_is_closed_and_fits_into_the_pool_of_a_world(name: str, seed: int) -> None:
     """The middle of every outer wall, walked once around: obstacle everywhere, without a gap."""
     arena = arena_of(name, seed)
+    assert len(arena.shapes) <= POOL_SIZE
     corners = inner_corners(arena)
     centre = corners.mean(axis=0)
     for a, b in itertools.pairwise([*corners, corners[0]]):
@@ -130,7 +122,7 @@ def test_all_free_space_is_connected(name: str, seed: int) -> None:
         assert tree.query(part)[0].max() <= RESOLUTION  # every free place is one that can be reached from the start
 
 
-@each_case("seed", range(6))
+@each_case("seed", range(3))
 def test_clearance_is_the_distance_to_the_outlines(seed: int) -> None:
     arena = made(seed)
     rng = np.random.default_rng(seed)
@@ -147,7 +139,7 @@ def test_clearance_is_the_distance_to_the_outlines(seed: int) -> None:
     assert (distance < 0).any()
 
 
-@each_case(("name", "seed"), [*EVERY_ARENA[:4], *EVERY_ARENA[-4:]])
+@each_case(("name", "seed"), [*EVERY_ARENA[:2], *EVERY_ARENA[-2:]])
 @each_case("size", [0.25, 0.4])
 def test_free_cells_are_cells_of_the_grid(name: str, seed: int, size: float) -> None:
     arena = arena_of(name, seed)
@@ -175,16 +167,6 @@ def test_cells_are_numbered_row_by_row_and_those_outside_are_clipped() -> None:
     assert arena.cell_of(points, 0.5).tolist() == [0, 1, 12, 143, 143, 0]
 
 
-def test_turtlebot3_world_has_nine_cylinders_on_a_grid() -> None:
-    arena = turtlebot3_world()
-    cylinders = [shape for shape in arena.shapes if shape.kind == "cylinder"]
-    assert {(round(s.x, 9), round(s.y, 9)) for s in cylinders} == set(itertools.product((-1.1, 0.0, 1.1), repeat=2))
-    assert {s.size_x for s in cylinders} == {0.15}
-    assert len(cylinders) == 9
-    assert arena.start[:2] == (-2.0, -0.5)
-    assert len(arena.shapes) == 9 + 6
-
-
 def test_random_arenas_differ_in_kind() -> None:
     """Posts, boxes, and walls of which corridors and dead ends are made: few of them in one arena, many in another."""
     shapes = [made(seed).shapes[4:] for seed in range(40)]
@@ -208,8 +190,3 @@ def test_a_random_start_is_free_and_reproducible(name: str) -> None:
         assert abs(y) < arena.extent[3]
         starts.add(arena.start)
     assert len(starts) == 20
-
-
-def test_an_unknown_arena_is_an_error_with_the_near_miss() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'turtlebot3_world'"):
-        make_arena("turtlebot_world", 0)

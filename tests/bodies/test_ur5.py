@@ -2,16 +2,13 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
-import pinocchio
 import pytest
 
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS, ur5
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 
@@ -56,13 +53,6 @@ def data(model: mujoco.MjModel) -> mujoco.MjData:
     return mujoco.MjData(model)
 
 
-@pytest.fixture(scope="module")
-def peer(tmp_path_factory: pytest.TempPathFactory) -> pinocchio.Model:
-    path: Path = tmp_path_factory.mktemp("ur5") / "ur5.xml"
-    path.write_text(BODY.mjcf, encoding="utf-8")
-    return pinocchio.buildModelFromMJCF(str(path))
-
-
 def postures(count: int, seed: int = 0) -> np.ndarray:
     """Random joint angles and finger positions, shape (count, 8)."""
     rng = np.random.default_rng(seed)
@@ -104,16 +94,6 @@ def test_masses_and_centres_of_mass_are_the_published_ones(model: mujoco.MjModel
             at = frame[:3, :3] @ centres[number] + frame[:3, 3]
             np.testing.assert_allclose(data.xipos[body], at, atol=1e-9)
     assert model.body_subtreemass[model.body("gripper").id] == pytest.approx(0.9)
-
-
-def test_inertias_are_those_of_bodies_as_large_as_the_links(model: mujoco.MjModel) -> None:
-    """The radius of gyration about no axis is longer than half the link."""
-    for joint, length in zip(JOINTS, (0.2, 0.6, 0.5, 0.15, 0.15, 0.1), strict=True):
-        body = model.joint(joint).bodyid[0]
-        inertia = model.body_inertia[body]
-        assert (inertia > 0).all()
-        assert 2 * inertia.max() <= inertia.sum()
-        assert np.sqrt(inertia / model.body_mass[body]).max() < length / 2
 
 
 def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -167,7 +147,7 @@ def clear_postures(count: int, margin: float = 0.05) -> np.ndarray:
 def clear() -> np.ndarray:
     # At full reach a payload bends the servos most.
     stretched = np.array([0.3, -0.02, 0.0, -math.pi / 2, 0.0, 0.0])
-    return np.vstack([stretched, clear_postures(29)])
+    return np.vstack([stretched, clear_postures(13)])
 
 
 def loaded_world(q: np.ndarray) -> tuple[World, Tabletop, np.ndarray]:
@@ -205,12 +185,12 @@ def test_the_servos_follow_with_velocity_feed_forward_and_within_their_torque(cl
         error = np.abs(world.qpos[untouched, :6] - clear[untouched] - swing)
         assert error.max() < 0.002
         assert (np.abs(torque[untouched, :6]) < TORQUE).all()
-    assert untouched.sum() > 10
+    assert untouched.sum() > 5
 
 
 def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray) -> None:
     for joint in range(6):
-        world, _, _ = loaded_world(clear)
+        world, _, _ = loaded_world(clear[:6])
         world.step(300)
         start = world.qpos[:, joint].copy()
         world.ctrl[:, joint] += 1e-3
@@ -239,26 +219,6 @@ def test_the_actuators_are_those_of_the_arm(actuation: str) -> None:
     for joint, torque in zip(JOINTS, TORQUE, strict=True):
         assert model.jnt_actfrcrange[model.joint(joint).id].tolist() == [-torque, torque]
         assert model.joint(joint).range.tolist() == [-2 * math.pi, 2 * math.pi]
-
-
-def test_with_pinocchios_gravity_as_torque_the_arm_hovers(peer: pinocchio.Model, clear: np.ndarray) -> None:
-    world = World(ur5(actuation="torque"), 10)
-    table = Tabletop(world)
-    start = np.hstack([clear[:10], np.full((10, 1), 0.05)])
-    table.place([TableScene("", (), tuple(q)) for q in start])
-    work = peer.createData()
-    held = world.ctrl.copy()
-    for sim in range(10):
-        gravity = pinocchio.computeGeneralizedGravity(peer, work, np.array([*start[sim, :6], 0.025, 0.025]))
-        np.testing.assert_allclose(held[sim, :6], gravity[:6], atol=1e-6)
-    for _ in range(200):
-        for sim in range(10):
-            world.ctrl[sim, :6] = pinocchio.computeGeneralizedGravity(peer, work, world.qpos[sim, :8].copy())[:6]
-        world.step()
-    assert np.abs(world.qpos[:, :6] - start[:, :6]).max() < 1e-3
-    world.ctrl[:, :6] = 0
-    world.step(100)
-    assert np.abs(world.qpos[:, :6] - start[:, :6]).max() > 0.1  # without torque it falls
 
 
 def test_the_gripper_opens_and_closes_with_its_fingers_in_step(clear: np.ndarray) -> None:
@@ -290,10 +250,3 @@ def test_the_pads_inner_faces_are_the_opening_apart(model: mujoco.MjModel, data:
         half = model.geom("pad_left").size[1]
         assert left + half == pytest.approx(-opening / 2, abs=1e-12)
         assert right - half == pytest.approx(opening / 2, abs=1e-12)
-
-
-def test_wrong_arguments_are_refused() -> None:
-    with pytest.raises(ConfigError, match="actuation"):
-        ur5(actuation="velocity")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="camera"):
-        ur5(camera_width=0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
-from bhd_lerobot.control.plant import PlantReading, SafetyStatus
+from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 
 HZ = 500
@@ -80,27 +80,6 @@ def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float, 
     assert not check.problem
 
 
-@pytest.mark.parametrize("turns", [-1, 1, 2])
-def test_angles_that_are_wrapped_are_named_as_such(turns: int) -> None:
-    check, reading = made()
-    reading.position[0, 0] = -turns * np.pi
-    assert check.wrong_positions(reading, 0) is None
-    reading.position[0, 0] += turns * 2 * np.pi + 0.001
-    assert check.wrong_positions(reading, PERIOD) is not None
-    assert "shoulder_pan reads a change of" in check.problem
-    assert "its angles are wrapped" in check.problem
-
-
-def test_a_robot_in_a_stop_of_its_own_may_be_moved() -> None:
-    check, reading = made()
-    assert check.wrong_positions(reading, 0) is None
-    reading.safety[0] = SafetyStatus.STOPPED
-    reading.position[0] += 0.5
-    assert check.wrong_positions(reading, PERIOD) is None
-    reading.safety[0] = SafetyStatus.NORMAL
-    assert check.wrong_positions(reading, 2 * PERIOD) is None
-
-
 def test_wheels_have_no_end_and_no_jumps() -> None:
     check, reading = ReadingCheck(turtlebot3_burger(), 1, 200), PlantReading(1, 2)
     for tick in range(2000):
@@ -108,18 +87,6 @@ def test_wheels_have_no_end_and_no_jumps() -> None:
         assert check.wrong_positions(reading, tick * NANOSECONDS // 200) is None
     reading.position[0, 1] = 0.0  # a counter that overflowed, or a board that was started anew
     assert check.wrong_positions(reading, 10 * NANOSECONDS) is not None
-
-
-def test_both_sides_of_an_age_are_checked() -> None:
-    now = 10**15
-    for age, is_wrong in ((0, False), (3, False), (3.01, True), (-1, False), (-1.01, True), (-5000, True)):
-        check = ReadingCheck(ur5(), 1, HZ)
-        stamp = np.array([now - round(age * PERIOD)])
-        assert (check.wrong_times(stamp, stamp, now) is not None) == is_wrong
-    assert check.problem == (
-        "a stamp is 10.000 s ahead of now: of another clock. Stamps are of the monotonic clock of this machine "
-        "(time.monotonic_ns)"
-    )
 
 
 def moving(check: ReadingCheck, reading: PlantReading, spoil: Callable[[int], None], ticks: int = 300) -> int | None:

@@ -15,10 +15,8 @@ from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Setpoint, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 from tests.control import arm_rig, support
 from tests.control.arm.test_impedance import ARM as TORQUE_ARM
@@ -297,11 +295,6 @@ def test_a_plant_that_takes_twists_moves_as_one_that_takes_wheel_speeds() -> Non
             np.testing.assert_allclose(twists.plant.velocity, wheels.plant.velocity, atol=1e-12)
     np.testing.assert_allclose(twists.plant.position, wheels.plant.position, atol=1e-9)
     assert np.abs(wheels.plant.position).max() > 1.0
-
-
-def test_an_arm_takes_no_twists() -> None:
-    with pytest.raises(ConfigError, match=r"takes twists \(Plant.takes\), and the body 'ur5' is no base"):
-        WireLimits.of(ARM, arm_rig.HZ, "twist")
 
 
 @pytest.mark.parametrize(("turns", "is_fault"), [(1.0, False), (0.8, False), (0.0, True), (-1.0, True), (2.5, True)])

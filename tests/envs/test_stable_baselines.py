@@ -66,18 +66,6 @@ def test_another_autoreset_mode_is_refused() -> None:
     env.close()
 
 
-def test_a_learner_of_stable_baselines3_learns_in_it() -> None:
-    from stable_baselines3 import PPO
-
-    from bhd_lerobot.envs.stable_baselines import BhdSb3VecEnv
-
-    env = BhdSb3VecEnv(BhdVectorEnv(4, "TurtleBot3Avoid-v0", autoreset_mode="Disabled", **OPTIONS))
-    model = PPO("MultiInputPolicy", env, seed=0, n_steps=16, batch_size=32, n_epochs=1, device="cpu").learn(64)
-    assert model.num_timesteps == 64
-    assert len(model.ep_info_buffer or ()) >= 4
-    env.close()
-
-
 @pytest.fixture
 def four() -> Iterator[Any]:
     from bhd_lerobot.envs.stable_baselines import BhdSb3VecEnv

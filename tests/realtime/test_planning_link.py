@@ -1,5 +1,6 @@
 """Plans from another process: what is asked for is what is planned, and what is played is never overwritten."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -89,19 +90,14 @@ def test_what_the_gripper_holds_arrives() -> None:
             assert plan.message.startswith("On the way what the gripper holds comes within")
 
 
-def test_a_failure_arrives_with_its_words() -> None:
+def test_a_planner_that_fails_or_raises_fails_one_goal_and_plans_the_next(caplog: pytest.LogCaptureFixture) -> None:
     link, server, _, _ = linked()
     link.request(0, ramp(3, max_velocity=0.25), STATE, None, 0)
     server.serve_once()
     failure = link.poll(0)
     assert isinstance(failure, PlanFailure)
     assert failure.code == ResultCode.UNREACHABLE
-    assert failure.message.startswith("0.25 is what was asked for. éé")
-    assert failure.message.endswith("é…")
-
-
-def test_a_planner_that_raises_fails_one_goal_and_plans_the_next(caplog: pytest.LogCaptureFixture) -> None:
-    link, server, _, _ = linked()
+    assert re.match(r"0.25 is what was asked for\. é+…$", failure.message)
     link.request(0, ramp(3, max_acceleration=1.0), STATE, None, 0)
     assert server.serve_once()
     failure = link.poll(0)

@@ -1,7 +1,6 @@
 """A cerebellum and a plant in two processes: the plant judges commands by their age, and stops are latched."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
-from tests.control.support import shared_block
-from tests.forks import Fork
 
 SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, sensors=3, capacity=4)
 MS = 1_000_000
@@ -183,53 +180,6 @@ def test_reading_and_writing_never_wait_for_the_other_side() -> None:
     assert rig.check() == PlantPhase.DRIVEN
     assert rig.guard.actuators.tolist() == [[79.0, 79.0]]
     assert rig.guard.number == 80
-
-
-COUNT = 5000
-
-
-def memory_of(path: Path) -> tuple[memoryview, memoryview]:
-    whole = memoryview(shared_block(path))
-    size = SHAPE.sections()["plant_commands"] // 64 * 64 + 64
-    return whole[:size], whole[size:]
-
-
-def write_commands(path: Path) -> None:
-    """Write commands that are full of their number, and states of which the same is true."""
-    link = PlantLink(SHAPE, *memory_of(path))
-    plant = RemotePlant(link)
-    state = np.zeros((), SHAPE.state_dtype)
-    for number in range(1, COUNT + 1):
-        plant.write(np.full((1, 2), float(number)))
-        state["command"] = number
-        state["observation"] = number
-        link.states.publish(state)
-
-
-def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: Path) -> None:
-    path = tmp_path / "block"
-    path.write_bytes(bytes(sum(SHAPE.sections().values()) + 128))
-    link = PlantLink(SHAPE, *memory_of(path))
-    guard = CommandGuard(link, 10**12, anything(), MS)
-    remote = RemotePlant(link)
-    process = Fork(write_commands, path)
-    try:
-        seen, newest = 0, 0
-        while guard.number < COUNT or len(link.states) < COUNT:
-            assert process.poll() in (None, 0)
-            guard.check(0, np.zeros((1, 2)))
-            assert guard.number >= newest
-            newest = guard.number
-            assert guard.actuators.tolist() == [[float(newest)] * 2]
-            state = remote.refresh()
-            if state is not None:
-                assert (state["observation"] == state["command"]).all()
-                seen += 1
-        assert process.wait() == 0
-    finally:
-        process.kill()
-    assert seen > 0
-    assert remote.refresh()["command"] == COUNT
 
 
 @pytest.mark.thorough(but=1)

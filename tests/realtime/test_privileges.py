@@ -249,28 +249,12 @@ def test_a_collector_that_was_off_stays_off() -> None:
         gc.enable()
 
 
-# Gives up the right to real-time priorities, as an ordinary user has none. Needs no right itself.
-GIVE_UP = """
-    import ctypes, resource
-    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
-    resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
-    libc = ctypes.CDLL(None, use_errno=True)
-    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # version 3, this thread
-    data = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; twice 32 bits
-    assert libc.capget(header, data) == 0
-    for bit in (14, 23):
-        data[0] &= ~(1 << bit)
-        data[1] &= ~(1 << bit)
-    assert libc.capset(header, data) == 0, ctypes.get_errno()
-"""
-START = """
+REPORT = """
     import gc, json, os, sys
     from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
     from bhd_lerobot.realtime.privileges import SystemCalls
     calls = SystemCalls()
     before = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
-"""
-REPORT = """
     privileges = Privileges()
     grants = privileges.acquire(RealtimeSettings(affinity=(min(os.sched_getaffinity(0)),)))
     during = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
@@ -294,34 +278,11 @@ REPORT = """
 """
 
 
-def report(*parts: str) -> dict[str, Any]:
-    program = "".join(textwrap.dedent(part) for part in parts)
-    root = Path(__file__).resolve().parents[2]
+def test_a_process_has_what_its_grants_say_and_gives_it_back() -> None:
+    root, program = Path(__file__).resolve().parents[2], textwrap.dedent(REPORT)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def test_a_process_without_the_right_falls_back_and_names_the_remedy() -> None:
-    result = report(GIVE_UP, START, REPORT)
-    scheduler = result["grants"]["scheduler"]
-    assert not scheduler["granted"]
-    assert "Operation not permitted" in scheduler["detail"]
-    assert "SCHED_OTHER with a timer slack of 1 ns" in scheduler["detail"]
-    assert "setcap cap_sys_nice" in scheduler["remedy"]
-    assert result["during"][:2] == [[os.SCHED_OTHER, 0], 1]
-    assert result["after"] == result["before"]
-    memory = result["grants"]["memory lock"]
-    assert not memory["granted"]  # no interpreter fits into 64 KiB
-    assert "64 KiB" in memory["detail"]
-    assert result["kilobytes"] == 0
-    # What needs no right is granted all the same.
-    assert all(result["grants"][name]["granted"] for name in ("affinity", "collector", "timer slack"))
-    assert result["collecting"] == [False, True]
-
-
-def test_a_process_has_what_its_grants_say_and_gives_it_back() -> None:
-    result = report(START, REPORT)
+    result = json.loads(done.stdout)
     grants = result["grants"]
     assert list(grants) == ["affinity", *NAMES]
     assert all(bool(grant["remedy"]) != grant["granted"] for grant in grants.values())

@@ -14,6 +14,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.conformance import ConformanceError, check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.cases import each_case
 from tests.robots.fake_feetech import START, so101
 
 
@@ -223,8 +224,9 @@ def config(tmp_path: Path) -> RobotConfig:
     return TurtleBot3Config(calibration_dir=tmp_path)
 
 
-def test_a_good_robot_passes(config):
+def test_a_good_robot_passes_and_shared_images_are_a_finding(config):
     assert check_robot(lambda: GoodRobot(config), adversarial=True) == ()
+    assert "shared the memory of 'eye'" in check_robot(lambda: broken(config, SHARED_IMAGE))[0]
 
 
 def test_names_that_lerobot_rollout_drops_are_a_finding(config):
@@ -240,63 +242,14 @@ def test_names_that_lerobot_rollout_drops_are_a_finding(config):
     assert "'a.vel'" not in finding
 
 
-@pytest.mark.parametrize("name", [*BROKEN, *ADVERSARIAL])
+@each_case("name", [*BROKEN, *ADVERSARIAL])
 def test_a_broken_robot_is_found(name, config):
     message, changes = (BROKEN | ADVERSARIAL)[name]
     with pytest.raises(ConformanceError, match=message):
         check_robot(lambda: broken(config, changes), adversarial=name in ADVERSARIAL)
 
 
-class MockRobot(GoodRobot):
-    """As in LeRobot's own tests: it returns the dict that it was given, and refuses a second `disconnect`."""
-
-    name = "mock_robot"
-    observation_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
-    action_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
-
-    def __init__(self, config: RobotConfig) -> None:
-        super().__init__(config)
-        self.cameras = {}
-        self.arrived: list[dict[str, float]] = []
-
-    def get_observation(self) -> dict[str, Any]:
-        check_connected(self)
-        return dict.fromkeys(self.observation_features, 40.0)
-
-    def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        self.arrived.append(dict(action))
-        check_connected(self)
-        return action
-
-    def disconnect(self) -> None:
-        check_connected(self)
-        self._on = False
-
-
-def test_lerobots_mock_robot_gets_findings_and_only_holding_actions(config):
-    made: list[MockRobot] = []
-
-    def make() -> MockRobot:
-        made.append(MockRobot(config))
-        return made[-1]
-
-    findings = check_robot(make)
-    assert len(findings) == 1
-    assert "disconnect() a second time raises DeviceNotConnectedError" in findings[0]
-    assert len(made[0].arrived) == 3 + 2 + 1  # the last one without a connection
-    for robot in made:
-        assert all(set(action.values()) == {40.0} for action in robot.arrived)
-        assert not robot.is_connected
-    given = {"motor_0.pos": 1.0, "motor_1.pos": 2.0, "motor_2.pos": 3.0}
-    check_robot(make, given)
-    assert all(action == given for robot in made[2:] for action in robot.arrived)
-    assert given == {"motor_0.pos": 1.0, "motor_1.pos": 2.0, "motor_2.pos": 3.0}
-    with pytest.raises(ConformanceError, match=r"took nan for 'motor_0.pos'"):
-        check_robot(make, adversarial=True)
-    assert not made[-1].is_connected
-
-
-@pytest.mark.parametrize("options", [{}, {"use_degrees": False}, {"max_relative_target": 5.0}], ids=str)
+@pytest.mark.parametrize("options", [{"use_degrees": False}, {"max_relative_target": 5.0}], ids=str)
 def test_lerobots_so101_stays_where_it_is(options, tmp_path, monkeypatch):
     make, buses = so101(tmp_path, monkeypatch, **options)
     findings = check_robot(make)
@@ -314,31 +267,30 @@ def test_lerobots_so101_stays_where_it_is(options, tmp_path, monkeypatch):
 
 
 def test_invalid_trial_actions_are_refused_before_connecting(config):
-    made: list[MockRobot] = []
+    arrived: list[dict[str, float]] = []
 
-    def make() -> MockRobot:
-        made.append(MockRobot(config))
-        return made[-1]
+    class Noting(GoodRobot):
+        def send_action(self, action: dict[str, float]) -> dict[str, float]:
+            arrived.append(action)
+            return super().send_action(action)
+
+    class Blind(Noting):
+        action_features: ClassVar[dict[str, Any]] = {"c.pos": float, "b.vel": float}
 
     for bad in (math.nan, math.inf):
-        with pytest.raises(ConfigError, match=f"'motor_1.pos': {bad}"):
-            check_robot(make, {"motor_0.pos": 1.0, "motor_1.pos": bad, "motor_2.pos": 3.0})
-    assert not any(robot.arrived for robot in made)
-
-    class Blind(MockRobot):
-        observation_features: ClassVar[dict[str, Any]] = {"motor_0.pos": float}
-
+        with pytest.raises(ConfigError, match=f"'b.vel': {bad}"):
+            check_robot(lambda: Noting(config), {"a.vel": 1.0, "b.vel": bad})
     blind = Blind(config)
-    with pytest.raises(ConfigError, match=r"does not observe 'motor_1.pos', 'motor_2.pos'"):
+    with pytest.raises(ConfigError, match=r"does not observe 'c.pos'"):
         check_robot(lambda: blind)
-    assert not blind.arrived
+    assert not arrived
     assert not blind.is_connected
 
 
 def test_after_an_error_the_robot_is_disconnected_and_the_error_stays(config):
-    class Stuck(MockRobot):
+    class Stuck(GoodRobot):
         def get_observation(self):
-            return {**super().get_observation(), "motor_0.pos": math.nan}
+            return {**super().get_observation(), "a.pos": math.nan}
 
         def disconnect(self):
             raise OSError("no such device")
@@ -348,15 +300,7 @@ def test_after_an_error_the_robot_is_disconnected_and_the_error_stays(config):
     assert "no such device" in caught.value.__notes__[0]
 
 
-def test_shared_images_are_a_finding(config):
-    assert "shared the memory of 'eye'" in check_robot(lambda: broken(config, SHARED_IMAGE))[0]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"beams": 36, "odometry": True, "imu": True}, {"beams": 1, "lidar_noise_std": 0.0, "fps": 50}],
-    ids=str,
-)
+@each_case("options", [{"odometry": True, "imu": True}, {"beams": 1, "lidar_noise_std": 0.0, "fps": 50}])
 def test_turtlebot3_keeps_the_contract(options, tmp_path):
     findings = check_robot(
         lambda: TurtleBot3(TurtleBot3Config(calibration_dir=tmp_path, **options)),

@@ -10,9 +10,7 @@ import pytest
 from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.rotations import rotation_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
-from bhd_lerobot.errors import SimulationError
-from bhd_lerobot.sim.world import World
-from tests.robots.impedance_rig import ARM, START, WALL, Rig
+from tests.robots.impedance_rig import ARM, START, Rig
 
 ROOT = Path(__file__).resolve().parents[2]
 EFFORT = np.array(ARM.limits.effort[:6])
@@ -67,16 +65,6 @@ def test_it_pushes_on_a_rigid_wall_until_no_commands_come_and_lets_go_cleanly() 
 
 
 @pytest.mark.thorough
-def test_a_push_by_the_spring_alone() -> None:
-    """Stiffness times depth, of an equilibrium behind the wall."""
-    rig = Rig(wall=True)
-    rig.move((0.07, 0, 0), 0.1)
-    rig.approach(0.02)
-    rig.target[:, 0] = rig.log["tool"][-1][0] + 10 / 500
-    rig.keep(1.2)
-    assert abs(rig.log["force"][-1][0] + 10) < 0.5
-
-
 def test_a_wall_in_the_way_of_a_far_target_is_pushed_no_harder_than_allowed() -> None:
     rig = Rig(wall=True, compliance=Compliance(max_force=30.0))
     rig.move((0.07, 0, 0), 0.1)
@@ -126,6 +114,7 @@ def test_an_emergency_stop_in_motion_ends_near_to_where_it_was_pressed() -> None
     assert rig.bridge.reset().accepted.all()
 
 
+@pytest.mark.thorough
 def test_a_stop_in_motion_brakes_the_equilibrium_and_holds_it_where_it_stops() -> None:
     rig = Rig()
     rig.move((0, -0.15, 0), 0.25)
@@ -182,6 +171,7 @@ def test_a_free_response_loses_energy_in_every_tick(damping: tuple[float, ...] |
     assert energies[-1] < 1e-3 * energies[0]
 
 
+@pytest.mark.thorough
 def test_no_contact_is_felt_in_free_motion_at_full_speed() -> None:
     rig = Rig()
     rig.move((0, -0.25, 0), 0.25)
@@ -208,6 +198,7 @@ def test_a_stretched_arm_stays_calm() -> None:
     np.testing.assert_allclose(rig.log["tool"][-1], START, atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_one_of_several_arms_does_bit_for_bit_what_one_does() -> None:
     logs = []
     for n in (1, 3):
@@ -217,13 +208,6 @@ def test_one_of_several_arms_does_bit_for_bit_what_one_does() -> None:
         rig.keep(0.2)
         logs.append(np.concatenate([rig.logged(name) for name in ("tool", "estimate", "torque", "command")], axis=1))
     assert logs[0].tobytes() == logs[1].tobytes()
-
-
-def test_a_base_has_no_fixtures() -> None:
-    from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-
-    with pytest.raises(SimulationError, match="Fixtures"):
-        World(turtlebot3_burger(), fixtures=(WALL,))
 
 
 @pytest.mark.thorough

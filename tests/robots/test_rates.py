@@ -11,6 +11,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from tests.cases import each_case
 
 # Ticks and physics steps a second.
 RATES = ((25, 500), (25, 150), (150, 150), (100, 200), (100, 500), (125, 500), (250, 500), (500, 500), (500, 1000))
@@ -61,7 +62,7 @@ def test_at_any_rates_an_arm_that_presses_on_something_stops(control_hz: int, ph
     assert np.linalg.norm(felt) < LIGHT_N
 
 
-@pytest.mark.thorough(but=3)
+@pytest.mark.thorough(but=2)
 @pytest.mark.parametrize("kicked", range(6))
 @pytest.mark.parametrize(("control_hz", "physics_hz"), [(25, 150), (150, 150), (25, 500)])
 def test_at_any_rates_that_are_accepted_a_kick_dies_down(control_hz: int, physics_hz: int, kicked: int) -> None:
@@ -90,22 +91,15 @@ RATES_REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("config", RATES_REFUSED)
+@each_case("config", RATES_REFUSED)
 def test_rates_at_which_it_would_shake_are_refused_with_the_nearest_that_work(config: type) -> None:
     for (control_hz, physics_hz, fps), near in RATES_REFUSED[config].items():
         with pytest.raises(ConfigError, match=f"control_hz = {near[0]}, physics_hz = {near[1]}") as refused:
             config(control_hz=control_hz, physics_hz=physics_hz, fps=fps)
         assert f"control_hz is {control_hz} and physics_hz is {physics_hz}" in str(refused.value)
         config(control_hz=near[0], physics_hz=near[1], fps=fps)
-
-
-def test_a_plant_has_no_physics_rate() -> None:
-    UR5Config(control_hz=60, physics_hz=60, fps=30, clock="realtime", plant="package.module:Class")
+    # A plant has no physics rate.
+    plant = {"clock": "realtime", "plant": "package.module:Class"}
+    UR5Config(control_hz=60, physics_hz=60, fps=30, **plant)
     with pytest.raises(ConfigError, match="control_hz is 10"):
-        UR5Config(control_hz=10, physics_hz=10, fps=10, clock="realtime", plant="package.module:Class")
-
-
-def test_the_least_physics_rate_follows_from_damping_and_inertia() -> None:
-    body, world = start(1, 500, 500).body, start(1, 500, 500).world
-    inertia = world.model.dof_armature[: len(body.servo_damping)]
-    assert body.least_physics_hz > max(np.array(body.servo_damping[3:6]) / (4 * inertia[3:6]))
+        UR5Config(control_hz=10, physics_hz=10, fps=10, **plant)

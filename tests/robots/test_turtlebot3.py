@@ -6,17 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot.robots import make_robot_from_config
-from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
+from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from tests.cases import each_case
 
 GO = {"x.vel": 0.2, "theta.vel": 0.0}
@@ -52,16 +48,6 @@ def test_bad_actions_are_refused_and_nothing_happens(robot):
     assert robot.host.bridge.now_ns == now
 
 
-def test_keys_are_names_so_their_order_does_not_matter(tmp_path):
-    results = []
-    for keys in (("x.vel", "theta.vel"), ("theta.vel", "x.vel")):
-        with make(tmp_path, arena="empty") as robot:
-            action = {"x.vel": 0.1, "theta.vel": 0.7}
-            results.append([robot.send_action({key: action[key] for key in keys}) for _ in range(5)])
-            assert list(results[-1][0]) == ["x.vel", "theta.vel"]
-    assert results[0] == results[1]
-
-
 def test_out_of_range_actions_are_limited_in_the_return_value(robot):
     for _ in range(20):
         applied = robot.send_action({"x.vel": 1e9, "theta.vel": 0.0})
@@ -79,8 +65,9 @@ def test_the_returned_action_is_what_the_base_was_commanded(robot):
     applied = robot.send_action({"x.vel": 0.1, "theta.vel": 1.0})
     assert applied["x.vel"] == pytest.approx(0.079, abs=0.002)
     assert applied["theta.vel"] == pytest.approx(0.1176, abs=1e-4)
-    applied = robot.send_action({"x.vel": 0.1, "theta.vel": 1.0})
+    applied = robot.send_action({"theta.vel": 1.0, "x.vel": 0.1})  # keys are names, in any order
     assert applied["x.vel"] == 0.1
+    assert list(applied) == ["x.vel", "theta.vel"]
     assert applied == dict(zip(robot.action_names, robot.host.cerebellum.command[0], strict=True))
 
 
@@ -165,11 +152,6 @@ def test_options_that_cannot_be_honoured(options, message):
         TurtleBot3Config(**options)
 
 
-def test_a_frame_longer_than_the_command_timeout_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="Raise fps to at least 2"):
-        make(tmp_path, fps=1).connect()
-
-
 def test_equal_seeds_give_equal_noise_and_others_do_not(tmp_path):
     def observe(seed):
         with make(tmp_path, seed=seed) as robot:
@@ -198,32 +180,3 @@ def test_odometry_follows_the_truth_and_drifts(tmp_path):
     error = math.hypot(seen["x.pos"] - truth[0], seen["y.pos"] - truth[1])
     assert 0 < error < 0.05
     assert seen["theta.pos"] == pytest.approx(truth[2], abs=0.15)
-
-
-def test_imu_measures_the_turn(tmp_path):
-    with make(tmp_path, arena="empty", imu=True) as robot:
-        for _ in range(15):
-            robot.send_action({"x.vel": 0.0, "theta.vel": 1.0})
-        seen = robot.get_observation()
-    assert seen["imu_z.vel"] == pytest.approx(1.0, abs=0.02)
-    assert seen["imu_x.vel"] == pytest.approx(0.0, abs=0.02)
-
-
-def test_lerobots_factories_make_robots_and_brain():
-    """That LeRobot finds them by itself is tested in `tests/apps/doctor`, in a process of its own."""
-    assert type(make_robot_from_config(TurtleBot3Config())).__name__ == "TurtleBot3"
-    assert type(make_robot_from_config(UR5Config())).__name__ == "UR5"
-    assert type(make_teleoperator_from_config(BhdBrainConfig())).__name__ == "BhdBrain"
-
-
-def test_camera_images_where_there_is_opengl(tmp_path):
-    robot = make(tmp_path, camera=True, camera_width=64, camera_height=48)
-    assert robot.observation_features["front"] == (48, 64, 3)
-    try:
-        robot.connect()
-    except RenderingError:
-        pytest.skip("no OpenGL here; the message is tested in tests/sim")
-    image = robot.get_observation()["front"]
-    robot.disconnect()
-    assert image.shape == (48, 64, 3)
-    assert image.std() > 1

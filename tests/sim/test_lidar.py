@@ -86,7 +86,7 @@ def scan(shapes: tuple[Shape, ...], pose: tuple[float, float, float], beams: int
 
 @each_case(
     ("seed", "pose"),
-    [(0, None), (1, None), (2, None), *(("world", pose) for pose in (None, (0.55, 0.5, 2.0), (-0.4, -1.7, -3.0)))],
+    [(0, None), (1, None), *(("world", pose) for pose in ((0.55, 0.5, 2.0), (-0.4, -1.7, -3.0)))],
 )
 def test_ranges_are_the_distances_to_the_shapes(seed: Any, pose: tuple[float, float, float] | None) -> None:
     arena = turtlebot3_world() if seed == "world" else random_arena(seed)
@@ -124,11 +124,12 @@ def test_an_obstacle_that_is_too_near_reads_the_shortest_range() -> None:
     assert ranges[60] == pytest.approx(0.092 / math.cos(math.pi / 3), abs=1e-6)
 
 
-@each_case("yaw", [0.0, 1.0, 3.0])
-def test_the_robot_does_not_see_itself_nor_the_floor(yaw: float) -> None:
+def test_the_robot_does_not_see_itself_nor_the_floor() -> None:
     world = World(BODY)
-    world.reset(poses=np.array([[0.3, -0.2, yaw]]))
+    world.reset(poses=np.array([[0.3, -0.2, 1.0]]))
     lidar = Lidar(world, spec_with())
+    with pytest.raises(ValueError, match="read-only"):
+        lidar.ranges[0, 0] = 1.0
     speed = 0.0
     for target in (6.0, -6.0, 0.0):
         for _ in range(100):
@@ -145,7 +146,7 @@ def test_only_what_is_as_high_as_the_lidar_is_seen(height: float) -> None:
     assert seen == (height > 0.182)
 
 
-@each_case("beams", [1, 24, 90, 180])
+@each_case("beams", [1, 90])
 def test_fewer_beams_are_evenly_spaced_ones_of_all(beams: int) -> None:
     arena = random_arena(3)
     some, every = scan(arena.shapes, arena.start, beams), scan(arena.shapes, arena.start)[:: 360 // beams]
@@ -197,12 +198,6 @@ def test_noise_belongs_to_the_simulation_not_to_how_many_there_are() -> None:
         if sim in (1, 3):
             alone.scan(generator)
         assert alone.ranges[0].tobytes() == together.ranges[sim].tobytes()
-
-
-def test_ranges_cannot_be_written_to() -> None:
-    lidar = Lidar(World(BODY), spec_with())
-    with pytest.raises(ValueError, match="read-only"):
-        lidar.ranges[0, 0] = 1.0
 
 
 HUB = BODY.mjcf.replace('<geom name="tyre_left" class="tyre"/>', '<geom class="tyre"/><site name="hub"/>')

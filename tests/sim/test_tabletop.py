@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.commands import BrainCommand
-from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.camera import Camera
@@ -21,11 +19,9 @@ from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 from tests.cases import each_case
-from tests.control.goal_rig import KINEMATICS, pose
 
 BODY = ur5()
 HOME = np.array(BODY.home)
-LAG = np.array(BODY.servo_damping) / np.array(BODY.servo_stiffness)
 SPOTS = ((0.55, 0.28), (0.45, -0.20), (0.75, -0.05), (0.62, 0.05), (0.38, 0.33))
 
 
@@ -97,7 +93,7 @@ def five() -> list[bytes]:
     return [everything(world, table, sim) for sim in range(5)]
 
 
-@pytest.mark.parametrize(("n", "first", "threads"), [(1, 0, None), (1, 4, None), (3, 1, 1), (5, 0, 3)])
+@pytest.mark.parametrize(("n", "first", "threads"), [(1, 4, None), (3, 1, 1), (5, 0, 3)])
 def test_results_do_not_depend_on_the_other_simulations_or_on_threads(
     n: int, first: int, threads: int | None, five: list[bytes]
 ) -> None:
@@ -114,15 +110,6 @@ def test_an_episode_does_not_depend_on_the_one_before(five: list[bytes]) -> None
     sweep(world)
     states = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(3)]
     assert all(expected.startswith(state) for state, expected in zip(states, five, strict=False))
-
-
-def test_placing_some_leaves_the_others_alone() -> None:
-    world, table = laid(4)
-    sweep(world, steps=5)
-    before = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
-    table.place([random_scene(40), random_scene(41)], np.array([1, 2]))
-    after = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
-    assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, False, True]
 
 
 def test_each_simulation_has_objects_of_its_own() -> None:
@@ -184,9 +171,13 @@ def test_absent_objects_touch_nothing_and_stay_absent() -> None:
     assert not np.asarray(touching).any()
 
 
-def test_a_reset_puts_the_arm_home_and_clears_the_table() -> None:
+def test_placing_some_leaves_the_others_alone_and_a_reset_puts_the_arm_home_and_clears_the_table() -> None:
     world, table = laid(3, count=5)
     sweep(world, steps=5)
+    before = [everything(world, table, sim) for sim in range(3)]
+    table.place([random_scene(40), random_scene(41)], np.array([0, 2]))
+    after = [everything(world, table, sim) for sim in range(3)]
+    assert [a == b for a, b in zip(after, before, strict=True)] == [False, True, False]
     world.reset([0, 2])
     np.testing.assert_array_equal(world.qpos[0, :6], HOME[:6])
     np.testing.assert_array_equal(world.qpos[2, 6:8], HOME[6] / 2)
@@ -259,13 +250,8 @@ def test_the_target_is_drawn_where_it_is_wanted_and_touches_nothing() -> None:
         world.copy_into(sim, model, data)
         mujoco.mj_forward(model, data)
         at = np.concatenate([data.body("target").xpos, data.body("target").xquat])
-        if sim == 0:
-            np.testing.assert_allclose(at, pose, atol=1e-12)
-        else:
-            assert np.abs(at).max() > 50  # out of sight
-        assert not any(
-            model.geom_contype[i] for i in range(model.ngeom) if model.geom_bodyid[i] == model.body("target").id
-        )
+        assert np.allclose(at, pose, atol=1e-12) if sim == 0 else np.abs(at).max() > 50  # out of sight
+        assert not model.geom_contype[model.geom_bodyid == model.body("target").id].any()
 
 
 def test_a_camera_sees_each_table_as_it_is_laid_now() -> None:
@@ -331,7 +317,7 @@ def test_the_flags_agree_with_the_list_of_contacts() -> None:
     models = [world.copy_model(sim) for sim in range(16)]
     datas = [mujoco.MjData(model) for model in models]
     seen = []
-    for _ in range(80):
+    for _ in range(50):
         # Anywhere at all: in the table, in the objects, in itself.
         world.qpos[:, :6] = HOME[:6] + rng.uniform(-1.5, 1.5, (16, 6))
         world.qpos[:, 6:8] = rng.uniform(0, 0.0425, (16, 1))
@@ -347,88 +333,6 @@ def test_the_flags_agree_with_the_list_of_contacts() -> None:
             seen.append((*flags, table.finger_on_object[sim].any()))
     share = np.mean(seen, axis=0)
     assert ((share > 0.005) & (share < 0.9)).all(), share  # the test has seen each flag in both states
-
-
-def test_closed_fingers_and_a_fold_at_home_touch_nothing() -> None:
-    world = World(BODY)
-    table = Tabletop(world)
-    for opening in (0.0, 0.085):
-        table.place([TableScene("", (), (*HOME[:6], opening))])
-        world.ctrl[0, 6] = 0.0
-        world.step(300)
-        assert not (table.arm_on_table | table.self_contact | table.arm_on_object).any()
-
-
-def test_the_tool_pushed_down_stops_at_the_table() -> None:
-    world = World(BODY)
-    table = Tabletop(world)
-    table.place([TableScene("", (), tuple(HOME))])
-    felt = None
-    for _ in range(1500):
-        world.ctrl[0, 1] += 5e-4
-        world.step()
-        if felt is None and table.arm_on_table[0]:
-            felt = table.tool_pose[0, 2]
-        if world.ctrl[0, 1] > HOME[1] + 0.7:
-            break
-    assert felt is not None
-    assert 0.005 < felt < 0.05  # the fingertips reach beyond the tool
-    assert table.tool_pose[0, 2] > 0.0
-
-
-def tool_at(position: tuple[float, float, float]) -> np.ndarray:
-    """The frame of a tool that is there, and points down."""
-    frame = KINEMATICS.tool(HOME[:6])
-    frame[:3, 3] = position
-    return frame
-
-
-def test_what_is_gripped_does_not_slip() -> None:
-    """0.3 kg lifted 0.15 m, moved at 0.5 m/s and held for two seconds."""
-    spot, forces = (0.5, 0.05), (40, 60, 40, 60)
-    things = (
-        TableObject("cup", "red", 0.025, 0.025, 0.10, *spot, mass=0.3),
-        TableObject("cup", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
-        TableObject("box", "red", 0.030, 0.025, 0.10, *spot, mass=0.3),
-        TableObject("box", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
-    )
-    q = KINEMATICS.solve(tool_at((*spot, 0.05)), HOME[:6]).postures[0]
-    world = World(BODY, 4)
-    table = Tabletop(world)
-    table.place([TableScene("", (thing,), (*q, 0.085)) for thing in things])
-    closed = np.array([2 * t.size_x - f / BODY.servo_stiffness[6] for t, f in zip(things, forces, strict=True)])
-    for _ in range(300):
-        world.ctrl[:, 6] = np.maximum(world.ctrl[:, 6] - 3e-4, closed)
-        world.step()
-    force = world.derived("actuator_force")
-    world.forward()
-    np.testing.assert_allclose(-force[:, 6], forces, rtol=0.12)
-    assert table.finger_on_object[:, 0].all()
-
-    def offset() -> np.ndarray:
-        world.forward()
-        return np.array([table.object_poses[sim, 0, :3] - table.tool_pose[sim, :3] for sim in range(4)])
-
-    start, slips = offset(), []
-    planner = GoalPlanner(BODY, BODY.physics_hz)
-    for there in ((*spot, 0.20), (0.5, -0.20, 0.20)):
-        goal = BrainCommand(
-            "a", target_pose=pose(tool_at(there)), motion="line", max_velocity=0.5, max_acceleration=2.5
-        )
-        plan = planner.plan(goal, [*q, 0.0], np.zeros(7), np.zeros(7))
-        assert isinstance(plan, Plan), plan
-        for k, (q, velocity) in enumerate(zip(plan.trajectory.position[:, :6], plan.trajectory.velocity, strict=True)):
-            world.ctrl[:, :6] = q + LAG[:6] * velocity[:6]
-            world.step()
-            if k % 20 == 0:
-                slips.append(np.linalg.norm(offset() - start, axis=1))
-    world.step(2 * BODY.physics_hz)
-    slips.append(np.linalg.norm(offset() - start, axis=1))
-    assert np.max(slips) < 0.002
-    assert np.max(slips[-1]) < 0.0005
-    assert (table.object_poses[:, 0, 2] > 0.19).all()
-    assert table.finger_on_object[:, 0].all()
-    assert not (table.arm_on_object | table.arm_on_table).any()
 
 
 @pytest.mark.parametrize("actuation", ["position", "torque"])

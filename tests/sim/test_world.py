@@ -67,33 +67,33 @@ def everything(world: World, sim: int) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def sixty_four() -> list[bytes]:
-    world = World(BODY, 64, threads=2)
-    fill(world, range(64))
-    roam(world, range(64))
-    return [everything(world, sim) for sim in range(64)]
+def many() -> list[bytes]:
+    world = World(BODY, 32, threads=2)
+    fill(world, range(32))
+    roam(world, range(32))
+    return [everything(world, sim) for sim in range(32)]
 
 
-@each_case(("sims", "threads"), [(1, None), (7, None), (7, 1), (64, 1), (64, 5), ((20, 23), None)])
+@each_case(("sims", "threads"), [(1, None), (7, 1), (32, 5), ((20, 23), None)])
 def test_the_same_commands_give_the_same_bytes_for_any_number_of_simulations_and_threads(
-    sims: int | tuple[int, int], threads: int | None, sixty_four: list[bytes]
+    sims: int | tuple[int, int], threads: int | None, many: list[bytes]
 ) -> None:
-    assert len(set(sixty_four)) == 64
+    assert len(set(many)) == 32
     which = range(sims) if isinstance(sims, int) else range(*sims)
     world = World(BODY, len(which), threads=threads)
     fill(world, which)
     roam(world, which)
-    assert [everything(world, sim) for sim in range(len(which))] == sixty_four[which.start : which.stop]
+    assert [everything(world, sim) for sim in range(len(which))] == many[which.start : which.stop]
 
 
-def test_an_episode_does_not_depend_on_the_one_before(sixty_four: list[bytes]) -> None:
+def test_an_episode_does_not_depend_on_the_one_before(many: list[bytes]) -> None:
     world = World(BODY, 4)
     fill(world, range(40, 44))
     roam(world, range(40, 44), 7)
     fill(world, range(4))
     roam(world, range(4))
     states = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
-    assert all(expected.startswith(state) for state, expected in zip(states, sixty_four, strict=False))
+    assert all(expected.startswith(state) for state, expected in zip(states, many, strict=False))
 
 
 def test_steps_may_be_split() -> None:
@@ -152,6 +152,7 @@ def test_a_restored_snapshot_goes_on_bit_exactly() -> None:
     roam(world, range(3, 8), 4)
     world.restore(snapshot)
     assert world.snapshot().state.tobytes() == snapshot.state.tobytes()
+    np.testing.assert_array_equal(world.sensor("encoder_left")[:, 0], world.qpos[:, 7])  # sensors read it at once
     roam(world, range(5), 10)
     assert [everything(world, sim) for sim in range(5)] == expected
 
@@ -187,6 +188,7 @@ def test_a_snapshot_holds_randomised_model_fields_and_what_derives_from_them() -
     snapshot = world.snapshot()
     roam(world, range(3), 10)
     expected = [world.snapshot([sim]).state.tobytes() for sim in range(3)]
+    world.model_field("geom_friction")[:] = 9.0  # the snapshot is a copy
     for target in (world, World(BODY, 3)):
         target.restore(snapshot)
         roam(target, range(3), 10)
@@ -209,28 +211,6 @@ def test_a_snapshot_from_before_a_randomisation_undoes_it() -> None:
     assert world.snapshot().state.tobytes() == reference.snapshot().state.tobytes()
 
 
-def test_sensors_read_the_restored_state() -> None:
-    world = World(BODY, 2)
-    fill(world, range(2))
-    roam(world, range(2))
-    snapshot = world.snapshot()
-    world.reset()
-    world.restore(snapshot)
-    np.testing.assert_array_equal(world.sensor("encoder_left")[:, 0], world.qpos[:, 7])
-    np.testing.assert_array_equal(world.sensor("speed_right")[:, 0], world.qvel[:, 7])
-
-
-def test_a_snapshot_is_a_copy() -> None:
-    world = World(BODY)
-    snapshot = world.snapshot()
-    before = snapshot.state.tobytes()
-    world.ctrl[:] = 5.0
-    world.step(10)
-    world.model_field("geom_pos")[:] += 1.0
-    assert snapshot.state.tobytes() == before
-    assert not (snapshot.fields["geom_pos"] == world.model_field("geom_pos")).any()
-
-
 POST = Shape("cylinder", 1.0, 0.0, 0.0, 0.1, 0.1)
 APART = BODY.mjcf.replace(
     '<velocity name="wheel_right"', '<velocity name="extra" joint="wheel_left"/><velocity name="wheel_right"'
@@ -246,6 +226,7 @@ APART = BODY.mjcf.replace(
         (lambda: World(BODY).joint_slice(["wheel_right", "wheel_left"]), "neighbours"),
         (lambda: World(dataclasses.replace(BODY, mjcf="<mujoco><body/></mujoco>")), BODY.name),
         (lambda: SimulatedPlant(World(dataclasses.replace(BODY, mjcf=APART))), "not neighbours"),
+        (lambda: World(BODY, fixtures=(POST,)), "Fixtures"),
         (lambda: World(BODY, 0), "at least one"),
         (lambda: World(BODY, -1), "at least one"),
         (lambda: World(BODY, pool_size=3).place([[POST] * 4]), r"4 obstacles; this world holds 3.*pool_size"),
@@ -289,7 +270,7 @@ def test_the_plant_reads_and_writes_the_wheels_by_name() -> None:
 
 
 @PHYSICS_HZ
-@pytest.mark.parametrize("speed", [0.05, 0.22, -0.22])
+@each_case("speed", [0.05, -0.22])
 def test_driving_straight_covers_speed_times_time(speed: float, physics_hz: int) -> None:
     world = World(BODY, physics_hz=physics_hz)
     world.reset(poses=np.array([[0.0, 0.0, 0.5]]))
@@ -302,7 +283,7 @@ def test_driving_straight_covers_speed_times_time(speed: float, physics_hz: int)
 
 
 @PHYSICS_HZ
-@pytest.mark.parametrize("rate", [0.5, 2.84, -2.84])
+@each_case("rate", [0.5, -2.84])
 def test_spinning_turns_rate_times_time_on_the_spot(rate: float, physics_hz: int) -> None:
     world = World(BODY, physics_hz=physics_hz)
     drive(world, 0.0, rate, 1.0)
@@ -314,20 +295,6 @@ def test_spinning_turns_rate_times_time_on_the_spot(rate: float, physics_hz: int
         before = yaw
     assert turned == pytest.approx(rate * 4.0, rel=0.02)
     assert np.hypot(*world.base_pose[0, :2]) < 0.01
-
-
-def test_a_circle_has_the_radius_speed_over_rate() -> None:
-    world = World(BODY)
-    drive(world, 0.15, 0.6, 0.5)
-    path = []
-    for _ in range(200):
-        pass_time(world, 0.05)
-        path.append(world.base_pose[0, :2])
-    points = np.array(path)
-    matrix = np.column_stack([2 * points, np.ones(len(points))])
-    solution = np.linalg.lstsq(matrix, (points**2).sum(axis=1), rcond=None)[0]
-    radius = math.sqrt(solution[2] + solution[:2] @ solution[:2])
-    assert radius == pytest.approx(0.15 / 0.6, rel=0.02)
 
 
 def test_the_gyro_measures_the_yaw_rate() -> None:
@@ -345,7 +312,7 @@ def test_a_robot_at_rest_stays_at_rest() -> None:
     start = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 2.0)])
     world.reset(poses=start)
     lowest = []
-    for _ in range(10):
+    for _ in range(3):
         world.step(world.physics_hz)
         lowest.append(world.qpos[:, 2].copy())
     drift = world.base_pose - start
@@ -369,32 +336,6 @@ def test_the_robot_keeps_its_feet_on_the_floor_when_it_starts_and_brakes(physics
             world.step(physics_hz // 200)
             largest = max(largest, 2 * abs(world.qpos[0, 5]))
     assert largest < 0.01
-
-
-def test_braking_takes_the_energy_out() -> None:
-    world = World(BODY)
-    drive(world, 0.22, 0.0, 1.0)
-    model = world.copy_model(0)
-    data = mujoco.MjData(model)
-    world.ctrl[0] = 0.0
-
-    def kinetic() -> float:
-        world.copy_into(0, model, data)
-        mujoco.mj_forward(model, data)
-        mujoco.mj_energyVel(model, data)
-        return float(data.energy[1])
-
-    energy = [kinetic()]
-    mass = model.body_subtreemass[model.body("base").id]
-    spinning = sum(model.body(name).inertia[1] + model.joint(name).armature[0] for name in BODY.drive.joints)
-    expected = 0.5 * mass * 0.22**2 + 0.5 * spinning * (0.22 / RADIUS) ** 2
-    assert energy[0] == pytest.approx(expected, rel=0.02)
-    for _ in range(200):
-        world.step()
-        energy.append(kinetic())
-    assert max(energy[1:]) < energy[0]
-    assert (np.diff(energy) < 0.1 * energy[0]).all()  # a little comes back from the pitching
-    assert energy[-1] < 1e-6
 
 
 def test_touch_is_felt_at_a_box_and_not_on_the_floor() -> None:

@@ -149,8 +149,7 @@ def test_scans_that_come_too_late_or_from_the_future_are_none_of_the_present() -
 
 
 def test_a_scan_from_the_future_does_not_take_the_place_of_one_that_grows_old() -> None:
-    rig = watched()
-    monitor: Any = rig.cerebellum.controller._monitor  # type: ignore[attr-defined]
+    monitor = CollisionMonitor(support.BODY, LIDAR, 1, support.HZ, BEAMS)
     pose, far = np.zeros((1, 3)), np.full((1, monitor.beams), 3.0)
     for tick in range(4 * SCAN_TICKS):
         stamp = np.array([tick])

@@ -132,12 +132,9 @@ def test_goals_that_do_not_fit_a_record_are_refused(fields: dict[str, Any], code
         assert refusal.code == code
 
 
-def test_whole_numbers_become_floats() -> None:
+def test_whole_numbers_become_floats_and_a_long_name_of_a_result_is_refused() -> None:
     command = BrainCommand("a", joint_target=(1, 0, 0, 0, 0, 0), timeout_s=5)
     assert decode_goal(encode_goal(command, DOF)) == command
-
-
-def test_a_long_name_of_a_result_is_refused() -> None:
     with pytest.raises(ActionError, match="65 bytes"):
         encode_result(CommandResult("x" * 65, False, ResultCode.FAULT, ""))
     with pytest.raises(ActionError, match="65 bytes"):

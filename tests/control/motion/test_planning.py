@@ -132,16 +132,6 @@ def test_a_plan_that_is_late_for_an_arm_that_moves_is_asked_for_again_from_furth
     assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.SUCCEEDED)]
 
 
-def test_a_planner_that_is_late_again_and_again_is_in_time_when_the_old_motion_has_ended() -> None:
-    rig, planning = rig_of(1, *(LEAD * 2**k + 2 for k in range(9)))
-    rig.go("a", joint_target=joints(0.1))
-    rig.tick(LEAD + 20)
-    rig.go("slow", joint_target=BACK, preempt=True)
-    rig.run()
-    assert rig.results() == [("a", ResultCode.PREEMPTED), ("slow", ResultCode.SUCCEEDED)]
-    assert 2 < len(planning.states) < 2 + np.log2(MOST_LEADS)
-
-
 def test_a_planner_that_is_always_too_late_is_named_and_the_arm_brakes() -> None:
     lead = MIN_LEAD
     planning = LatePlanning([1, *(lead * 2**k + 2 for k in range(9))], lead)
@@ -227,17 +217,6 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
     assert rig.results() == [("after", ResultCode.SUCCEEDED)]
 
 
-def test_waiting_goals_are_planned_in_order_one_at_a_time() -> None:
-    rig, planning = rig_of(3, LEAD + 20, 1)
-    for name, target in (("a", 0.1), ("b", 0.2), ("c", 0.3)):
-        assert rig.go(name, joint_target=joints(target)) is None
-    rig.tick(40)
-    assert len(planning.states) == 1
-    rig.run()
-    assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in "abc"]
-    assert len(planning.states) == 3
-
-
 @pytest.mark.parametrize("preempt", [False, True])
 def test_a_goal_in_a_brake_waits_for_its_end_or_preempts_it(preempt: bool) -> None:
     rig, planning = rig_of(1, ticks=100)
@@ -271,18 +250,6 @@ def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     assert not rig.acceleration.any()
     assert rig.manager.feedback(0) is None
     assert planning.out == {}
-
-
-@settings(max_examples=20)
-@given(st.lists(actions, min_size=1, max_size=4), st.lists(actions, min_size=1, max_size=3), latencies)
-def test_arms_are_planned_for_independently_of_each_other(script: list, other: list, latencies: list[int]) -> None:
-    rig = Rig(2, planning=LatePlanning(latencies))  # type: ignore[arg-type]
-    for number, ((kind, value), _) in enumerate(other):
-        if kind == "goal":
-            rig.go(f"other {number}", 1, **value)
-    due = follow(rig, 0, script)
-    rig.run()
-    assert Counter(result.task_id for result in rig.taken + rig.manager.take_results(0)) == +due
 
 
 @settings(max_examples=15)

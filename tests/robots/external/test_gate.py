@@ -11,6 +11,7 @@ from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.gate import Gate
+from tests.cases import each_case
 
 NAMES = ("arm.pos", "x.vel")
 RANGE = {"arm.pos": [-90.0, 90.0], "x.vel": [-0.3, 0.3]}
@@ -61,9 +62,10 @@ def test_ranges_come_from_the_options_before_the_calibration() -> None:
     assert gate.lower.tolist() == [-1.0, -2.0]
     assert gate.unlimited() == []
     assert Gate(NAMES, GateConfig(), {}).unlimited() == list(NAMES)
+    assert np.isinf(Gate(NAMES, GateConfig(max_change={}), {}).max_change).all()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"range": {"arm.pos": [1, 0]}}, r"gate.range.arm.pos is \[1, 0\]"),
@@ -83,7 +85,7 @@ def test_wrong_options_are_named(options: dict, message: str) -> None:
         Gate(NAMES, GateConfig(**options), {})
 
 
-@pytest.mark.parametrize("name", ["x.vel", "linear_velocity", "mobile_base.vx", "mobile_base.vtheta", "wheel_speed"])
+@each_case("name", ["x.vel", "linear_velocity", "mobile_base.vx", "mobile_base.vtheta", "wheel_speed"])
 def test_a_speed_holds_at_zero_however_its_robot_names_it(name: str) -> None:
     gate = Gate((name, "level.pos"), GateConfig(), {})
     gate.begin(np.array([0.4, 2.0]))
@@ -101,23 +103,10 @@ def test_after_a_hold_a_speed_rises_from_zero() -> None:
     assert gate.passed(np.array([0.0, 0.3])).action[1] == pytest.approx(0.1)
 
 
-def test_no_change_by_name_is_no_limit() -> None:
-    assert np.isinf(Gate(NAMES, GateConfig(max_change={}), {}).max_change).all()
+GRIPS = ("gripper", "left_gripper", "rightGripper", "GRIPPER_L", "hand", "panda_finger_joint1", "jaw", "index_flexor")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "gripper.pos",
-        "left_gripper",
-        "rightGripper.pos",
-        "GRIPPER_L",
-        "hand.pos",
-        "panda_finger_joint1.pos",
-        "jaw.pos",
-        "index_flexor.pos",
-    ],
-)
+@each_case("name", GRIPS)
 def test_what_grips_keeps_its_position_in_an_emergency_stop(name: str) -> None:
     gate = Gate(("wrist.pos", name, "x.vel"), GateConfig(), {})
     gate.begin(np.zeros(3))

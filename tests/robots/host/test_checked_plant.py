@@ -233,21 +233,6 @@ def test_a_robot_that_is_not_ready_is_waited_for_and_then_given_up(how: Callable
     assert not rig.plant.written
 
 
-def test_a_robot_that_fails_for_a_moment_before_it_starts_is_waited_for() -> None:
-    rig = Rig()
-    left = [3]
-
-    def flaky(out: PlantReading) -> None:
-        if left[0]:
-            left[0] -= 1
-            boom()
-
-    rig.plant.broken["read"] = flaky
-    rig.start()
-    assert rig.checked.problem == ""
-    assert rig.drive(2) == Mode.TRACKING
-
-
 @each_case("asked", [1, 2, 7])
 def test_a_stop_of_its_own_that_is_not_left_at_once_is_left_when_it_is_asked_again(asked: int) -> None:
     rig = Rig()
@@ -264,12 +249,22 @@ def test_a_stop_of_its_own_that_is_not_left_at_once_is_left_when_it_is_asked_aga
     assert rig.drive(2) == Mode.TRACKING
 
 
-def test_a_robot_that_cannot_be_read_before_it_left_its_stop_is_asked_to() -> None:
+@each_case("ends", ["with its stop", "by itself"])
+def test_a_robot_that_cannot_be_read_yet_is_asked_to_leave_a_stop_and_waited_for(ends: str) -> None:
     rig = Rig()
-    rig.plant.broken["read"] = boom
-    rig.plant.broken["recover"] = lambda: rig.plant.broken.pop("read") is not None
+    left = [3]
+
+    def flaky(out: PlantReading) -> None:
+        left[0] -= ends == "by itself"
+        if left[0] >= 0:
+            boom()
+
+    rig.plant.broken["read"] = flaky
+    if ends == "with its stop":
+        rig.plant.broken["recover"] = lambda: rig.plant.broken.pop("read") is not None
     rig.start()
     assert rig.slept < 1
+    assert rig.checked.problem == ""
     assert rig.drive(2) == Mode.TRACKING
 
 
@@ -281,35 +276,32 @@ def test_a_robot_that_cannot_be_reached_is_named(done: str) -> None:
         Rig(plant).start()
 
 
-@each_case(
-    "name, why",
-    [
-        ("nowhere.at_all:Arm", "cannot be imported: ModuleNotFoundError"),
-        ("bhd_lerobot.control.plant:Nothing", "cannot be imported: AttributeError"),
-        ("bhd_lerobot.control.plant:SafetyStatus", "has no open and no enable"),
-    ],
-)
-def test_what_is_no_plant_is_refused(name: str, why: str) -> None:
-    with pytest.raises(ConfigError, match=why):
-        plant_class(name)
+def taking(what: str) -> Rig:
+    plant = Perfect()
+    plant.takes = what
+    return Rig(plant)
 
 
 @each_case(
-    "options, why",
+    "make, why",
     [
-        ({"plant": "my plant", "clock": "realtime"}, "name a class as package.module:Class"),
-        ({"plant": "mine:Arm"}, "use --robot.clock=realtime"),
-        ({"plant": "mine:Arm", "clock": "realtime", "camera": True}, "robot.camera is of simulated robots"),
+        (lambda: plant_class("nowhere.at_all:Arm"), "cannot be imported: ModuleNotFoundError"),
+        (lambda: plant_class("bhd_lerobot.control.plant:Nothing"), "cannot be imported: AttributeError"),
+        (lambda: plant_class("bhd_lerobot.control.plant:SafetyStatus"), "has no open and no enable"),
+        (lambda: UR5Config(plant="my plant", clock="realtime"), "name a class as package.module:Class"),
+        (lambda: UR5Config(plant="mine:Arm"), "use --robot.clock=realtime"),
+        (lambda: UR5Config(plant="m:Arm", clock="realtime", camera=True), "robot.camera is of simulated robots"),
+        (
+            lambda: CheckedPlant.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS),
+            "Refusing cannot be made of this configuration: ValueError: no",
+        ),
+        (lambda: taking("velocities"), r"The plant mine:Arm takes 'velocities'; .* 'actuators' or 'twist'"),
+        (lambda: taking("twist"), r"takes twists .* 'ur5' is no base"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], why: str) -> None:
+def test_what_is_no_plant_of_this_robot_is_refused(make: Callable[[], object], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
-        UR5Config(**options)
-
-
-def test_a_plant_that_cannot_be_made_says_why() -> None:
-    with pytest.raises(ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"):
-        CheckedPlant.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
+        make()
 
 
 class Refusing(Perfect):
@@ -372,16 +364,6 @@ def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> No
     assert (np.abs(np.diff(written, axis=0)).max(axis=0) <= most + 1e-12).all()
     assert base.observe().state[0, :2].tolist() == pytest.approx(written[-1].tolist())
     assert base.modes[0] == Mode.TRACKING
-
-
-def test_a_plant_that_takes_something_else_is_refused() -> None:
-    plant = Perfect()
-    plant.takes = "velocities"
-    with pytest.raises(ConfigError, match=r"The plant mine:Arm takes 'velocities'; .* 'actuators' or 'twist'"):
-        Rig(plant)
-    plant.takes = "twist"
-    with pytest.raises(ConfigError, match=r"takes twists .* 'ur5' is no base"):
-        Rig(plant)
 
 
 def test_what_a_robot_does_not_measure_a_person_judges() -> None:

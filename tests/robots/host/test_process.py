@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from bhd_lerobot.realtime.loop import LoopLimits
 from bhd_lerobot.realtime.privileges import RealtimeSettings
 from bhd_lerobot.robots.arm_host import ArmHost
@@ -31,28 +29,19 @@ RUN = """
 import pickle, sys
 import bhd_lerobot.robots.host.process as process
 sys.path.insert(0, sys.argv[1])
-spec = pickle.loads(sys.stdin.buffer.read())
-plant = spec.make_plant()
-host = spec.make_host(plant)
-plant.read(host.cerebellum.reading)
-host.observe(), host.truth(), host.step(None)
-print(sorted({"torch", "lerobot", "mujoco"} & set(sys.modules)))
+for spec in pickle.loads(sys.stdin.buffer.read()):
+    plant = spec.make_plant()
+    host = spec.make_host(plant)
+    plant.read(host.cerebellum.reading)
+    host.observe(), host.truth(), host.step(None)
+print({"torch", "lerobot", "mujoco"} & set(sys.modules))
+import bhd_lerobot.robots.base_simulation, bhd_lerobot.robots.ur5_simulation, bhd_lerobot.robots.host.plant_process
+print({"torch", "lerobot"} & set(sys.modules))
 """
 
 
-@pytest.mark.parametrize(
-    ("config", "host"),
-    [
-        (UR5Config(), ArmHost),
-        (UR5Config(control="impedance", action_space="tool"), ArmHost),
-        (TurtleBot3Config(imu=True), BaseHost),
-    ],
-)
-def test_the_process_of_a_real_robot_needs_neither_torch_nor_lerobot_nor_mujoco(
-    config: BhdRobotConfig, host: type[Host], tmp_path: Path
-) -> None:
-    (tmp_path / "standing.py").write_text(PLANT, encoding="utf-8")
-    spec = LiveSpec(
+def spec_of(config: BhdRobotConfig, host: type[Host]) -> LiveSpec:
+    return LiveSpec(
         host=f"{host.__module__}:{host.__qualname__}",
         plant="standing:Standing",
         values=_plain(config),
@@ -62,7 +51,16 @@ def test_the_process_of_a_real_robot_needs_neither_torch_nor_lerobot_nor_mujoco(
         privileges=RealtimeSettings(),
         limits=LoopLimits(),
     )
+
+
+def test_processes_need_neither_torch_nor_lerobot_and_that_of_a_real_robot_no_mujoco(tmp_path: Path) -> None:
+    (tmp_path / "standing.py").write_text(PLANT, encoding="utf-8")
+    specs = [
+        spec_of(UR5Config(), ArmHost),
+        spec_of(UR5Config(control="impedance", action_space="tool"), ArmHost),
+        spec_of(TurtleBot3Config(imu=True), BaseHost),
+    ]
     done = subprocess.run(
-        [sys.executable, "-c", RUN, str(tmp_path)], input=pickle.dumps(spec), capture_output=True, check=False
+        [sys.executable, "-c", RUN, str(tmp_path)], input=pickle.dumps(specs), capture_output=True, check=False
     )
-    assert done.stdout.decode().strip() == "[]", done.stderr.decode()
+    assert done.stdout.decode().split() == ["set()"] * 2, done.stderr.decode()

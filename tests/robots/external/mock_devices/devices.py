@@ -203,7 +203,10 @@ class MockArm(Robot):
             with open(self.config.log, "a", encoding="utf-8") as file:
                 file.write(" ".join(f"{action[name]!r}" for name in JOINTS) + "\n")
         self._position = {name: float(np.clip(action[name], -90.0, 90.0)) for name in JOINTS}
-        return dict(self._position)
+        applied = dict(self._position)
+        if self.config.fault == "sends nan" and self.sent == self.config.fault_at:
+            applied["elbow.pos"] = math.nan
+        return applied
 
     def disconnect(self) -> None:
         if not self._is_connected:
