@@ -263,7 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(
         __doc__, arguments, rounds=(3, "measure so often"), seconds=(8.0, "how long each measurement lasts [s]")
     )
-    found = peer_env._environment("kilted")
+    found = peer_env._environment()
     if isinstance(found, peer_env.UnavailableError):
         print(f"No ROS 2 here: {found}", file=sys.stderr)
         return 2

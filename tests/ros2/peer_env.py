@@ -1,6 +1,6 @@
-"""Environments with the real ROS 2 client library, and processes in them to test against.
+"""The environment with the real ROS 2 client library, and processes in it to test against.
 
-An environment is made once per version of the files that describe it, in .ros/ of this checkout. It is never the tests'
+It is made once per version of the files that describe it, in .ros/ of this checkout. It is never the tests'
 own: every start of Python in it sets LD_LIBRARY_PATH and executes itself again.
 """
 
@@ -31,7 +31,7 @@ from tests.waiting import until
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 CACHE = ROOT / ".ros"
-DISTRIBUTIONS = ("kilted", "jazzy")
+DISTRIBUTION = "kilted"
 MESSAGES = {
     "bhd_interfaces": ROOT / "bhd_lerobot/ros2/messages",
     "tf2_msgs": HERE / "messages/tf2_msgs",
@@ -67,12 +67,12 @@ class RosEnvironment:
 
 
 @functools.cache
-def _environment(distribution: str) -> RosEnvironment | UnavailableError:
+def _environment() -> RosEnvironment | UnavailableError:
     """Make or find an environment; what went wrong is kept, so that it is tried once in a process."""
-    requirements = HERE / f"requirements-{distribution}.txt"
+    requirements = HERE / f"requirements-{DISTRIBUTION}.txt"
     builder = HERE / "build_messages.py"
     try:
-        home = _made(distribution, [requirements], lambda folder: _install(requirements, folder))
+        home = _made(DISTRIBUTION, [requirements], lambda folder: _install(requirements, folder))
     except UnavailableError as error:
         return error
     python = home / "bin/python"
@@ -80,7 +80,7 @@ def _environment(distribution: str) -> RosEnvironment | UnavailableError:
     command = [python, builder, *(f"{name}={folder}" for name, folder in MESSAGES.items())]
     try:
         messages = _made(
-            f"{distribution}-messages",
+            f"{DISTRIBUTION}-messages",
             [requirements, builder, *sources],
             lambda folder: _run([*command[:2], folder, *command[2:]], RosEnvironment(python, None).variables(0)),
         )
@@ -132,17 +132,17 @@ def _run(command: list[str | Path], variables: dict[str, str]) -> str:
     return done.stdout
 
 
-def environment(distribution: str = "kilted", *, messages: bool = False) -> RosEnvironment:
-    """Return the environment of a ROS distribution; where there is none, skip the test, or fail it in CI.
+def environment(*, messages: bool = False) -> RosEnvironment:
+    """Return the environment; where there is none, skip the test, or fail it in CI.
 
     With `messages`, the type support of our own messages must be there, too.
     """
-    found = _environment(distribution)
+    found = _environment()
     reason = ""
     if isinstance(found, UnavailableError):
-        reason = f"no ROS 2 {distribution} could be installed into {CACHE.name}: {found}"
+        reason = f"no ROS 2 {DISTRIBUTION} could be installed into {CACHE.name}: {found}"
     elif messages and found.messages is None:
-        reason = f"no type support of bhd_interfaces for ROS 2 {distribution}: {found.why_no_messages}"
+        reason = f"no type support of bhd_interfaces for ROS 2 {DISTRIBUTION}: {found.why_no_messages}"
     if reason:
         not_tested(f"our side of ROS 2 against its own client library; {reason}")
     assert isinstance(found, RosEnvironment)
@@ -169,11 +169,11 @@ class Peer:
     It prints one JSON object a line, the first of them {"event": "ready"}; `lines` holds those that have come.
     """
 
-    def __init__(self, script: str, *options: object, domain: int, distribution: str = "kilted") -> None:
+    def __init__(self, script: str, *options: object, domain: int) -> None:
         self.name = script
         self.options = [str(option) for option in options]
         self.domain = domain
-        self.environment = environment(distribution)
+        self.environment = environment()
         self.lines: list[dict[str, Any]] = []
         self.process: subprocess.Popen[str] | None = None
 

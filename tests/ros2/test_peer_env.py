@@ -60,7 +60,7 @@ def test_no_two_get_the_same_domain() -> None:
 def test_without_ros_a_test_is_skipped_and_fails_in_ci(
     required: str, outcome: type[BaseException], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(peer_env, "_environment", lambda _: peer_env.UnavailableError("no network"))
+    monkeypatch.setattr(peer_env, "_environment", lambda: peer_env.UnavailableError("no network"))
     monkeypatch.setenv(requirements.REQUIRE, required)
     with pytest.raises(outcome, match=r"no ROS 2 kilted .*: no network"):
-        peer_env.environment("kilted")
+        peer_env.environment()

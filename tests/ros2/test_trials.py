@@ -259,8 +259,7 @@ def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, 
     log = tmp_path / "robot.jsonl"
     move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=3", "--brain.type=random")
     options = ("--brain.scale=0.02", "--dataset.num_episodes=1")
-    driver = ("--active=forward_position_controller", "--log", log)
-    with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
+    with Peer("ur_driver_standin.py", "--log", log, domain=domain) as robot:
         robot.wait_event("ready")
         with Recording("ur5", *move, *options, domain=domain, folder=tmp_path) as recording:
             assert recording.process.wait() == 0, recording.text
@@ -281,8 +280,8 @@ def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, 
 
 
 STOPPED = {  # what happens to the driver or to a process of ours; what is printed of it
-    "protective stop": (("--on-usr1=safety", "--value=3"), "its safety status is STOPPED"),
-    "emergency stop": (("--on-usr1=safety", "--value=7"), r"Emergency stop \(the robot's own\)"),
+    "protective stop": (("--on-usr1=safety:3",), "its safety status is STOPPED"),
+    "emergency stop": (("--on-usr1=safety:7",), r"Emergency stop \(the robot's own\)"),
     # A reading whose message came late is too old before its successor is missed.
     "silence": (("--on-usr1=silence",), r"/joint_states has sent no message for|the newest reading was \d"),
     "node": ((), "The process of the ROS 2 node ended with status -9"),
@@ -299,8 +298,7 @@ def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cau
     log = tmp_path / "robot.jsonl"
     move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=2", "--brain.type=random")
     environment(messages=True)
-    driver = ("--active=forward_position_controller", "--log", log, *options)
-    with Peer("ur_driver_standin.py", *driver, domain=domain) as robot:
+    with Peer("ur_driver_standin.py", "--log", log, *options, domain=domain) as robot:
         robot.wait_event("ready")
         given = (*move, "--brain.scale=0.02", "--dataset.num_episodes=9")
         silence_s = 0.4 if what == "silence" else 5

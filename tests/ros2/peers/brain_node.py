@@ -1,10 +1,8 @@
 """The articles' brain: it sends pose goals on /brain/command, one after the other, and waits for the result of each.
 
-It counts results that come twice, that nobody asked for, or never, and the rate of the state topic. The names of the
-topics can be given, as can one of std_msgs/Bool on which it presses the emergency stop.
+It counts results that come twice, that nobody asked for, or never, and the rate of the state topic.
 """
 
-import itertools
 import math
 import signal
 import time
@@ -13,7 +11,6 @@ from typing import Any
 import node as peer
 from bhd_interfaces.msg import BrainCommand, BrainResult, CerebellumState
 from rclpy.node import Node
-from std_msgs.msg import Bool
 
 parser = peer.options(__doc__)
 parser.add_argument(
@@ -24,45 +21,32 @@ parser.add_argument(
     metavar="X,Y,YAW or X,Y,Z,QX,QY,QZ,QW",
     help="a target pose [m, rad]; several are sent one after the other; --goal=-1,0,0 where it begins with a minus",
 )
-parser.add_argument("--task-type", default="navigate")
 parser.add_argument("--name", default="task", help="the goals are called so, and numbered from 0 on")
 parser.add_argument("--frame", default="", help="frame_id of the goals' header")
 parser.add_argument("--max-velocity", type=float, default=0.0)
-parser.add_argument("--max-acceleration", type=float, default=0.0)
 parser.add_argument("--patience", type=float, default=60.0, help="the longest wait for a result [s]")
 parser.add_argument("--linger", type=float, default=2.0, help="the wait for results that come twice, at the end [s]")
 parser.add_argument("--preempt", type=float, help="send the next goal after this time, without waiting [s]")
-parser.add_argument("--command-topic", default="/brain/command")
-parser.add_argument("--result-topic", default="/brain/result")
-parser.add_argument("--state-topic", default="/cerebellum/state")
-parser.add_argument("--stop-topic", help="publish true here, a Bool, --stop-after the first goal")
-parser.add_argument("--stop-after", type=float, default=1.0, help="[s]")
 args = parser.parse_args()
 
 
 class Brain:
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.commands = node.create_publisher(BrainCommand, args.command_topic, 10)
-        node.create_subscription(BrainResult, args.result_topic, self.on_result, 10)
-        node.create_subscription(CerebellumState, args.state_topic, self.on_state, 10)
-        self.stops = node.create_publisher(Bool, args.stop_topic, 10) if args.stop_topic else None
-        self.has_stopped = False
+        self.commands = node.create_publisher(BrainCommand, "/brain/command", 10)
+        node.create_subscription(BrainResult, "/brain/result", self.on_result, 10)
+        node.create_subscription(CerebellumState, "/cerebellum/state", self.on_state, 10)
         self.sent: dict[str, float] = {}  # task -> when [s]
         self.results: dict[str, list[dict[str, Any]]] = {}
-        self.state: CerebellumState | None = None
-        self.states = self.states_before = self.moving = self.stopped = 0
         self.state_times: list[float] = []
-        self.since = time.monotonic()
         self.finished: float | None = None
         node.create_timer(0.02, self.act)
-        node.create_timer(1.0, self.report)
 
     def act(self) -> None:
         now = time.monotonic()
         # What is sent the moment a subscription is found can be lost: wait for a state as well.
-        is_heard = self.commands.get_subscription_count() and self.node.count_publishers(args.result_topic)
-        if not self.sent and not (is_heard and self.states):
+        is_heard = self.commands.get_subscription_count() and self.node.count_publishers("/brain/result")
+        if not self.sent and not (is_heard and self.state_times):
             return
         waiting = [
             task for task, since in self.sent.items() if task not in self.results and now - since < args.patience
@@ -75,13 +59,9 @@ class Brain:
             self.finished = self.finished or now
             if now - self.finished >= args.linger:
                 signal.raise_signal(signal.SIGTERM)
-        if self.stops and not self.has_stopped and self.sent and now - min(self.sent.values()) >= args.stop_after:
-            self.stops.publish(Bool(data=True))
-            self.has_stopped = True
-            peer.log("stop")
 
     def send(self, goal: list[float]) -> None:
-        command = BrainCommand(task_id=f"{args.name}-{len(self.sent)}", task_type=args.task_type)
+        command = BrainCommand(task_id=f"{args.name}-{len(self.sent)}", task_type="navigate")
         command.header.stamp = self.node.get_clock().now().to_msg()
         command.header.frame_id = args.frame
         position, orientation = command.target_pose.position, command.target_pose.orientation
@@ -91,7 +71,7 @@ class Brain:
         else:
             position.x, position.y, position.z = goal[:3]
             orientation.x, orientation.y, orientation.z, orientation.w = goal[3:]
-        command.max_velocity, command.max_acceleration = args.max_velocity, args.max_acceleration
+        command.max_velocity = args.max_velocity
         self.sent[command.task_id] = time.monotonic()
         self.commands.publish(command)
         peer.log("command", task_id=command.task_id, goal=goal)
@@ -103,44 +83,19 @@ class Brain:
         self.results.setdefault(result.task_id, []).append(line)
         peer.log("result", **line)
 
-    def on_state(self, state: CerebellumState) -> None:
-        self.states += 1
-        self.moving += state.is_moving
-        self.stopped += state.emergency_stop
-        self.state = state
+    def on_state(self, _: CerebellumState) -> None:
         self.state_times.append(time.monotonic())
-
-    def report(self) -> None:
-        now = time.monotonic()
-        elapsed, self.since = now - self.since, now
-        state = self.state
-        peer.log(
-            "report",
-            states=self.states,
-            state_hz=(self.states - self.states_before) / elapsed,
-            moving=self.moving,
-            stopped=self.stopped,
-            results=sum(map(len, self.results.values())),
-            positions=None if state is None else list(state.joint_positions),
-            velocities=None if state is None else list(state.joint_velocities),
-        )
-        self.states_before = self.states
 
     def conclude(self) -> None:
         times = self.state_times
-        gaps = sorted(after - before for before, after in itertools.pairwise(times))
         peer.log(
             "summary",
             sent=len(self.sent),
-            results=sum(map(len, self.results.values())),
-            successes=sum(line["success"] for lines in self.results.values() for line in lines),
             once=sum(len(self.results.get(task, [])) == 1 for task in self.sent),
             twice=sum(len(lines) > 1 for lines in self.results.values()),
             never=sum(task not in self.results for task in self.sent),
             unknown=sum(task not in self.sent for task in self.results),
-            states=self.states,
             state_hz=(len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
-            state_gap_p99=gaps[int(0.99 * len(gaps))] if gaps else None,
         )
 
 

@@ -53,7 +53,6 @@ class Base:
     forward: float = 0.0  # [m/s]
     turning: float = 0.0  # [rad/s]
     command: tuple[float, float] = (0.0, 0.0)  # [m/s], [rad/s]
-    motors_on: bool = True
     contacts: int = 0
     touching: bool = False
     most_acceleration: float = 1.0  # [m/s^2], an estimate
@@ -61,10 +60,9 @@ class Base:
 
     def step(self, dt: float) -> tuple[float, float]:
         """Move for a time [s], and return how far the base drove [m] and turned [rad]."""
-        wanted = self.command if self.motors_on else (0.0, 0.0)
         limit, angular_limit = self.most_acceleration * dt, self.most_angular_acceleration * dt
-        self.forward += float(np.clip(wanted[0] - self.forward, -limit, limit))
-        self.turning += float(np.clip(wanted[1] - self.turning, -angular_limit, angular_limit))
+        self.forward += float(np.clip(self.command[0] - self.forward, -limit, limit))
+        self.turning += float(np.clip(self.command[1] - self.turning, -angular_limit, angular_limit))
         driven, turned = self.forward * dt, self.turning * dt
         middle = self.yaw + turned / 2
         x, y = self.x + driven * math.cos(middle), self.y + driven * math.sin(middle)

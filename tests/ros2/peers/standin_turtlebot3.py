@@ -10,26 +10,19 @@ the start [s]; an option may be given several times.
 
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import node as peer
 import numpy as np
 from faults import Outlet, add_faults, at
-from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from geometry_msgs.msg import TransformStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from room import LIDAR_X, MOST_FORWARD, MOST_TURNING, WHEEL_RADIUS, WHEEL_SEPARATION, Base, Room
 from sensor_msgs.msg import BatteryState, Imu, JointState, LaserScan
-from std_srvs.srv import SetBool, Trigger
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -41,33 +34,21 @@ CYCLE = 5  # steps between two publications of turtlebot3_node: 20 Hz
 TICK = math.tau / 4096  # [rad], of a DYNAMIXEL XL430-W250's encoder
 RPM_UNIT = 0.229 * math.tau / 60 * WHEEL_RADIUS  # [m/s], of its velocity
 TURN = 0.2  # [s], of the lidar: 5 Hz
-RESTART = 75  # exit status of a life that ends by --restart
 OLDEST = 0.2  # [s], what is older by the time it could be published is left out, as after SIGCONT
 
 
 parser = peer.options(__doc__)
-parser.add_argument("--lidar", choices=("lds01", "lds02"), default="lds01")
-parser.add_argument("--twist", action="store_true", help="take Twist, as up to Humble, instead of TwistStamped")
 parser.add_argument(
     "--log", help="file for JSON lines: each command, scan, wheel speeds and odometry, and the true pose at 20 Hz"
 )
 parser.add_argument("--seed", type=int, default=0, help="of all noise")
-parser.add_argument("--noise", type=float, default=1.0, help="factor of all noise; 0: none")
 parser.add_argument("--pose", type=at("X:Y:YAW"), default=(-1.2, -0.6, 0.0), help="where it starts [m, rad]")
 parser.add_argument("--open", action="store_true", help="no pillars")
 parser.add_argument("--half", type=float, default=2.0, help="half of the room's width [m]")
-parser.add_argument("--acceleration", type=float, default=1.0, help="limit of the acceleration [m/s^2]")
-parser.add_argument("--heading", choices=("wheels", "imu"), default="wheels", help="what the odometry turns by")
-parser.add_argument(
-    "--old-twist", action="store_true", help="/odom's twist is divided by minus the time since 1970, as up to 2024"
-)
 parser.add_argument("--wait", action="store_true", help="stand still while this process is not scheduled")
 fault = add_faults(parser)
 fault.add_argument("--clock-offset", type=float, default=0.0, help="[s]")
-fault.add_argument("--clock-drift", type=float, default=0.0, help="[s/s]")
 fault.add_argument("--clock-jump", action="append", default=[], type=at("START:OFFSET"), metavar="START:OFFSET")
-fault.add_argument("--restart", action="append", default=[], type=at("START:DURATION"), metavar="START:DURATION")
-parser.add_argument("--resume", help=peer.argparse.SUPPRESS)  # file of what outlives a restart
 args = parser.parse_args()
 
 log_file = open(args.log, "a", buffering=1) if args.log else None  # noqa: SIM115
@@ -89,19 +70,16 @@ def assign(message: Any, values: dict[str, float]) -> None:
 
 class Robot:
     def __init__(self, new_node: Callable[[str], Node]) -> None:
-        before = json.loads(Path(args.resume).read_text()) if args.resume else {}
-        self.start = before.get("start", time.monotonic())
-        self.restarts = before.get("restarts", 0)
-        self.random = np.random.default_rng([args.seed, self.restarts])
+        self.start = time.monotonic()
+        self.random = np.random.default_rng(args.seed)
         self.room = Room(args.half, np.zeros((0, 3))) if args.open else Room(args.half)
-        x, y, yaw = before.get("pose", args.pose)
-        self.base = Base(self.room, x, y, yaw, most_acceleration=args.acceleration)
+        self.base = Base(self.room, *args.pose)
         self.now = time.monotonic()  # up to which the robot has moved
         self.steps = 0
         self.wheels = np.zeros(2)  # [rad], left and right
         self.old_wheels = np.zeros(2)  # of the last cycle
         self.odometry = np.zeros(3)  # x, y, yaw [m, rad]
-        self.imu_yaw = self.odometry_imu_yaw = 0.0
+        self.imu_yaw = 0.0
         self.battery = 12.1  # [V]
         self.commands = 0
         self.begin_turn()
@@ -109,7 +87,7 @@ class Robot:
         self.outlets: dict[str, Outlet] = {}
         main = new_node("turtlebot3_node")
         drive = new_node("diff_drive_controller")
-        lidar = new_node("hlds_laser_publisher" if args.lidar == "lds01" else "ld08_driver")
+        lidar = new_node("hlds_laser_publisher")
         self.scan = self.outlet(lidar, "scan", LaserScan, qos=qos_profile_sensor_data, frame="base_scan")
         self.odom = self.outlet(drive, "odom", Odometry, frame="odom")
         self.imu = self.outlet(main, "imu", Imu, frame="imu_link")
@@ -122,10 +100,7 @@ class Robot:
             self.publish_fixed_frames(
                 new_node("robot_state_publisher").create_publisher(TFMessage, "/tf_static", latched)
             )
-        main.create_subscription(Twist if args.twist else TwistStamped, "/cmd_vel", self.on_command, 10)
-        main.create_service(SetBool, "/motor_power", self.on_motor_power)
-        main.create_service(Trigger, "/reset", self.on_reset)
-        drive.create_service(Trigger, "/reset_odometry", self.on_reset_odometry)
+        main.create_subscription(TwistStamped, "/cmd_vel", self.on_command, 10)
         main.create_timer(STEP, self.advance)
         main.create_timer(1.0, self.report)
 
@@ -136,23 +111,22 @@ class Robot:
 
     @property
     def elapsed(self) -> float:
-        """Time since the start, restarts included [s]."""
+        """Time since the start [s]."""
         return self.now - self.start
 
     def stamp(self, monotonic: float) -> int:
         """Return what the robot's clock shows at a time [ns]."""
         age = time.monotonic() - monotonic
-        wrong = args.clock_offset + args.clock_drift * (monotonic - self.start)
-        wrong += sum(offset for start, offset in args.clock_jump if monotonic - self.start >= start)
+        wrong = args.clock_offset + sum(offset for start, offset in args.clock_jump if monotonic - self.start >= start)
         return time.time_ns() + round((wrong - age) * 1e9)
 
     def noise(self, deviation: float, *shape: int) -> Any:
-        return args.noise * self.random.normal(0.0, deviation, shape or None)
+        return self.random.normal(0.0, deviation, shape or None)
 
     # what comes in
 
     def on_command(self, message: Any) -> None:
-        twist = message if args.twist else message.twist
+        twist = message.twist
         self.commands += 1
         given = twist.linear.x, twist.angular.z
         if all(map(math.isfinite, given)):  # sent to the motors as whole hundredths, cut off
@@ -161,26 +135,8 @@ class Robot:
                 float(np.clip(forward, -MOST_FORWARD, MOST_FORWARD)),
                 float(np.clip(turning, -MOST_TURNING, MOST_TURNING)),
             )
-        stamp = None if args.twist else message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         record("command", time.monotonic(), given=given, taken=self.base.command, stamp=stamp)
-
-    def on_motor_power(self, request: Any, response: Any) -> Any:
-        self.base.motors_on = request.data
-        response.success, response.message = True, "on" if request.data else "off"
-        record("motor_power", time.monotonic(), on=request.data)
-        return response
-
-    def on_reset(self, _: Any, response: Any) -> Any:
-        self.imu_yaw = self.odometry_imu_yaw = 0.0
-        response.success = True
-        record("reset", time.monotonic())
-        return response
-
-    def on_reset_odometry(self, _: Any, response: Any) -> Any:
-        self.odometry[:] = 0.0
-        response.success = True
-        record("reset_odometry", time.monotonic())
-        return response
 
     # what happens
 
@@ -200,24 +156,11 @@ class Robot:
             self.turn_lidar(is_late)
             if self.steps % CYCLE == 0:
                 self.cycle(is_late)
-            for start, duration in sorted(args.restart)[self.restarts :]:
-                if self.elapsed >= start:
-                    self.restart(duration)
-
-    def restart(self, duration: float) -> None:
-        """Vanish as a robot does whose power fails, without a goodbye, and come back after a time."""
-        pose = [self.base.x, self.base.y, self.base.yaw]
-        state = {"start": self.start, "pose": pose, "restarts": self.restarts + 1}
-        Path(args.resume).write_text(json.dumps(state))
-        record("restart", self.now, down=duration)
-        peer.log("restart", down=duration)
-        os._exit(RESTART)
 
     def begin_turn(self) -> None:
         self.turn_start = self.now
-        beams = 360 if args.lidar == "lds01" else int(self.random.integers(350, 371))
-        self.increment = math.tau / (beams if args.lidar == "lds01" else beams - 1)
-        self.readings = np.full(beams, math.nan)
+        self.increment = math.tau / 360
+        self.readings = np.full(360, math.nan)
         self.measured = 0
 
     def turn_lidar(self, is_late: bool) -> None:
@@ -239,24 +182,16 @@ class Robot:
         scan = LaserScan(angle_min=0.0, angle_max=math.tau, angle_increment=self.increment)
         scan.scan_time, scan.time_increment = TURN, TURN / len(self.readings)
         ranges = self.readings
-        if args.lidar == "lds01":
-            scan.range_min, scan.range_max = 0.12, 3.5
-            ranges = np.where((ranges < scan.range_min) | (ranges > scan.range_max), 0.0, ranges)
-        else:
-            scan.range_min, scan.range_max = 0.0, 100.0
-            lost = (ranges > 8.0) | (self.random.random(len(ranges)) < 0.03 * args.noise)
-            ranges = np.where(lost, math.nan, ranges)
+        scan.range_min, scan.range_max = 0.12, 3.5
+        ranges = np.where((ranges < scan.range_min) | (ranges > scan.range_max), 0.0, ranges)
         if self.scan.is_nan:
             ranges = np.full(len(ranges), math.nan)
         scan.ranges = ranges.astype(np.float32).tolist()
         scan.intensities = [0.0 if not value > 0 else 200.0 for value in scan.ranges]
         stamp = self.stamp(self.turn_start)
         self.scan.publish(scan, scan.header, stamp)
-        finite = ranges[np.isfinite(ranges) & (ranges > 0)]
-        nearest = float(finite.min()) if len(finite) else None
         shown = [None if math.isnan(value) else value for value in scan.ranges]
-        times = {"stamp": stamp, "first": self.turn_start}
-        record("scan", self.now, **times, beams=len(ranges), nearest=nearest, ranges=shown)
+        record("scan", self.now, stamp=stamp, first=self.turn_start, ranges=shown)
 
     def cycle(self, is_late: bool) -> None:
         """Publish what turtlebot3_node and diff_drive_controller publish every 50 ms."""
@@ -265,8 +200,6 @@ class Robot:
         difference, shown, self.old_wheels = ticks - self.old_wheels, self.old_wheels, ticks
         driven = WHEEL_RADIUS * difference.mean()
         turned = WHEEL_RADIUS * (difference[1] - difference[0]) / WHEEL_SEPARATION
-        if args.heading == "imu":  # no remainder is taken: the rate leaps where the angle does, as the real node's
-            turned, self.odometry_imu_yaw = self.imu_yaw - self.odometry_imu_yaw, self.imu_yaw
         middle = self.odometry[2] + turned / 2
         self.odometry += np.array([driven * math.cos(middle), driven * math.sin(middle), turned])
         self.battery = max(11.0, self.battery - 1e-5)
@@ -282,12 +215,11 @@ class Robot:
         )
         if is_late:
             return
-        per = -stamp * 1e-9 if args.old_twist else dt
         odometry = Odometry(child_frame_id="base_footprint")
         pose, twist = odometry.pose.pose, odometry.twist.twist
         pose.position.x, pose.position.y = float(self.odometry[0]), float(self.odometry[1])
         assign(pose.orientation, quaternion(self.odometry[2]))
-        twist.linear.x, twist.angular.z = float(driven / per), float(turned / per)
+        twist.linear.x, twist.angular.z = float(driven / dt), float(turned / dt)
         if self.odom.is_nan:
             pose.position.x = pose.position.y = twist.linear.x = twist.angular.z = math.nan
         imu = Imu()
@@ -346,34 +278,5 @@ class Robot:
         )
 
 
-def supervise() -> int:
-    """Run the stand-in in processes of their own, one after the other: each life is another participant of DDS."""
-    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
-        file.write("{}")
-        file.flush()
-        child: subprocess.Popen[bytes] | None = None
-        stopped = False
-
-        def stop(*_: object) -> None:
-            nonlocal stopped
-            stopped = True
-            if child is not None:
-                child.send_signal(signal.SIGINT)
-
-        signal.signal(signal.SIGINT, stop)
-        peer.end_with_parent()
-        for _, down in [*sorted(args.restart), (0.0, 0.0)]:
-            variables = os.environ | {"BHD_PARENT": str(os.getpid())}
-            child = subprocess.Popen([sys.executable, *sys.argv, "--resume", file.name], env=variables)
-            if (status := child.wait()) != RESTART:
-                return status
-            time.sleep(down)
-            if stopped:
-                break
-        return 0
-
-
 if __name__ == "__main__":
-    if args.restart and not args.resume:
-        sys.exit(supervise())
     peer.run(lambda new_node: Robot(new_node).report, args.seconds)

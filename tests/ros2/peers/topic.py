@@ -1,9 +1,8 @@
-"""What the ros2 command does, by the real client library: publish, echo and list topics, and call a service.
+"""What the ros2 command does, by the real client library: publish, echo and list topics.
 
     topic.py pub /cmd_vel geometry_msgs/msg/Twist '{"linear": {"x": 0.1}}' --hz 10 --count 5
     topic.py echo /scan sensor_msgs/msg/LaserScan --best-effort
     topic.py list
-    topic.py call /motor_power std_srvs/srv/SetBool '{"data": true}'
 
 A stamp that is not given is the present. Messages are printed as JSON.
 """
@@ -11,8 +10,6 @@ A stamp that is not given is the present. Messages are printed as JSON.
 import importlib
 import json
 import math
-import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,7 @@ from typing import Any
 import node as peer
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 
 def from_json(text: str) -> Any:
@@ -28,22 +25,16 @@ def from_json(text: str) -> Any:
 
 
 parser = peer.options(__doc__)
-parser.add_argument("verb", choices=("pub", "echo", "list", "call"))
+parser.add_argument("verb", choices=("pub", "echo", "list"))
 parser.add_argument("name", nargs="?")
 parser.add_argument("type", nargs="?")
 parser.add_argument("values", nargs="?", type=from_json, default={}, help="JSON, or @ and the name of a file with it")
 parser.add_argument("--hz", type=float, default=10.0)
 parser.add_argument("--burst", type=int, default=1, help="messages each time")
-parser.add_argument("--count", type=int, default=0, help="end after so many messages; 0: never")
 parser.add_argument("--best-effort", action="store_true")
-parser.add_argument("--latched", action="store_true", help="durability transient local")
-parser.add_argument("--depth", type=int, default=10)
 args = parser.parse_args()
-qos = QoSProfile(
-    depth=args.depth,
-    reliability=QoSReliabilityPolicy.BEST_EFFORT if args.best_effort else QoSReliabilityPolicy.RELIABLE,
-    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL if args.latched else QoSDurabilityPolicy.VOLATILE,
-)
+reliability = QoSReliabilityPolicy.BEST_EFFORT if args.best_effort else QoSReliabilityPolicy.RELIABLE
+qos = QoSProfile(depth=10, reliability=reliability)
 
 
 def load(name: str) -> Any:
@@ -79,10 +70,6 @@ def plain(value: Any) -> Any:
     return [plain(one.item() if hasattr(one, "item") else one) for one in value]
 
 
-def end() -> None:
-    signal.raise_signal(signal.SIGTERM)
-
-
 def publish(node: Node) -> Callable[[], None]:
     kind = load(args.type)
     publisher = node.create_publisher(kind, args.name, qos)
@@ -90,7 +77,7 @@ def publish(node: Node) -> Callable[[], None]:
 
     def send() -> None:
         nonlocal sent
-        if not args.latched and publisher.get_subscription_count() == 0:
+        if publisher.get_subscription_count() == 0:
             return
         message = fill(kind(), args.values)
         if hasattr(message, "header") and "stamp" not in args.values.get("header", {}):
@@ -98,8 +85,6 @@ def publish(node: Node) -> Callable[[], None]:
         for _ in range(args.burst):
             publisher.publish(message)
             sent += 1
-        if args.count and sent >= args.count:
-            end()
 
     node.create_timer(1 / args.hz, send)
 
@@ -112,74 +97,19 @@ def publish(node: Node) -> Callable[[], None]:
 
 
 def echo(node: Node) -> Callable[[], None]:
-    count = 0
-
-    def show(message: Any) -> None:
-        nonlocal count
-        count += 1
-        peer.log("message", message=plain(message))
-        if count == args.count:
-            end()
-
-    node.create_subscription(load(args.type), args.name, show, qos)
-    return lambda: peer.log("received", count=count)
+    node.create_subscription(load(args.type), args.name, lambda one: peer.log("message", message=plain(one)), qos)
+    return lambda: None
 
 
 def list_all(node: Node) -> Callable[[], None]:
-    def endpoint(info: Any) -> dict[str, Any]:
-        profile = info.qos_profile
-        return {
-            "node": f"{info.node_namespace.rstrip('/')}/{info.node_name}",
-            "type": info.topic_type,
-            "type_hash": str(info.topic_type_hash),
-            "reliability": profile.reliability.name,
-            "durability": profile.durability.name,
-        }
-
     def show() -> None:
         nodes = sorted(f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
-        topics = {
-            name: {
-                "types": types,
-                "publishers": [endpoint(info) for info in node.get_publishers_info_by_topic(name)],
-                "subscribers": [endpoint(info) for info in node.get_subscriptions_info_by_topic(name)],
-            }
-            for name, types in node.get_topic_names_and_types()
-            if name not in ("/rosout", "/parameter_events")
-        }
-        services = {
-            name: types
-            for name, types in node.get_service_names_and_types()
-            if not types[0].startswith(("rcl_interfaces/", "type_description_interfaces/"))
-        }
-        peer.log("list", nodes=nodes, topics=topics, services=services)
+        peer.log("list", nodes=nodes, topics=dict(node.get_topic_names_and_types()))
 
     node.create_timer(1.0, show)
     return lambda: None
 
 
-def call(node: Node) -> Callable[[], None]:
-    kind = load(args.type)
-    client = node.create_client(kind, args.name)
-    pending: list[tuple[float, Any]] = []
-
-    def ask() -> None:
-        # A request that is sent the moment a service is ready can be lost: ask again after a while.
-        if client.service_is_ready() and (not pending or time.monotonic() - pending[-1][0] > 2):
-            future = client.call_async(fill(kind.Request(), args.values))
-            pending.append((time.monotonic(), future))
-        for _, future in pending:
-            if future.done():
-                peer.log("response", response=plain(future.result()))
-                pending.clear()
-                timer.cancel()
-                end()
-                return
-
-    timer = node.create_timer(0.1, ask)
-    return lambda: None
-
-
 if __name__ == "__main__":
-    verb = {"pub": publish, "echo": echo, "list": list_all, "call": call}[args.verb]
+    verb = {"pub": publish, "echo": echo, "list": list_all}[args.verb]
     peer.run(lambda new_node: verb(new_node(f"topic_{args.verb}")), args.seconds)

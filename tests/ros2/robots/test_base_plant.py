@@ -1,6 +1,8 @@
-"""A stand-in for a real TurtleBot3, by rclpy, below our plant: what it reads, and when the robot stops."""
+"""A TurtleBot3 below our plant, by rclpy or made up: what it reads, what it names, and when the robot stops."""
 
+import json
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -18,16 +20,18 @@ from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.messages.scan import ScanReader
 from bhd_lerobot.ros2.robots.base_plant import BasePlant
-from tests.ros2.peer_env import Peer
+from tests.cases import each_case
+from tests.ros2.feed import JOINTS, SCAN, Sent, feed, head, scan
+from tests.ros2.peer_env import Peer, free_domain
 from tests.waiting import until
 
 FORWARD = np.array([[0.1, 0.0]])
-_SOON_S = 10.0  # far longer than a stop takes, for a busy machine
+STAMPED, STRING = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/String"
 
 
-def make(domain: int, **options: float) -> BasePlant:
-    network = Ros2Config(domain=domain, **{"silence_s": 5.0, **options})  # type: ignore[arg-type]
-    return BasePlant(SimpleNamespace(beams=360, imu=True, ros2=network), turtlebot3_burger())
+def make(domain: int, *, imu: bool = True, **options: Any) -> BasePlant:
+    network = Ros2Config(domain=domain, **{"silence_s": 5.0, **options})
+    return BasePlant(SimpleNamespace(beams=360, imu=imu, ros2=network), turtlebot3_burger())
 
 
 def reading() -> PlantReading:
@@ -36,16 +40,23 @@ def reading() -> PlantReading:
     return out
 
 
-@pytest.fixture
-def robot(domain: int) -> Iterator[Peer]:
-    with Peer("standin_turtlebot3.py", "--open", domain=domain) as peer:
+@pytest.fixture(scope="module")
+def shared() -> Iterator[int]:
+    """The domain of a robot that all tests have, which none may end."""
+    with free_domain() as domain:
+        yield domain
+
+
+@pytest.fixture(scope="module")
+def robot(shared: int) -> Iterator[Peer]:
+    with Peer("standin_turtlebot3.py", "--open", "--half=50", domain=shared) as peer:
         peer.wait_event("ready")
         yield peer
 
 
 @pytest.fixture
-def plant(robot: Peer, domain: int) -> Iterator[BasePlant]:
-    made = make(domain)
+def plant(robot: Peer, shared: int) -> Iterator[BasePlant]:
+    made = make(shared)
     made.open()
     try:
         made.enable()
@@ -64,6 +75,12 @@ def drive(plant: BasePlant, goes_on: Callable[[], object], what: str) -> None:
     until(step, what)
 
 
+def fails(plant: BasePlant, match: str) -> None:
+    """Read until the plant raises."""
+    with pytest.raises(RealtimeError, match=match):
+        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+
+
 def moves(robot: Peer) -> bool:
     return bool(robot.events("report")) and abs(robot.events("report")[-1]["twist"][0]) > 0.05
 
@@ -73,25 +90,26 @@ def stands(robot: Peer) -> bool:
     return report["twist"] == [0.0, 0.0] and report["command"] == [0.0, 0.0]
 
 
-def test_it_reads_what_the_robot_measures_and_drives_it(robot: Peer, plant: BasePlant) -> None:
+def test_it_reads_and_drives_the_robot_and_stops_it_when_commands_cease_and_when_it_is_closed(
+    robot: Peer, plant: BasePlant, shared: int
+) -> None:
     out = reading()
     plant.read(out)
     now = time.monotonic_ns()
-    assert 0 < now - int(out.stamp_ns[0]) < 5e9
+    assert 0 < now - int(out.stamp_ns[0]) < 5e9  # type: ignore[index]
     assert 0 < now - int(out.sensors_ns[0]) < 5e9
     assert np.isfinite(out.sensors).all()
     assert 0.12 <= out.sensors[0, :360].min() <= out.sensors[0, :360].max() <= 3.5
     before = out.position.copy()
+    refused = f"Another program of this machine commands /cmd_vel in ROS domain {shared}"
+    with pytest.raises(RealtimeError, match=refused):
+        make(shared).open()
     drive(plant, lambda: moves(robot), "the robot moves")
     plant.read(out)
     assert (out.position > before).all()
     # turtlebot3_node gives wheel speeds in m/s; here they are in rad/s: 0.1 m/s on wheels of 33 mm.
     until(lambda: [plant.write(FORWARD), plant.read(out), out.velocity.min() > 2.5][2], "both wheels turn at 3 rad/s")
     np.testing.assert_allclose(out.velocity, 0.1 / 0.033, rtol=0.1)
-
-
-def test_it_stops_when_commands_cease_and_when_it_is_closed(robot: Peer, plant: BasePlant) -> None:
-    drive(plant, lambda: moves(robot), "the robot moves")
     until(lambda: stands(robot), "the robot stands without commands")
     drive(plant, lambda: moves(robot), "the robot moves again")
     plant.close()
@@ -110,80 +128,110 @@ def test_it_stops_when_the_node_is_killed_or_stopped(robot: Peer, plant: BasePla
         os.kill(plant.link.pids["node"], signal.SIGCONT)
 
 
-def test_a_guard_that_is_gone_is_a_fault(robot: Peer, plant: BasePlant) -> None:
+def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_that_is_gone_are_faults(
+    plant: BasePlant, shared: int
+) -> None:
+    def is_well() -> bool:
+        return not plant.link.problem
+
+    with Peer("standin_turtlebot3.py", domain=shared):
+        fails(plant, r"Several nodes send /(joint_states|scan|imu) at a time: .*two robots")
+    until(is_well, "the other robot has left")
+    with Peer("avoidance_node.py", domain=shared):
+        fails(plant, r"Another node commands the robot: /cmd_vel by (/avoidance_node|an unnamed node)")
+    until(is_well, "the other node has left")
     os.kill(plant.link.pids["guard"], signal.SIGKILL)
-    with pytest.raises(RealtimeError, match="guard ended with status -9"):
-        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+    fails(plant, "guard ended with status -9")
 
 
-def test_a_robot_that_is_gone_is_named(robot: Peer, plant: BasePlant) -> None:
-    robot.signal(signal.SIGKILL)
-    with pytest.raises(RealtimeError, match=r"/(joint_states|imu|scan).*no message for|Nobody publishes"):
-        until(lambda: [plant.read(reading()), False][1], "it is noticed")
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["--silence", "scan:6"], "/scan has sent no message for"),
-        (
-            ["--frame", "scan:laser"],
-            "cannot be used: The scans of /scan are in the frame 'laser', whose rotation in the robot is not",
-        ),
-    ],
-)
-@pytest.mark.thorough(but=1)
-def test_what_is_wrong_with_a_topic_is_named(domain: int, options: list[str], text: str) -> None:
-    with Peer("standin_turtlebot3.py", *options, domain=domain) as peer:
-        peer.wait_event("ready")
-        plant = make(domain)
-
-        def fails() -> None:
-            plant.link.open(patience_s=4.0)
-            until(lambda: [plant.read(reading()), False][1], "it is noticed")
-
+def test_a_silent_topic_and_a_robot_that_is_gone_are_named(domain: int) -> None:
+    plant = make(domain, silence_s=2.0)
+    with Peer("standin_turtlebot3.py", "--silence=scan:6", domain=domain) as robot:
+        robot.wait_event("ready")
         try:
-            with pytest.raises(RealtimeError, match=text):
-                fails()
+            plant.open()
+            fails(plant, "/scan has sent no message for")
+            robot.signal(signal.SIGKILL)
+            gone = ("/joint_states has sent no message for", "Nobody publishes /joint_states")
+            until(lambda: plant.link.problem.startswith(gone), "it is named")
         finally:
             plant.close()
 
 
-def test_another_node_that_commands_the_robot_is_named(robot: Peer, plant: BasePlant, domain: int) -> None:
+@pytest.mark.parametrize("fault", ["--zero-stamp=all", "--clock-offset=86400"])
+def test_stamps_of_zero_and_of_tomorrow_are_of_another_clock_and_nan_is_read_as_it_is(fault: str, domain: int) -> None:
+    """The check of all readings above the plants finds what is no number."""
+    plant, out = make(domain, imu=False, silence_s=1.0), PlantReading(1, 2, 360)
+    out.stamp_ns = np.zeros(1, np.int64)
+    with Peer("standin_turtlebot3.py", fault, "--nan=joint_states:0:999", "--nan=scan:0:999", domain=domain):
+        try:
+            plant.open()
+            before = int(plant.state()["count"][0])
+            until(lambda: plant.state()["count"][0] > before + 5, "five more joint states")
+            plant.read(out)
+            assert 0 < plant.state()["arrived_ns"][0] - out.stamp_ns[0] + 1 < 1e9
+            assert np.isnan(out.position).all()
+            np.testing.assert_array_equal(out.sensors, 3.5)  # a reading that is none is no return
+        finally:
+            plant.close()
+
+
+WHEELS = {
+    "name": ["wheel_left_joint", "wheel_right_joint"],
+    "position": np.array([[1.0, 2.0]]),
+    "velocity": np.zeros((1, 2)),
+}
+RANGES = np.ones(360)
+STILL = {"angle_increment": np.zeros(1)}
+UNUSABLE: dict[str, tuple[str, dict[str, Any], dict[str, Any], str]] = {  # joints, what is another about the scan, text
+    "no ranges": (JOINTS, WHEELS, {"ranges": np.zeros((1, 0), np.float32)}, "the scan has 0 ranges"),
+    "no angles": (JOINTS, WHEELS, STILL, "/scan cannot be used: .*angle"),
+    "too many": (
+        JOINTS,
+        WHEELS,
+        {"ranges": np.ones((1, 100_000), np.float32)},
+        "100000 ranges; at most 10000 are read",
+    ),
+    "another frame": (JOINTS, WHEELS, {"header": head("laser")}, "frame 'laser', whose rotation in the robot is not"),
+    "no joints": (JOINTS, {}, {}, "cannot be used: it has positions and velocities of no joint; needed"),
+    "no JointState": (STRING, {}, {}, f"/robot is of type {STRING}; .* of {JOINTS}"),
+}
+
+
+@pytest.mark.parametrize("what", UNUSABLE)
+@pytest.mark.thorough(but=3)
+def test_what_cannot_be_used_is_named(what: str, domain: int) -> None:
+    msgtype, wheels, changed, text = UNUSABLE[what]
+    plant = make(domain, imu=False, silence_s=1.0)
+
+    def sent(_: float) -> list[Sent]:
+        stamped = {"header": head()} if msgtype == JOINTS else {}
+        return [("/joint_states", msgtype, wheels | stamped), ("/scan", SCAN, scan(RANGES) | changed)]
+
+    with feed(domain, sent, receives=(("/cmd_vel", STAMPED),)):
+        try:
+            plant.link.open(None)
+            until(lambda: re.search(text, plant.link.problem), "it is named")
+        finally:
+            plant.close()
+
+
+def test_a_flood_is_read(domain: int) -> None:
+    plant, out = make(domain, imu=False, silence_s=1.0), PlantReading(1, 2, 360)
+    values = json.dumps({name: np.ravel(value).tolist() for name, value in WHEELS.items()})
+    flood = ("pub", "/joint_states", JOINTS, values, "--hz=1000", "--burst=10")
     with (
-        Peer("avoidance_node.py", domain=domain),
-        pytest.raises(
-            RealtimeError, match=r"Another node commands the robot: /cmd_vel by (/avoidance_node|an unnamed node)"
-        ),
+        feed(domain, lambda _: [("/scan", SCAN, scan(RANGES))], hz=5, receives=(("/cmd_vel", STAMPED),)),
+        Peer("topic.py", *flood, domain=domain),
     ):
-        until(lambda: [plant.read(reading()), False][1], "it is noticed")
-
-
-def test_a_namespace_and_another_scanner(domain: int) -> None:
-    plant = make(domain, namespace="tb3_1", scan_frame="laser")  # type: ignore[arg-type]
-    assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
-    assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
-    reader = plant.link.spec.inputs[1].reader
-    assert isinstance(reader, ScanReader)
-    assert (reader.topic, reader.frame) == ("/tb3_1/scan", "laser")
-
-
-def test_a_second_program_is_refused_and_the_first_drives_on(robot: Peer, plant: BasePlant, domain: int) -> None:
-    second = make(domain)
-    with pytest.raises(
-        RealtimeError, match=f"Another program of this machine commands /cmd_vel in ROS domain {domain}"
-    ):
-        second.open()
-    drive(plant, lambda: moves(robot), "the robot moves")
-    plant.read(reading())
-
-
-def test_two_robots_of_one_name_are_named(robot: Peer, plant: BasePlant, domain: int) -> None:
-    with (
-        Peer("standin_turtlebot3.py", domain=domain),
-        pytest.raises(RealtimeError, match=r"Several nodes send /(joint_states|scan) at a time: .*two robots"),
-    ):
-        until(lambda: [plant.read(reading()), False][1], "it is noticed")
+        try:
+            plant.link.open(patience_s=30.0)
+            plant.read(out)
+            np.testing.assert_array_equal(out.position, [[1.0, 2.0]])
+            count = plant.state()["count"][0]
+            until(lambda: plant.state()["count"][0] > count + 1000, "a thousand more joint states")
+        finally:
+            plant.close()
 
 
 def test_a_network_with_nobody_is_named(domain: int) -> None:
@@ -193,7 +241,16 @@ def test_a_network_with_nobody_is_named(domain: int) -> None:
     plant.close()
 
 
-@pytest.mark.parametrize(
+def test_a_namespace_and_another_scanner() -> None:
+    plant = make(1, namespace="tb3_1", scan_frame="laser")
+    assert [one.topic for one in plant.link.spec.inputs] == ["/tb3_1/joint_states", "/tb3_1/scan", "/tb3_1/imu"]
+    assert [one.topic for one in plant.link.spec.outputs] == ["/tb3_1/cmd_vel"]
+    reader = plant.link.spec.inputs[1].reader
+    assert isinstance(reader, ScanReader)
+    assert (reader.topic, reader.frame) == ("/tb3_1/scan", "laser")
+
+
+@each_case(
     ("options", "brain_s", "plant_s"),
     [
         ({}, 0.2, 0.5),
@@ -208,14 +265,14 @@ def test_the_brain_of_a_ros_robot_is_waited_for_as_long_as_its_commands(
     assert (realtime.brain_timeout_s, realtime.plant_timeout_s) == (brain_s, plant_s)
 
 
-@pytest.mark.parametrize(("options", "latency_s"), [({}, 0.3), ({"latency_s": 0.0}, 0.0), ({"latency_s": 0.7}, 0.7)])
+@each_case(("options", "latency_s"), [({}, 0.3), ({"latency_s": 0.0}, 0.0), ({"latency_s": 0.7}, 0.7)])
 def test_how_late_a_base_follows_is_an_option(options: dict[str, float], latency_s: float) -> None:
     plant = make(1, **options)
     assert plant.latency_s == latency_s
     assert "/cmd_vel" in plant.hint
 
 
-@pytest.mark.parametrize("options", [{"latency_s": -0.1}, {"latency_s": 3.0}, {"scan_yaw": np.nan}, {"silence_s": 0.0}])
+@each_case("options", [{"latency_s": -0.1}, {"latency_s": 3.0}, {"scan_yaw": np.nan}, {"silence_s": 0.0}])
 def test_options_that_cannot_be_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(options))):
         Ros2Config(**options)  # type: ignore[arg-type]
