@@ -7,16 +7,26 @@ import json
 import re
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bhd_lerobot.cli import record, serve
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig
+from bhd_lerobot.ros2.live.node import Node, Publisher, Subscription
+from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.serve.interface import ESTOP_TOPIC, RESET_TOPIC, RESULT, RESULT_TOPIC
 from tests.forks import Fork
+from tests.ros2.peer_env import free_domain
 from tests.waiting import until
+
+BOOL, STATE = "std_msgs/msg/Bool", "bhd_interfaces/msg/CerebellumState"
 
 RELAXED = (
     "--robot.realtime.brain_timeout_s=20",
@@ -85,6 +95,64 @@ class Served(Program):
         found = re.search(r"Contact in (\d+) of (\d+) control ticks", self.text)
         assert found, self.text
         return int(found[1]), int(found[2])
+
+
+class Side:
+    """Another node, and the robot that it commands."""
+
+    def __init__(self, served: Served, node: Node) -> None:
+        self.served, self.node = served, node
+        self.states = node.subscription("/cerebellum/state", STATE)
+        self.results = node.subscription(RESULT_TOPIC, RESULT, EVERY)
+        self.diagnostics = node.subscription("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        self._publishers: dict[str, Publisher] = {}
+
+    def publisher(self, topic: str, msgtype: str) -> Publisher:
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.publisher(topic, msgtype, EVERY)
+        publisher = self._publishers[topic]
+        until(lambda: publisher.receivers, f"the robot receives {topic}")
+        return publisher
+
+    def send(self, topic: str, msgtype: str, fields: dict[str, Any]) -> None:
+        self.publisher(topic, msgtype).send(encode(msgtype, fields, 1)[0])
+
+    def newest(self, subscription: Subscription | None = None) -> Any:
+        return until((subscription or self.states).take, "a message comes")[-1].message()
+
+    def state(self) -> Any:
+        self.states.take()
+        return self.newest()
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        return np.asarray(self.state().joint_positions)[:6]
+
+    def wait(self, holds: Callable[[Any], Any], text: str) -> None:
+        until(lambda: holds(self.state()), text)
+
+    def ended(self, count: int) -> list[Any]:
+        found: list[Any] = []
+        until(lambda: [found.extend(one.message() for one in self.results.take()), len(found) >= count][1], "results")
+        return found
+
+    def press(self) -> None:
+        self.send(ESTOP_TOPIC, BOOL, {"data": True})
+        self.wait(lambda state: state.emergency_stop, "the stop is latched")
+
+    def reset(self) -> None:
+        self.send(RESET_TOPIC, "std_msgs/msg/Empty", {})
+        self.wait(lambda state: not state.emergency_stop, "the robot is reset")
+
+
+def served(robot: str, folder: Path, *options: str) -> Iterator[Side]:
+    """Serve a robot beside another node, for tests that share both."""
+    with (
+        free_domain() as domain,
+        Served(robot, *options, domain=domain, log=folder / "log") as program,
+        Node("other", NetworkConfig(domain=domain)) as node,
+    ):
+        yield Side(program, node)
 
 
 def _record(options: list[str], starts: Path) -> int:

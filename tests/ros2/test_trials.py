@@ -11,7 +11,7 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli import record, train
 from bhd_lerobot.cli.data.main import main as data
 from tests.ros2.peer_env import Peer, environment
-from tests.ros2.programs import Recording, Served, log_of
+from tests.ros2.programs import Recording, Served, Side, log_of, served
 from tests.waiting import until
 
 IS_FULL = os.environ.get("BHD_TRIALS") == "full"
@@ -184,16 +184,21 @@ def goal(*position: float, orientation: tuple[float, ...] = DOWN) -> str:
 ASIDE = (HOME[0], HOME[1] + 0.1, HOME[2])
 FLOATS = "std_msgs/msg/Float64MultiArray"
 REACHED = "The target is reached."
+NAMES = itertools.count()
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Side]:
+    environment(messages=True)
+    yield from served("ur5", tmp_path_factory.mktemp("arm"), "--state_hz=40")
 
 
 @pytest.fixture
-def talk(domain: int) -> Callable[..., list[tuple[bool, str]]]:
+def talk(arm: Side) -> Callable[..., list[tuple[bool, str]]]:
     """Return a function that sends goals as the articles' brain does, and returns the one result of each."""
-    environment(messages=True)
-    names = itertools.count()
 
-    def send(*options: str, **brain: Any) -> list[tuple[bool, str]]:
-        name = brain.get("name", f"brain-{next(names)}")
+    def send(*options: str, name: str = "") -> list[tuple[bool, str]]:
+        name, domain = name or f"brain-{next(NAMES)}", arm.node.network.domain_number
         with Peer("brain_node.py", f"--name={name}", "--linger=0.3", *options, domain=domain) as peer:
             summary = peer.wait_event("summary")
             results = sorted(peer.events("result"), key=lambda line: line["task_id"])
@@ -205,54 +210,48 @@ def talk(domain: int) -> Callable[..., list[tuple[bool, str]]]:
 
 
 def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate(
-    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+    arm: Side, talk: Callable[..., list[tuple[bool, str]]]
 ) -> None:
     bad = {
         goal(3.0, 0.0, 0.3): "too far away",
         goal(math.nan, 0.0, 0.3): "must be finite",
         goal(*HOME, orientation=(0.0, 0.0, 0.0, 0.0)): "norm of the quaternion",
     }
-    with Served("ur5", "--state_hz=40", domain=domain, log=tmp_path / "log"):
-        first, *refused, last = talk(goal(*ASIDE), *bad, goal(*HOME), name="first")
-        assert first == last == (True, REACHED)
-        for (success, message), why in zip(refused, bad.values(), strict=True):
-            assert not success
-            assert why in message
-        [(success, message)] = talk(goal(*ASIDE), name="first")
+    first, *refused, last = talk(goal(*ASIDE), *bad, goal(*HOME), name="first")
+    assert first == last == (True, REACHED)
+    for (success, message), why in zip(refused, bad.values(), strict=True):
         assert not success
-        assert "already had the task_id 'first-0'" in message
-        [(success, message)] = talk(goal(*ASIDE), "--frame=map")
-        assert not success
-        assert "'map'" in message
-        assert talk(goal(*ASIDE), goal(*HOME), "--preempt=0.1") == [(True, REACHED)] * 2  # the second waits
-        slowly = ("--name=slow", "--max-velocity=0.01", "--linger=0.3")
-        home = json.dumps({"data": ur5().home[:6]})
-        with Peer("brain_node.py", goal(*ASIDE), *slowly, domain=domain) as brain:
-            brain.wait_event("command")
-            with Peer("topic.py", "pub", "/forward_position_controller/commands", FLOATS, home, domain=domain):
-                summary = brain.wait_event("summary")
-        assert (summary["once"], summary["twice"]) == (1, 0)
-        assert summary["state_hz"] == pytest.approx(40, rel=0.1)
-        assert "A setpoint came" in brain.events("result")[0]["message"]
+        assert why in message
+    [(success, message)] = talk(goal(*ASIDE), name="first")
+    assert not success
+    assert "already had the task_id 'first-0'" in message
+    [(success, message)] = talk(goal(*ASIDE), "--frame=map")
+    assert not success
+    assert "'map'" in message
+    assert talk(goal(*ASIDE), goal(*HOME), "--preempt=0.1") == [(True, REACHED)] * 2  # the second waits
+    slowly = ("--name=slow", "--max-velocity=0.01", "--linger=0.3")
+    with Peer("brain_node.py", goal(*ASIDE), *slowly, domain=arm.node.network.domain_number) as brain:
+        brain.wait_event("command")
+        arm.wait(lambda state: state.is_moving, "it moves")
+        arm.send("/forward_position_controller/commands", FLOATS, {"data": np.array([ur5().home[:6]])})
+        summary = brain.wait_event("summary")
+    assert (summary["once"], summary["twice"]) == (1, 0)
+    states: list[Any] = []
+    until(lambda: [states.extend(one.message() for one in arm.states.take()), len(states) > 40][1], "forty states")
+    stamps = np.array([one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in states])
+    assert np.median(np.diff(stamps)) == pytest.approx(1e9 / 40, rel=0.1)
+    assert "A setpoint came" in brain.events("result")[0]["message"]
 
 
 def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
-    domain: int, talk: Callable[..., list[tuple[bool, str]]], tmp_path: Path
+    arm: Side, talk: Callable[..., list[tuple[bool, str]]]
 ) -> None:
-    def publish_until(is_stopped: bool, topic: str, kind: str, values: str) -> None:
-        with (
-            Peer("topic.py", "echo", "/cerebellum/state", "bhd_interfaces/msg/CerebellumState", domain=domain) as echo,
-            Peer("topic.py", "pub", topic, kind, values, domain=domain),
-        ):
-            echo.wait(lambda line: line.get("message", {}).get("emergency_stop") is is_stopped, f"stop: {is_stopped}")
-
-    with Served("ur5", domain=domain, log=tmp_path / "log"):
-        publish_until(True, "/emergency_stop", "std_msgs/msg/Bool", '{"data": true}')
-        [(success, message)] = talk(goal(*ASIDE))
-        assert not success
-        assert "emergency stop" in message
-        publish_until(False, "/emergency_stop/reset", "std_msgs/msg/Empty", "{}")
-        assert talk(goal(*ASIDE)) == [(True, REACHED)]
+    arm.press()
+    [(success, message)] = talk(goal(*ASIDE))
+    assert not success
+    assert "emergency stop" in message
+    arm.reset()
+    assert talk(goal(*ASIDE)) == [(True, REACHED)]
 
 
 def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ class Goal:
 
         def is_decided() -> bool:
             mine = any(bytes(one.goal_id.uuid) == self.id for reply in replies.all() for one in reply.goals_canceling)
-            return mine or self.status >= GoalStatus.CANCELING or replies.are_final
+            return mine or self.status >= GoalStatus.CANCELING or replies.are_final()
 
         client._update()
         if self.status.is_end:
@@ -302,7 +302,7 @@ class ActionClient:
         replies.request({"goal_id": sent._uuid, "goal": goal})
         self._wait(
             sent,
-            lambda: bool(sent.status) or (replies.are_final and not replies.all()[-1].accepted),
+            lambda: bool(sent.status) or replies.are_final(lambda reply: not reply.accepted),
             max(0.0, end - time.monotonic()),
             f"has not replied within {timeout_s:g} s. The goal may have been accepted",
         )
@@ -353,18 +353,18 @@ class _Replies:
     """
 
     def __init__(self, service: ServiceClient) -> None:
-        self._service, self._taken, self._since = service, list[Any](), math.inf
+        self._service, self._taken = service, list[tuple[float, Any]]()  # with the times of arrival [s]
 
     def request(self, request: Mapping[str, Any]) -> None:
         self._service._replies.take()
         self._service._requests.send(encode_one(f"{self._service.srvtype}_Request", request))
 
     def all(self) -> list[Any]:
-        if new := self._service._replies.take():
-            self._taken += [received.message() for received in new]
-            self._since = min(self._since, time.monotonic())
-        return self._taken
+        now = time.monotonic()
+        self._taken += [(now, received.message()) for received in self._service._replies.take()]
+        return [reply for _, reply in self._taken]
 
-    @property
-    def are_final(self) -> bool:
-        return bool(self.all()) and time.monotonic() > self._since + _FINAL_S
+    def are_final(self, fits: Callable[[Any], bool] = lambda reply: True) -> bool:
+        """Return whether one that fits has been there for that time, whatever others have come since."""
+        self.all()
+        return any(time.monotonic() > at + _FINAL_S and fits(reply) for at, reply in self._taken)

@@ -1,6 +1,6 @@
 """The articles' brain: it sends pose goals on /brain/command, one after the other, and waits for the result of each.
 
-It counts results that come twice, that nobody asked for, or never, and the rate of the state topic.
+It counts results that come twice, that nobody asked for, or never.
 """
 
 import math
@@ -38,7 +38,7 @@ class Brain:
         node.create_subscription(CerebellumState, "/cerebellum/state", self.on_state, 10)
         self.sent: dict[str, float] = {}  # task -> when [s]
         self.results: dict[str, list[dict[str, Any]]] = {}
-        self.state_times: list[float] = []
+        self.states = 0
         self.finished: float | None = None
         node.create_timer(0.02, self.act)
 
@@ -46,7 +46,7 @@ class Brain:
         now = time.monotonic()
         # What is sent the moment a subscription is found can be lost: wait for a state as well.
         is_heard = self.commands.get_subscription_count() and self.node.count_publishers("/brain/result")
-        if not self.sent and not (is_heard and self.state_times):
+        if not self.sent and not (is_heard and self.states):
             return
         waiting = [
             task for task, since in self.sent.items() if task not in self.results and now - since < args.patience
@@ -84,10 +84,9 @@ class Brain:
         peer.log("result", **line)
 
     def on_state(self, _: CerebellumState) -> None:
-        self.state_times.append(time.monotonic())
+        self.states += 1
 
     def conclude(self) -> None:
-        times = self.state_times
         peer.log(
             "summary",
             sent=len(self.sent),
@@ -95,7 +94,6 @@ class Brain:
             twice=sum(len(lines) > 1 for lines in self.results.values()),
             never=sum(task not in self.results for task in self.sent),
             unknown=sum(task not in self.sent for task in self.results),
-            state_hz=(len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
         )
 
 

@@ -80,7 +80,7 @@ class Servers:
             goal.succeed()
         result = Fibonacci.Result()
         result.sequence = numbers
-        peer.log("ended", goal=bytes(goal.goal_id.uuid).hex(), succeeded=goal.status == GoalStatus.STATUS_SUCCEEDED)
+        peer.log("ended", order=goal.request.order, succeeded=goal.status == GoalStatus.STATUS_SUCCEEDED)
         return result
 
     async def pause(self, seconds: float) -> None:

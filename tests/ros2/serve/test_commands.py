@@ -1,7 +1,8 @@
 """What becomes of commands to a served robot: none is lost, a refused one changes nothing, what is cut is said."""
 
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,70 +10,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig, Qos
-from bhd_lerobot.ros2.live.node import Node, Publisher, Subscription
+from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC, RESET_TOPIC, RESULT, RESULT_TOPIC
-from tests.ros2.peer_env import free_domain
-from tests.ros2.programs import Served
+from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC
+from tests.ros2.peer_env import Peer
+from tests.ros2.programs import BOOL, Served, Side, served
 from tests.waiting import until
 
-BOOL, STATE = "std_msgs/msg/Bool", "bhd_interfaces/msg/CerebellumState"
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+FORWARD = {"linear": {"x": 0.1}}
 JOINTS = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 
 
-class Side:
-    """Another node, and the robot that it commands."""
-
-    def __init__(self, served: Served, node: Node) -> None:
-        self.served, self.node = served, node
-        self.states = node.subscription("/cerebellum/state", STATE)
-        self.results = node.subscription(RESULT_TOPIC, RESULT, EVERY)
-        self.diagnostics = node.subscription("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-        self._publishers: dict[str, Publisher] = {}
-
-    def publisher(self, topic: str, msgtype: str) -> Publisher:
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.publisher(topic, msgtype, EVERY)
-        publisher = self._publishers[topic]
-        until(lambda: publisher.receivers, f"the robot receives {topic}")
-        return publisher
-
-    def send(self, topic: str, msgtype: str, fields: dict[str, Any]) -> None:
-        self.publisher(topic, msgtype).send(encode(msgtype, fields, 1)[0])
-
-    def newest(self, subscription: Subscription | None = None) -> Any:
-        return until((subscription or self.states).take, "a message comes")[-1].message()
-
-    def state(self) -> Any:
-        self.states.take()
-        return self.newest()
-
-    @property
-    def joints(self) -> NDArray[np.float64]:
-        return np.asarray(self.state().joint_positions)[:6]
-
-    def wait(self, holds: Callable[[Any], Any], text: str) -> None:
-        until(lambda: holds(self.state()), text)
-
-    def ended(self, count: int) -> list[Any]:
-        found: list[Any] = []
-        until(lambda: [found.extend(one.message() for one in self.results.take()), len(found) >= count][1], "results")
-        return found
-
-    def reset(self) -> None:
-        self.send(RESET_TOPIC, "std_msgs/msg/Empty", {})
-        self.wait(lambda state: not state.emergency_stop, "the robot is reset")
-
-
-def served(robot: str, folder: Path, *options: str) -> Iterator[Side]:
-    with (
-        free_domain() as domain,
-        Served(robot, *options, domain=domain, log=folder / "log") as program,
-        Node("other", NetworkConfig(domain=domain)) as node,
-    ):
-        yield Side(program, node)
+def moves(side: Side) -> None:
+    side.wait(lambda state: state.is_moving, "it drives")
 
 
 @pytest.fixture(scope="module")
@@ -134,17 +86,56 @@ def test_each_goal_of_a_burst_to_an_arm_has_one_result(arm: Side) -> None:
 
 
 def test_a_refused_twist_leaves_the_goal_alone(base: Side) -> None:
-    twist = "geometry_msgs/msg/TwistStamped"
     base.send(COMMAND_TOPIC, COMMAND, goal("the goal", -0.4))
     for value in (np.nan, np.inf):
-        base.send("/cmd_vel", twist, {"twist": {"linear": {"x": value}}})
+        base.send("/cmd_vel", STAMPED, {"twist": {"linear": {"x": value}}})
+    base.served.wait_for("/cmd_vel: the command holds NaN or an infinity")
     [result] = base.ended(1)
     assert (result.task_id, result.success) == ("the goal", True)
     base.send(COMMAND_TOPIC, COMMAND, goal("another", 0.4))
-    base.wait(lambda state: state.is_moving, "it drives")
-    base.send("/cmd_vel", twist, {"twist": {"linear": {"x": 0.0}}})
+    moves(base)
+    base.send("/cmd_vel", STAMPED, {"twist": {"linear": {"x": 0.0}}})
     [result] = base.ended(1)
     assert (result.task_id, result.success) == ("another", False)
+
+
+@pytest.mark.parametrize("seconds", [0, 2_000_000_000], ids=["zero", "tomorrow"])
+def test_twists_with_wrong_stamps_are_taken_as_a_real_robot_does(seconds: int, base: Side) -> None:
+    stamped = {"header": {"stamp": {"sec": np.array([seconds])}}, "twist": FORWARD}
+    base.wait(lambda state: [base.send("/cmd_vel", STAMPED, stamped), state.is_moving][1], "it drives")
+    base.wait(lambda state: not state.is_moving, "it stands without commands")
+
+
+def test_a_flood_of_commands_is_followed_and_the_robot_still_answers(base: Side) -> None:
+    flood = ("/cmd_vel", STAMPED, json.dumps({"twist": FORWARD}), "--hz=1000", "--burst=10")
+    with Peer("topic.py", "pub", *flood, domain=base.node.network.domain_number):
+        moves(base)
+        for _ in range(20):
+            base.state()
+    base.wait(lambda state: not state.is_moving, "it stands without commands")
+
+
+def test_a_command_of_an_absurd_size_gets_its_result_and_others_theirs(base: Side) -> None:
+    for name in ("a" * 10_000_000, "small"):
+        wrong = goal(name, 0.0) | {"target_pose": {"orientation": {"w": 0.0}}}
+        base.send(COMMAND_TOPIC, COMMAND, wrong)
+        [result] = base.ended(1)
+        assert (result.task_id, result.success) == (name, False)
+
+
+def test_a_node_whose_topic_does_not_fit_is_named(base: Side) -> None:
+    misfits = [
+        ("of type", base.node.publisher("/cmd_vel", TWIST), f"of /cmd_vel in /other is of type {TWIST}"),
+        (
+            "effort",
+            base.node.publisher("/cmd_vel", STAMPED, Qos(1, reliable=False)),
+            "/cmd_vel in /other is best effort",
+        ),
+        ("scan", base.node.subscription("/scan", "sensor_msgs/msg/LaserScan"), "of /scan in /other is reliable"),
+    ]
+    for _, end, text in misfits:
+        base.served.wait_for(text)
+        del end
 
 
 def trajectory(arm: Side, positions: NDArray[np.float64], ahead_s: float | None = None, **point: Any) -> None:
