@@ -10,7 +10,7 @@ from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_brain
 from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks
-from bhd_lerobot.teleoperators.keyboard import KeyboardConfig
+from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 
 
 @contextmanager

@@ -151,6 +151,16 @@ def test_help_and_errors_need_neither_pytorch_nor_pandas_nor_matplotlib(module: 
     assert not loaded & {"torch", "pandas", "matplotlib", "deepdiff", "datasets", "av"}
 
 
+def test_a_recording_of_a_simulation_needs_no_pytorch(tmp_path: Path) -> None:
+    options = ["--robot.type=turtlebot3", "--brain.type=avoidance", "--task.type=free", "--task.instruction=drive"]
+    options += ["--task.duration_s=1", "--dataset.num_episodes=1", "--dataset.repo_id=test/light"]
+    options += [f"--dataset.root={tmp_path / 'light'}", f"--output_dir={tmp_path / 'run'}"]
+    program = f"import sys; sys.argv[1:] = {options}; from bhd_lerobot.cli import start; assert start.record() == 0"
+    program += "; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT, stdin=subprocess.DEVNULL)
+    assert len(list((tmp_path / "light" / "data").rglob("*.parquet"))) == 1
+
+
 def test_lerobots_packages_are_what_they_were_once_they_are_needed() -> None:
     program = """
 import sys
