@@ -108,47 +108,39 @@ def test_every_command_names_the_nearest_option_with_status_2(capsys: pytest.Cap
         assert (status, "Did you mean" in capsys.readouterr().err) == (2, True), module
 
 
-@pytest.mark.parametrize(
-    ("program", "slow"),
-    [
-        ("import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main", "numpy torch lerobot rich yaml pyarrow mujoco"),
-        ("import bhd_lerobot.cli.data.main as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
-    ],
-    ids=["before Ctrl-C is handled", "for the help"],
-)
-def test_nothing_slow_is_imported(program: str, slow: str) -> None:
+def loaded(program: str) -> list[set[str]]:
+    """Return the packages that a new interpreter has loaded at each call of `show` in a program."""
+    show = "import sys; show = lambda: print('@', *sys.modules, file=sys.stderr)\n"
     done = subprocess.run(
-        [sys.executable, "-c", f"{program}; import sys; print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT,
+        [sys.executable, "-c", show + program], capture_output=True, text=True, check=True, cwd=ROOT,
         stdin=subprocess.DEVNULL,
-    )
-    loaded = {name.partition(".")[0] for name in done.stdout.split()}
-    assert not loaded & {*slow.split(), "huggingface_hub"}
+    )  # fmt: skip
+    shown = [line.split()[1:] for line in done.stderr.splitlines() if line.startswith("@ ")]
+    return [{name.partition(".")[0] for name in names} for names in shown]
 
 
-@pytest.mark.parametrize(
-    ("module", "arguments"),
-    [
-        ("cli.record", ["--help"]),
-        ("cli.record", ["--robot.type=turtelbot"]),
-        ("cli.record", ["--config_path=there_is_none.yaml"]),
-        ("cli.evaluate", ["--help"]),
-        ("cli.replay", ["--help"]),
-        ("cli.ros2", ["serve", "--help"]),
-    ],
-)
-def test_help_and_errors_need_neither_pytorch_nor_pandas_nor_matplotlib(module: str, arguments: list[str]) -> None:
-    program = f"import sys; sys.argv[1:] = {arguments}; from bhd_lerobot.cli import start"
-    program += f"; start.run('bhd_lerobot.{module}'); print(*sys.modules, file=sys.stderr)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
+def test_nothing_slow_is_imported_before_ctrl_c_is_handled_and_for_the_help() -> None:
+    before, for_help = loaded(
+        "import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main as data; show()\n"
+        "try: data.main(['--help'])\nexcept SystemExit: show()"
     )
-    loaded = {name.partition(".")[0] for name in done.stderr.splitlines()[-1].split()}
-    assert "bhd_lerobot" in loaded
-    assert not loaded & {"torch", "pandas", "matplotlib", "deepdiff", "datasets", "av"}
+    slow = {"torch", "lerobot", "mujoco", "huggingface_hub", "rosbags", "av", "PIL"}
+    assert not before & {*slow, "numpy", "rich", "yaml", "pyarrow"}
+    assert not for_help & {*slow, "pandas", "pinocchio", "matplotlib", "ray"}
+
+
+def test_help_and_errors_need_neither_pytorch_nor_pandas_nor_matplotlib() -> None:
+    commands = [
+        ("record", "--help"), ("record", "--robot.type=turtelbot"), ("record", "--config_path=there_is_none.yaml"),
+        ("evaluate", "--help"), ("replay", "--help"), ("ros2", "serve", "--help"),
+    ]  # fmt: skip
+    program = "from bhd_lerobot.cli import start\n"
+    for module, *arguments in commands:
+        program += f"sys.argv[1:] = {arguments}; start.run('bhd_lerobot.cli.{module}'); show()\n"
+    found = loaded(program)
+    assert len(found) == len(commands)
+    for command, packages in zip(commands, found, strict=True):
+        assert not packages & {"torch", "pandas", "matplotlib", "deepdiff", "datasets", "av"}, command
 
 
 def test_a_recording_of_a_simulation_needs_no_pytorch(tmp_path: Path) -> None:
@@ -170,7 +162,7 @@ import lerobot.robots.config
 assert "torch" not in sys.modules
 from lerobot.robots import Robot, make_robot_from_config
 from lerobot.utils import constants
-from lerobot.policies import *
+from lerobot.robots import *
 import lerobot.robots as package
 assert "torch" in sys.modules
 assert Robot is sys.modules["lerobot.robots.robot"].Robot and "Robot" in package.__all__

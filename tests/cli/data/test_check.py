@@ -57,11 +57,6 @@ def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_p
     assert "file-009" in capsys.readouterr().out
 
 
-def test_no_dataset_is_status_2(tmp_path: Path, capsys) -> None:
-    assert main.main(["check", str(tmp_path)]) == 2
-    assert "is not a LeRobot dataset" in capsys.readouterr().err
-
-
 def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
     for name, kind in robot_configs().items():
         limits = kind().body().limits

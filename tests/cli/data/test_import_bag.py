@@ -88,38 +88,6 @@ def test_a_scan_is_the_newest_and_its_beams_are_in_order(dataset):
         assert scan == pytest.approx(bags.distance(angle, (stamp - START) / NANO), abs=1e-6)
 
 
-def test_other_scanners_see_the_same(tmp_path, dataset):
-    expected = read_episode(dataset, 0)["observation.state"]
-    for number, scanner in enumerate(
-        [
-            {"clockwise": True},
-            {"angle_min": -np.pi},
-            {"beams": 223},
-            {"beams": 720, "clockwise": True, "angle_min": 1.0},
-        ]
-    ):
-        root = tmp_path / f"d{number}"
-        imported(write(tmp_path / f"bag{number}", drive(**scanner)), root)
-        difference = np.abs(expected - read_episode(root, 0)["observation.state"]).max()
-        assert difference < 1.4 * np.pi / scanner.get("beams", 360) + 1e-5, scanner
-
-
-def test_what_happens_later_changes_nothing_before(tmp_path, dataset):
-    """The law of no look-ahead, for whole bags: after t everything is another drive, with a gap and a clock jump."""
-    until = START + 3 * NANO
-    other = [one for one in drive() if one[1] <= until]
-    other += [(topic, time + NANO, bags.twist(9, 9) if topic == "/cmd_vel" else message)
-              for topic, time, message in drive(seed=5) if time > until]  # fmt: skip
-    imported(write(tmp_path / "bag", other), tmp_path / "b", "--stamps=auto")
-    ours, theirs = read_episode(dataset, 0), read_episode(tmp_path / "b", 0)
-    start = source_of(dataset)["start_ns"]
-    count = (until - start) // (NANO // 10) - 1
-    assert count > 20
-    for key, values in ours.items():
-        if key != "next.done":
-            assert np.array_equal(values[:count], theirs[key][:count]), key
-
-
 def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     def keep(message):
         time = (message[1] - START) / NANO
@@ -148,10 +116,14 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("jump", "note", "storage"),
-    [(-3600, "jumped back 1 times", "sqlite3"), (86400 * 365, "clock jumped ahead", "mcap")],
+    [
+        (-3600, "jumped back 1 times", "sqlite3"),
+        (86400 * 365, "clock jumped ahead", "mcap"),
+        (-0.3, "the clock jumped back", "mcap"),  # as by NTP
+    ],
 )
 def test_clock_jumps_split_the_episode(tmp_path, capsys, jump, note, storage):
-    first, second = drive(seconds=4), drive(seconds=4, start=START + (4 + jump) * NANO)
+    first, second = drive(seconds=4), drive(seconds=4, start=START + int((4 + jump) * NANO))
     info = imported(write(tmp_path / "bag", first + second, storage), tmp_path / "d")
     assert note in capsys.readouterr().err
     assert len(info.episodes) == 2
@@ -212,11 +184,10 @@ def test_all_topics_that_are_missing_are_named_at_once(tmp_path, capsys):
     assert "/odom, which" not in error
 
 
-@pytest.mark.parametrize("options", [(), ("--scan=scan", "--cmd=/cmd_vel")])
-def test_a_topic_has_its_name_with_and_without_the_slash(tmp_path, plain, dataset, options):
+def test_a_topic_has_its_name_with_and_without_the_slash(tmp_path, plain, dataset):
     plains = [(topic.removeprefix("/"), at, message) for topic, at, message in drive()]
-    imported(write(tmp_path / "bag", plains), tmp_path / "d", *options)
-    imported(plain, tmp_path / "e", *options)
+    imported(write(tmp_path / "bag", plains), tmp_path / "d")
+    imported(plain, tmp_path / "e", "--scan=scan", "--cmd=/cmd_vel")
     for key, values in read_episode(dataset, 0).items():
         for root in (tmp_path / "d", tmp_path / "e"):
             assert np.array_equal(values, read_episode(root, 0)[key]), key
@@ -403,11 +374,6 @@ def test_a_robot_that_stands_against_its_last_command_is_reported(tmp_path, caps
     assert re.search(r"in (29|3[01]) of 60 frames .* stands though its last command", capsys.readouterr().err)
 
 
-def test_commands_of_another_clock_are_refused(tmp_path, capsys):
-    messages = [(topic, at + 1000 * NANO if topic == "/cmd_vel" else at, message) for topic, at, message in drive()]
-    assert "Their stamps are of different clocks" in refused(write(tmp_path / "bag", messages), tmp_path / "d", capsys)
-
-
 def test_a_computer_whose_clock_is_off_is_noticed_where_it_matters(tmp_path, capsys):
     """Else each observation would have the command of another time."""
     make = {"/scan": bags.scan, "/odom": bags.odometry}
@@ -419,14 +385,6 @@ def test_a_computer_whose_clock_is_off_is_noticed_where_it_matters(tmp_path, cap
     # With headers everywhere it does not matter whether the recorder's clock is that of the robot, or as fast.
     slow = [(topic, START + 2 * (at - START), one) for topic, at, one in drive(stamped=True)]
     assert imported(write(tmp_path / "slow", slow), tmp_path / "s", "--stamps=header").frames > 30
-
-
-def test_a_step_of_the_recorders_clock_begins_an_episode(tmp_path, capsys):
-    """As of NTP: what was heard before and after must not be sorted into each other."""
-    half = START + 4 * NANO
-    messages = [(topic, at if at < half else at - 3 * NANO // 10, message) for topic, at, message in drive(seconds=8)]
-    assert len(imported(write(tmp_path / "bag", messages), tmp_path / "d").episodes) == 2
-    assert "the clock jumped back" in capsys.readouterr().err
 
 
 def test_a_truncated_bag_is_imported_up_to_its_end_with_a_message(tmp_path, capsys, plain, dataset):
@@ -595,7 +553,7 @@ def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source)
         (path,) = (one for one in write(tmp_path / "bag", drive(seconds=2), source).iterdir() if one.suffix != ".yaml")
     whole, damaged = path.read_bytes(), tmp_path / f"damaged{path.suffix}"
     statuses = set()
-    for seed in range(30):
+    for seed in range(14):
         rng = np.random.default_rng(seed)
         content = np.frombuffer(whole, np.uint8).copy()
         reach = len(content) if seed % 2 else 6000

@@ -1,6 +1,5 @@
 """bhd-data: what it shows, and what it says about what is broken."""
 
-import argparse
 import json
 import os
 import shutil
@@ -131,20 +130,6 @@ def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
         error = capsys.readouterr().err
         assert "name the dataset, in one way: its folder (ROOT or --root), or --repo_id" in error
         assert all(argument in error for argument in arguments)
-
-
-def test_help_names_every_value_by_what_it_is():
-    """Not by the name that the program has for it, such as ROOT_OPTION."""
-    (commands,) = (one for one in main._parser()._actions if isinstance(one, argparse._SubParsersAction))
-    for name in ["info", "timing", "check", "repair", "mark", "merge", "filter", "delete", "split", "view"]:
-        for action in commands.choices[name]._actions:
-            assert action.nargs == 0 or (action.metavar and action.help), f"{name}: {action.dest}"
-            assert "_" not in str(action.metavar)
-
-
-def test_repair_of_a_valid_dataset_has_nothing_to_do(recorded, capsys):
-    assert main.main(["repair", str(recorded)]) == 0
-    assert "nothing to do" in capsys.readouterr().out
 
 
 def test_repair_reports_what_it_dropped(recorded, tmp_path, capsys):

@@ -1,13 +1,11 @@
 """bhd-data timing: what it says of a recording on the wall clock, of one in simulated time, and of what is neither."""
 
-import io
 import json
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.cli.data import main
@@ -15,8 +13,6 @@ from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.timing import report as timing_report
-from bhd_lerobot.datasets.timing.plots import draw_timing
-from bhd_lerobot.datasets.timing.tables import fitting, ms, print_timing, ticks
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from tests.recording.support import data_columns, run_record
@@ -138,18 +134,6 @@ def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypat
     assert min(Image.open(image).size) > 500
 
 
-def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured):
-    report = timing_report.load_timing(measured)
-    for width in (20, 80, 100, 170):
-        console = Console(width=width, record=True, file=io.StringIO())
-        print_timing(report, console)
-        text = console.export_text()
-        assert max(map(len, text.splitlines())) <= width
-        assert ("inference [ms]" in text) == (width >= 170)
-        if width >= 80:
-            assert "…" not in text[text.index("Episodes") : text.index("granted")]
-
-
 def test_one_episode(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
@@ -261,22 +245,3 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
         with pytest.raises(SystemExit) as stop:
             main.main(["timing", *arguments])
         assert stop.value.code == 2
-
-
-@pytest.mark.thorough
-def test_episodes_of_any_length_are_drawn(measured, tmp_path):
-    report = timing_report.load_timing(measured, 0)
-    (one,) = report.episodes
-    for frames in (1, 2, 5000):
-        columns = {key: np.resize(column, frames) for key, column in one.columns.items()}
-        columns[keys.TIME] = np.arange(frames) / RATES.fps
-        changed = replace(one, columns=columns, intervals=np.diff(columns[keys.TIME]))
-        draw_timing(replace(report, episodes=(changed,)), tmp_path / "t.png")
-        assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
-
-
-def test_number_formats():
-    assert [ms(seconds) for seconds in (0, 0.00999, 0.009999, 0.1234, 2)] == ["0.00", "9.99", "10.0", "123", "2000"]
-    assert [ticks(number) for number in (-0.001, 0.3, -2)] == ["+0.00", "+0.30", "-2.00"]
-    columns = [("ab\nabc", ["1"]), ("d", ["12345"])]
-    assert [len(fitting(columns, width)) for width in (6, 7, 14, 15)] == [0, 1, 1, 2]
