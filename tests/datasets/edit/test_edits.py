@@ -130,14 +130,6 @@ def test_full_files_are_not_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert_valid(tmp_path / "all")
 
 
-def test_an_edited_dataset_cannot_be_resumed(tmp_path: Path) -> None:
-    """Its next episode would not be the one that its seed says."""
-    root = record(tmp_path / "d", [0, 1, 2])
-    delete(root, [1])
-    with pytest.raises(DatasetMismatchError, match="edited"):
-        support.resume(root)
-
-
 def test_edits_are_logged(tmp_path: Path) -> None:
     roots = [record(tmp_path / name, [0, 1]) for name in ("a", "b")]
     merge(roots, tmp_path / "all")

@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from bhd_lerobot.datasets.format import statistics, video
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.datasets.format.video_splice import splice
 from bhd_lerobot.errors import FrameError
+from tests.waiting import until
 
 SIZE = (32, 48)
 
@@ -52,23 +52,6 @@ def test_joined_files_hold_every_frame_at_its_time(tmp_path: Path, settings: Vid
     assert video.count_frames(twice) == 12
 
 
-def test_encoders_side_by_side_make_the_same_of_the_same_images(tmp_path: Path) -> None:
-    """With x264's macroblock tree, about one in 40 of these does not, on a processor with AVX-512."""
-    rng = np.random.default_rng(0)
-    wide = np.kron(rng.integers(0, 256, (12, 60, 3), np.uint8), np.ones((4, 4, 1), np.uint8))
-    places = np.clip(np.cumsum(rng.integers(-12, 13, 120)), 0, 240 - 64)
-    made = set()
-    for _ in range(3):
-        encoders = [CameraEncoder(tmp_path / f"{i}.mp4", 10, (48, 64), VideoSettings()) for i in range(12)]
-        for place in places:
-            for encoder in encoders:
-                encoder.add(wide[:, place : place + 64])
-        for encoder in encoders:
-            encoder.finish()
-            made.add(encoder.path.read_bytes())
-    assert len(made) == 1
-
-
 @pytest.mark.parametrize("settings", [VideoSettings(queue_size=1), VideoSettings("libsvtav1", preset=12, queue_size=1)])
 def test_no_encoder_gets_real_time_priority(tmp_path: Path, settings: VideoSettings) -> None:
     """SVT-AV1 takes `SCHED_FIFO` 99 where it may, for example as root."""
@@ -86,8 +69,10 @@ def test_options_and_info_are_lerobots(tmp_path: Path) -> None:
     for settings in (VideoSettings(), VideoSettings(vcodec="libsvtav1", preset=12, crf=30, fast_decode=1)):
         encoder = RGBEncoderConfig(**settings.recorded())
         ours = settings.codec_options()
-        for own in ("bf", "mbtree"):  # without which streams could not be joined, or would not always be the same
-            ours.pop(own, None)
+        ours.pop("bf", None)  # without which streams could not be joined
+        # With x264's macroblock tree, one in 40 encoders beside others makes something else of the same images.
+        assert ours.pop("mbtree", "0") == "0"
+        assert (settings.vcodec == "h264") == ("mbtree" in settings.codec_options())
         assert ours == encoder.get_codec_options(1, as_strings=True)
         path = encode(tmp_path / "a.mp4", [1, 2], settings)
         assert video.video_info(path, settings) == get_video_info(path, encoder)
@@ -107,8 +92,7 @@ def test_a_slow_encoder_makes_the_caller_wait(tmp_path: Path, monkeypatch: pytes
 
     producer = threading.Thread(target=produce)
     producer.start()
-    time.sleep(0.3)
-    assert len(added) <= 3, "one image in the encoder, two in the queue"
+    until(lambda: len(added) == 3)  # one image in the encoder, two in the queue
     go.set()
     producer.join()
     assert len(encoder.finish()) == 20
@@ -123,19 +107,6 @@ def test_images_are_copied(tmp_path: Path) -> None:
         encoder.add(image)
     histograms = encoder.finish()
     assert histograms.argmax(axis=2)[:, 0].tolist() == list(range(10))
-
-
-def test_an_error_of_the_encoder_is_raised(tmp_path: Path) -> None:
-    encoder = CameraEncoder(tmp_path / "missing" / "a.mp4", 10, SIZE, VideoSettings(queue_size=1))
-
-    def add_many() -> None:
-        for _ in range(100):
-            encoder.add(np.zeros((*SIZE, 3), np.uint8))
-
-    with pytest.raises(OSError, match="missing"):
-        add_many()
-    encoder.cancel()
-    encoder.cancel()
 
 
 def test_wrong_images_are_refused(tmp_path: Path) -> None:

@@ -131,10 +131,6 @@ def test_a_share_of_all_episodes_is_held_out(kinds: int, share: float) -> None:
         assert gaps.max() <= math.ceil(1 / share)
 
 
-def test_few_episodes_with_instructions_of_their_own(plain: Path) -> None:
-    assert split_episodes(open_metadata(plain), [0, 1], 0.1) == ([0], [1])
-
-
 def test_a_split_that_leaves_nothing(plain: Path) -> None:
     with pytest.raises(DatasetError, match=r"2 episodes have 2 different instructions.* hold_out to 'episode'"):
         split_episodes(open_metadata(plain), [0, 1], 0.1, "instruction")

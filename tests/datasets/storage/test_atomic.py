@@ -105,14 +105,6 @@ def test_a_mixture_of_old_and_new_never_loads(root: Path, monkeypatch: pytest.Mo
     assert list(dict.fromkeys(seen)) == [3, 0, 2]
 
 
-def test_the_current_folder_is_edited_in_place(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(root)
-    inode = root.stat().st_ino
-    assert main.main(["delete", ".", "--episodes=1"]) == 0
-    assert (root.stat().st_ino, Path.cwd(), len(content(root))) == (inode, root, 2)
-    assert leftovers(root.parent) == []
-
-
 def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     (tmp_path / "link").symlink_to("disk")
@@ -196,16 +188,6 @@ def test_all_commands_work_at_a_mount_point(root: Path, tmp_path: Path) -> None:
     (tmp_path / "volume").mkdir()
     process = Fork(use_a_mount_point, root, tmp_path / "volume", output=tmp_path / "log")
     assert process.wait() == 0, (tmp_path / "log").read_text()
-
-
-def test_without_an_atomic_swap_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(22, "Invalid argument")
-
-    monkeypatch.setattr(Disk, "swap", refuse)
-    delete(root, [1])
-    assert len(content(root)) == 2
-    assert leftovers(root.parent) == []
 
 
 def test_unusual_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

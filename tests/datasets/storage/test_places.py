@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.datasets.edit.edits import keep, merge, split
@@ -50,6 +49,7 @@ def root(video_dataset: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(video_dataset, tmp_path / "d"))
 
 
+@settings(max_examples=50)
 @given(NAMES)
 def test_a_valid_name_is_one_part_of_a_path(name: str) -> None:
     whole = Path("/d/videos")
@@ -103,21 +103,6 @@ def test_all_readers_refuse_names_that_lead_outside(root: Path, tmp_path: Path) 
             assert {path for path in tmp_path.rglob("*") if root not in path.parents} <= before | {tmp_path / "work"}
         with pytest.raises(BhdError, match="name"):  # as an exported bag may say it
             DatasetRecorder.create("t/t", 10, features, robot_type="t", root=tmp_path / "new")
-
-
-def test_filter_writes_to_its_output_only(root: Path, tmp_path: Path) -> None:
-    evil = "../../../far"  # from <output>/videos: beside the folder that the output lies in
-    info = json.loads((root / layout.INFO).read_text())
-    info["features"][evil] = info["features"].pop(support.CAMERA)
-    (root / layout.INFO).write_text(json.dumps(info))
-    for path in (root / "meta/episodes").glob("*/*.parquet"):
-        table = pq.read_table(path)
-        pq.write_table(table.rename_columns([name.replace(support.CAMERA, evil) for name in table.column_names]), path)
-    (root / "videos" / support.CAMERA).rename((root / "videos" / evil).resolve())
-    output = tmp_path / "a" / "b" / "c" / "kept"
-    with pytest.raises(DatasetError, match=r"'\.\./\.\./\.\./far' would lead to another folder"):
-        keep(root, [0, 1], output)
-    assert not (tmp_path / "a").exists()
 
 
 class Listing:
