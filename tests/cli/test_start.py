@@ -120,12 +120,14 @@ def loaded(program: str) -> list[set[str]]:
 
 
 def test_nothing_slow_is_imported_before_ctrl_c_is_handled_and_for_the_help() -> None:
-    before, for_help = loaded(
+    before, to_watch, for_help = loaded(
         "import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main as data; show()\n"
+        "import bhd_lerobot.cli.monitor; show()\n"
         "try: data.main(['--help'])\nexcept SystemExit: show()"
     )
     slow = {"torch", "lerobot", "mujoco", "huggingface_hub", "rosbags", "av", "PIL"}
     assert not before & {*slow, "numpy", "rich", "yaml", "pyarrow"}
+    assert not to_watch & slow
     assert not for_help & {*slow, "pandas", "pinocchio", "matplotlib", "ray"}
 
 

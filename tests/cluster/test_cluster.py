@@ -241,7 +241,7 @@ class TestOnePool:
         # saved.
         with monkeypatch.context() as once:
             after_saves(once, {2: kill_a_worker, 6: kill_its_machine})
-            many = {"dataset__num_episodes": 28, "n_envs": 2, "dataset__episode_time_s": 2}
+            many = {"dataset__num_episodes": 28, "n_envs": 2, "dataset__episode_time_s": 1}
             result, _ = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
         printed = pool._console.file.getvalue()
         assert (result.exit_status, result.recorded) == (0, 28)
@@ -300,6 +300,12 @@ class TestOnePool:
         ):
             assert all(np.array_equal(one[name], other[name]) for name in other.files)
         assert result.timing["brains"]["net"]["act"]["calls"] > 0
+
+    def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(self, cluster, pool):
+        assert pool._workers  # which occupy what machines there are
+        _, _, error = run_pool(cluster, [fakes.ECHO], timeout_s=1.0)
+        assert isinstance(error, ClusterError)
+        assert "No worker could be started within 1 s" in str(error)
 
     def test_nothing_is_left_where_a_brain_fails_on_the_cluster(self, cluster, shared, checkpoint, tmp_path):  # noqa: F811
         import safetensors.numpy
@@ -423,22 +429,6 @@ def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster, 
         for config, tasks in ((RayConfig(num_workers=5), 2), (RayConfig(), 6)):
             pool._config = config
             assert describe_crowding(config, pool.workers_for(tasks)) == ""
-
-
-def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cluster):
-    import ray
-
-    class Busy:
-        def ready(self) -> bool:
-            return True
-
-    with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())):
-        others = [ray.remote(Busy).options(num_cpus=1).remote() for _ in range(2)]
-        ray.get([other.ready.remote() for other in others])
-        # Within the same program, which is so a driver already.
-        _, _, error = run_pool(cluster, [fakes.ECHO], timeout_s=1.0)
-    assert isinstance(error, ClusterError)
-    assert "No worker could be started within 1 s" in str(error)
 
 
 @pytest.mark.thorough

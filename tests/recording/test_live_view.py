@@ -94,6 +94,8 @@ def columns(robot: Simulation, number: int = 0) -> dict[str, Any]:
 def test_every_number_is_sent_under_its_name(sent: Helpers, robot: Simulation) -> None:
     view = LiveView(display(), robot)
     image = np.full((4, 6, 3), 9, np.uint8)
+    view(1, {"observation.images.front": np.zeros((2, 2, 3), np.uint8)})  # only the first of several robots is shown
+    view(1, columns(robot, 5))
     view(0, {"observation.images.front": image})
     view(0, columns(robot))
     view.close()
@@ -150,16 +152,6 @@ def test_a_slow_view_does_not_delay_the_run_and_shows_the_newest_frames(sent: He
     view.close()
     assert [round(frame["observation"][keys.TIME], 3) for frame in sent.frames] == [0, 0.8, 0.9]
     assert (view.shown, view.left_out) == (3, 7)
-
-
-def test_only_the_first_of_several_robots_is_shown(sent: Helpers, robot: Simulation) -> None:
-    view = LiveView(display(), robot)
-    view(1, columns(robot))
-    view(1, {"observation.images.front": np.zeros((2, 2, 3), np.uint8)})
-    view(0, columns(robot))
-    view.close()
-    (frame,) = sent.frames
-    assert "observation.images.front" not in frame["observation"]
 
 
 def test_a_view_that_fails_is_reported_at_the_end_and_does_not_end_the_run(sent: Helpers, robot: Simulation) -> None:
@@ -246,26 +238,18 @@ def test_a_package_that_is_missing_is_named_before_anything_starts(
     parse(RecordConfig, options(tmp_path / "d", display_mode=mode))  # no package is needed without display_data
 
 
-def test_a_view_that_cannot_start_says_so(monkeypatch: pytest.MonkeyPatch, robot: Simulation) -> None:
-    def fail(mode: str, **arguments: Any) -> None:
-        raise RuntimeError("Address already in use")
-
-    monkeypatch.setattr(helpers, "init_visualization", fail)
-    with pytest.raises(ConfigError, match=r"foxglove could not be started: Address already in use\. .*--display_port"):
-        LiveView(display(), robot)
-
-
 def test_points_lie_ahead_upwards_and_to_the_left_leftwards() -> None:
     scan = np.array([1.0, 2.0, 3.5, 4.0])  # ahead, left, behind (no return), right
     assert points(scan, 3.5 + 1e-9) == pytest.approx(np.array([[0, -1], [-2, 0], [0, 3.5]]), abs=1e-12)
     assert points(scan, 3.5) == pytest.approx(np.array([[0, -1], [-2, 0]]), abs=1e-12)
 
 
-def test_a_recording_shows_the_frames_that_it_records(sent: Helpers, tmp_path: Path) -> None:
-    _, printed = run_record(
-        tmp_path / "d", display_data="true", display_mode="foxglove", dataset__num_episodes=2, n_envs=2
-    )
+def test_a_recording_shows_the_frames_that_it_records_and_is_the_same_without(sent: Helpers, tmp_path: Path) -> None:
+    short = {"dataset__num_episodes": 2, "dataset__episode_time_s": 2, "n_envs": 2}
+    _, printed = run_record(tmp_path / "d", display_data="true", display_mode="foxglove", **short)
     recorded = data_columns(tmp_path / "d")
+    run_record(tmp_path / "unseen", **short)
+    assert data_columns(tmp_path / "unseen") == recorded
     first = [i for i, episode in enumerate(recorded["episode_index"]) if episode == 0]
     shown = {round(frame["observation"][keys.TIME], 6): frame for frame in sent.frames}
     assert shown
@@ -281,12 +265,6 @@ def test_a_recording_shows_the_frames_that_it_records(sent: Helpers, tmp_path: P
     assert ("left out" in printed) == (missing > 0)
     if missing:
         assert f"{len(sent.frames)} frames shown, {missing} left out" in printed
-
-
-def test_a_recording_is_the_same_with_and_without_a_view(sent: Helpers, tmp_path: Path) -> None:
-    run_record(tmp_path / "a", dataset__num_episodes=1)
-    run_record(tmp_path / "b", dataset__num_episodes=1, display_data="true", display_mode="foxglove")
-    assert data_columns(tmp_path / "a") == data_columns(tmp_path / "b")
 
 
 def record_and_list_viewers(arguments: list[str]) -> int:

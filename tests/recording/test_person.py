@@ -19,8 +19,6 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.encoder_process import EncoderProcess
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.options.parse import parse
-from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
@@ -155,20 +153,6 @@ def test_a_recording_by_keys(tmp_path: Path) -> None:
     assert "600 s left" in at.text()
 
 
-def test_a_held_key_ends_one_take(tmp_path: Path) -> None:
-    at = Terminal(tmp_path / "d", dataset__num_episodes=3, task__duration_s=3)
-    at.expect("take 1 of 3 · recording")
-    at.type(b"s")
-    for _ in range(40):  # more than a second, into the second take
-        time.sleep(0.03)
-        os.write(at.person, b"s")
-    assert at.wait() == 0, at.text()
-    lengths = [episode.frames for episode in dataset_info(at.root).episodes]
-    assert len(lengths) == 3
-    outcomes = [episode.metadata["outcome"] for episode in dataset_info(at.root).episodes]
-    assert outcomes == ["success", "timeout", "timeout"]
-
-
 def test_the_line_says_who_drives_and_what_is_left_and_the_bell_rings(tmp_path: Path) -> None:
     marks, taken = Marks(), [False]
     out = io.StringIO()
@@ -222,11 +206,6 @@ def test_a_hiccup_is_no_rate_in_the_summary(tmp_path: Path, monkeypatch: pytest.
     time_s = np.asarray(read_episode(tmp_path / "d", 0)["control.time"])
     assert np.diff(time_s).max() > 0.25
     assert time_s[-1] < 4.1
-
-
-def test_the_bell_is_an_option() -> None:
-    assert parse(RecordConfig, options(Path("d"))).bell
-    assert not parse(RecordConfig, options(Path("d"), bell="false")).bell
 
 
 def test_an_encoder_that_is_too_slow_holds_up_no_frame_and_is_named(

@@ -36,7 +36,7 @@ ARM = {"robot__type": "ur5", "brain__type": "language", "task__type": "pick", "r
 
 def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
     reference = None
-    for n_envs, threads in ((1, 1), (7, 2), (64, 2)):
+    for n_envs, threads in ((1, 1), (7, 2), (12, 2)):
         root = tmp_path / f"n{n_envs}"
         # 9 episodes on 7 simulations: two of them start when others end, in the middle of the run.
         run_record(root, n_envs=n_envs, threads=threads, dataset__num_episodes=9, seed=5, robot__beams=360)
@@ -48,12 +48,6 @@ def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
         for name, column in content.items():
             assert column.equals(reference[0][name]), (n_envs, name)
         assert rows == reference[1]
-
-
-def test_another_seed_gives_other_episodes(tmp_path):
-    run_record(tmp_path / "a", seed=1)
-    run_record(tmp_path / "b", seed=2)
-    assert data_columns(tmp_path / "a")["observation.state"] != data_columns(tmp_path / "b")["observation.state"]
 
 
 def test_what_is_recorded_is_consistent(tmp_path):
@@ -108,6 +102,12 @@ def test_stock_lerobot_reads_it(recorded):
     assert np.array_equal(item["action"].numpy(), np.float32(columns["action"][4:6]))
     assert item["task"] == "Roam without touching anything."
     assert set(dataset.meta.stats) >= {"observation.state", "action"}
+
+
+def test_another_seed_gives_other_episodes(recorded, tmp_path):
+    run_record(tmp_path / "d", seed=2, dataset__num_episodes=1, dataset__episode_time_s=0.5)
+    key = "observation.state"
+    assert data_columns(tmp_path / "d")[key] != data_columns(recorded[0])[key][:5]
 
 
 def test_an_existing_root_is_refused_and_left_alone(recorded):
@@ -210,17 +210,6 @@ def test_the_run_folder_has_the_resolved_configuration_and_an_image(recorded):
         assert part in text
 
 
-def test_a_path_stands_in_one_line_at_80_columns(recorded):
-    root, result, _ = recorded
-    console = Console(file=io.StringIO(), width=80)
-    far = Path("/", *(f"folder_{number}_of_a_long_path" for number in range(6)))
-    print_summary(console, parse(RecordConfig, options(root)), replace(result, root=far / "d", output_dir=far), False)
-    lines = console.file.getvalue().splitlines()
-    assert lines[-3:-1] == [f"Dataset: {far / 'd'}", f"Run folder: {far}"]
-    assert lines[-1] == f"Look at it with: bhd-data view {far / 'd'}"
-    assert all(len(line) <= 80 for line in lines[:-3])
-
-
 def test_late_frames_and_what_becomes_of_dropped_episodes_are_said(recorded, tmp_path):
     _, result, _ = recorded
     stopped = StopRequest()
@@ -307,13 +296,6 @@ def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
         ({"dataset__episode_time_s": 0}, "episode_time_s is 0"),
         ({"dataset__episode_time_s": ".nan"}, "episode_time_s is nan"),
         ({"task__duration_s": 12}, "task.duration_s is 12.* and dataset.episode_time_s is 3"),
-        ({"brain__type": "avoidence"}, "Did you mean 'avoidance'"),
-        ({"task__type": "avoidd"}, "Did you mean 'avoid'"),
-        ({"robot__type": "turtlebot4"}, "Did you mean 'turtlebot3'"),
-        ({"robot__beems": 3}, "Did you mean 'robot.beams'"),
-        ({"dataset__num_episode": 3}, "Did you mean 'dataset.num_episodes'"),
-        ({"task__duration_s": "long"}, "must be a number"),
-        ({"resume": 3}, "must be true or false"),
         ({**ARM, "task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
         (
             {**ARM, "brain__type": "gap_follower"},
@@ -323,8 +305,6 @@ def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
         ({**ARM, "task__max_objects": 6}, "max_objects is 6"),
         ({**ARM, "task__language": "fr"}, "task.language"),
         ({**ARM, "task__randomisation__size": 1.5}, "randomisation.size is 1.5"),
-        ({**ARM, "brain__max_velocity": 99}, r"brain\.max_velocity is 99"),
-        ({**ARM, "brain__attempts": 0}, "brain.attempts is 0"),
         ({**ARM, "robot__action_space": "joints"}, "Did you mean 'joint'"),
     ],
 )
@@ -332,12 +312,6 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, messa
     with pytest.raises(ConfigError, match=message):
         run_record(tmp_path / "d", **change)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_example_configuration_parses():
-    path = Path(__file__).parents[2] / "configs" / "record" / "turtlebot3_avoid.yaml"
-    config = parse(RecordConfig, [f"--config_path={path}", "--dataset.num_episodes=20", "--seed=1"])
-    assert (config.dataset.num_episodes, config.seed) == (20, 1)
 
 
 def test_a_dataset_that_is_older_than_an_option_of_its_task_is_resumed_while_that_is_as_it_was(tmp_path: Path) -> None:

@@ -168,14 +168,14 @@ def test_no_image_is_made_of_frames_that_went_by_unless_somebody_looks() -> None
 
     options: dict[str, Any] = {"camera": True, "camera_width": 64, "camera_height": 48, "beams": 36}
     config = TurtleBot3Config(id=unique("images"), clock="realtime", realtime=relaxed(), **options)
-    for is_watched in (False, True):
-        brain, made = Slow(script("turtlebot3")), []
-        with closing(make_robot(config)) as robot:
-            render = robot.render_later
-            robot.render_later = lambda *order, render=render, made=made: (made.append(order), render(*order))[1]
+    with closing(make_robot(config)) as robot:
+        render = robot.render_later
+        for is_watched in (False, True):
+            brain, made = Slow(script("turtlebot3")), []
+            robot.render_later = lambda *order, made=made: (made.append(order), render(*order))[1]
             loop = EpisodeLoop(robot, make_task(AvoidConfig(duration_s=FRAMES / 10), 1, 10), brain)
             loop.observer = (lambda *_: None) if is_watched else None
             (episode,) = loop.run([EpisodeSpec(0, 0)])
-        frames = len(episode.columns["action"])
-        assert brain.frame < frames
-        assert len(made) == len(robot.camera_shapes) * (frames if is_watched else brain.frame)
+            frames = len(episode.columns["action"])
+            assert brain.frame < frames
+            assert len(made) == len(robot.camera_shapes) * (frames if is_watched else brain.frame)

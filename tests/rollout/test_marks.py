@@ -2,32 +2,22 @@
 
 import contextlib
 import itertools
-import os
-import pty
-import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
-from numpy.typing import NDArray
 
-from bhd_lerobot.cli.record import main
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks, key_help
+from bhd_lerobot.rollout.marks import KEYS, TELEOP_KEYS, MarkKey, Marks
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 from tests.cases import each_case
-from tests.forks import Fork
-from tests.waiting import until
 
 ALL = np.array([True, True])
 NOTHING = np.zeros(2, np.int64)
@@ -198,12 +188,6 @@ def test_a_pause_is_not_ended_by_its_own_key() -> None:
     assert not board.marks.is_paused
 
 
-def test_the_help_names_every_key() -> None:
-    rest = "discards this take, or between two the last, and records it again, p pauses before the next episode"
-    assert key_help(KEYS) == f"s success, f failure, i intervention begins or ends, r {rest}"
-    assert key_help(TELEOP_KEYS) == f"Enter success, Backspace failure, Tab intervention begins or ends, t {rest}"
-
-
 def test_wrong_names_are_refused() -> None:
     with pytest.raises(ConfigError, match="Did you mean 'success'"):
         Marks().outcome("sucess")
@@ -260,45 +244,3 @@ def test_in_the_loop_an_intervention_flags_its_frames() -> None:
     ]
     assert marked[0].columns[keys.EVENT].tolist() == expected
     np.testing.assert_array_equal(marked[0].columns[keys.ACTION], plain[0].columns[keys.ACTION])
-
-
-def record_at_a_terminal(folder: Path, typed: bytes, *options: str) -> dict[str, NDArray]:
-    """Record an episode of minutes in a terminal in which keys are pressed again and again; return its columns.
-
-    A mark ends it at once. Marks between two episodes are dropped: the keys are repeated until they take effect.
-    """
-    ours, theirs = pty.openpty()
-    log = folder / "log"
-    arguments = [
-        *options, "--robot.type=turtlebot3", "--robot.clock=realtime", "--robot.beams=36",
-        f"--dataset.root={folder}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
-        f"--output_dir={folder}/o", "--dataset.episode_time_s=600",
-    ]  # fmt: skip
-    process = Fork(main, arguments, output=log, terminal=theirs)
-    os.close(theirs)
-    until(lambda: process.poll() is not None or " success, " in log.read_text())
-    while process.poll() is None:
-        for key in typed:
-            os.write(ours, bytes([key]))
-            time.sleep(0.2)
-    os.close(ours)
-    assert process.wait() == 0, log.read_text()
-    (episode,) = dataset_info(folder / "d").episodes
-    assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)
-    (data,) = (folder / "d" / "data").rglob("*.parquet")
-    table = pq.read_table(data)
-    return {name: np.array(table[name].to_pylist()) for name in (keys.ACTION, keys.EVENT)}
-
-
-def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
-    root = Path(__file__).resolve().parents[2]
-    record_at_a_terminal(tmp_path, b"s", f"--config_path={root}/configs/record/turtlebot3_avoid.yaml")
-
-
-@pytest.mark.thorough
-def test_by_keys_a_person_drives_and_marks(tmp_path: Path) -> None:
-    """`s`, `f` and `i` belong to the teleoperator; Enter marks."""
-    options = ("--teleop.type=bhd_keyboard_base", "--task.instruction=Drive.", "--task.arena=empty")
-    columns = record_at_a_terminal(tmp_path, b"sfi" * 4 + b"\r", *options)
-    assert [0.22, 0.0] in columns[keys.ACTION].round(6).tolist()
-    assert columns[keys.EVENT].tolist()[:-1] == [Event.NOTHING] * (len(columns[keys.EVENT]) - 1)

@@ -10,20 +10,6 @@ from bhd_lerobot.rollout import plots
 pytestmark = pytest.mark.figures
 
 
-@pytest.mark.thorough(but=1)
-@pytest.mark.parametrize("count", [1, 2, 7, plots.SHOWN])
-def test_every_trajectory_has_a_panel(tmp_path, monkeypatch, count):
-    drawn = []
-    original = plots._draw_panel
-    monkeypatch.setattr(plots, "_draw_panel", lambda axes, t: (drawn.append(t.title), original(axes, t)))
-    arena = make_arena("turtlebot3_world", 0)
-    xy = np.array([[-2.0, -0.5], [-1.6, -0.5]])
-    trajectories = [plots.Trajectory(str(i), arena, xy, i % 2 == 0) for i in range(count)]
-    plots.draw_trajectories(trajectories, tmp_path / "t.png", "heading")
-    assert drawn == [str(i) for i in range(count)]
-    assert min(Image.open(tmp_path / "t.png").size) > 200
-
-
 @pytest.mark.parametrize("failed", [set(), {3, 17}, set(range(9)), set(range(20))])
 def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeypatch, failed):
     monkeypatch.setattr(plots, "SHOWN", 5)

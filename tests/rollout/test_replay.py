@@ -1,18 +1,16 @@
 """bhd-replay: bit-exact on its own recordings, and a number where it is not."""
 
 import json
-import math
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.cli.replay import main
-from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.options.parse import parse
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
-from bhd_lerobot.rollout.replay import Replay, ReplayConfig
+from bhd_lerobot.rollout.replay import Replay
+from tests.cases import each_case
 from tests.recording.support import run_record
 
 
@@ -89,27 +87,18 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
     assert main([*arguments, "--tolerance_m=100"]) == 0
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
-        (["--mode=openloop"], "Did you mean 'open_loop'"),
-        (["--tolerance_m=-1"], "tolerance_m is -1"),
-        (["--mod=state"], "Did you mean 'mode'"),
+        (["--dataset.root={}", "--mode=openloop"], "Did you mean 'open_loop'"),
+        (["--dataset.root={}", "--tolerance_m=-1"], "tolerance_m is -1"),
+        (["--dataset.root={}", "--dataset.episode=9"], "from 0 to 3"),
+        ([], "No dataset is given; set --dataset.root=FOLDER"),
     ],
 )
-def test_bad_options(options, message):
-    with pytest.raises(ConfigError, match=message):
-        parse(ReplayConfig, options)
-
-
-def test_a_dataset_is_to_be_named(capsys):
-    assert main([]) == 2
-    assert "No dataset is given; set --dataset.root=FOLDER" in capsys.readouterr().err
-
-
-def test_an_episode_that_does_not_exist(recorded, capsys):
-    assert main([f"--dataset.root={recorded}", "--dataset.episode=9"]) == 2
-    assert "from 0 to 3" in capsys.readouterr().err
+def test_what_cannot_be_replayed_is_named(recorded, capsys, options, message):
+    assert main([option.format(recorded) for option in options]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_path):
@@ -148,12 +137,3 @@ def test_other_versions_are_named(recorded):
     assert replay.changed_versions() == {}
     replay.metadata["versions"] = replay.metadata["versions"].replace('"mujoco":"', '"mujoco":"0.')
     assert list(replay.changed_versions()) == ["mujoco"]
-
-
-def test_recorded_columns_are_read_as_they_are(recorded):
-    table = pq.read_table(recorded / "data")
-    rows = table.filter(pa.compute.equal(table["episode_index"], 1))
-    columns = Replay(recorded, 1).columns
-    assert columns["observation.state"].tolist() == rows["observation.state"].to_pylist()
-    assert columns["next.done"].dtype == bool
-    assert math.isclose(columns["control.time"][1], 0.1)

@@ -461,10 +461,3 @@ def test_a_stop_does_not_wait_for_an_image(monkeypatch: pytest.MonkeyPatch) -> N
     finally:
         os.close(master)
         os.close(slave)
-
-
-def test_it_starts_fast_because_it_imports_little() -> None:
-    heavy = "{'torch', 'lerobot', 'mujoco'}"
-    code = f"import sys; from bhd_lerobot.cli import monitor; print(*sorted({heavy} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []

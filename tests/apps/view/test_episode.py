@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
-from bhd_lerobot.apps.view.episode import _subtasks
 from bhd_lerobot.apps.view.groups import MAX_LINES, names_of, scan_of, sections, unit_of
 from bhd_lerobot.apps.view.packing import pack, unpack
 from bhd_lerobot.bodies.ur5 import ur5
@@ -124,10 +123,3 @@ def test_subtasks_come_from_the_language_column_where_no_other_has_them(tmp_path
     header, _ = unpack(dataset.packed(0))
     assert header["bands"][0]["name"] == "subtask"
     assert len(header["bands"][0]["runs"]) == length(0)  # each frame has its own
-    rows = [
-        {"style": "plan", "timestamp": 0.0, "content": "1. a"},
-        {"style": "subtask", "timestamp": 0.4, "content": "b"},
-        {"style": "subtask", "timestamp": 0.0, "content": "a"},
-    ]
-    assert _subtasks(rows, 9, 10) == [[0, 4, "a"], [4, 9, "b"]]
-    assert _subtasks(None, 9, 10) == []

@@ -337,23 +337,17 @@ def test_ctrl_c_before_the_address_ends_in_the_same_way(base, capsys, monkeypatc
     assert "Stopped" in capsys.readouterr().err
 
 
-def test_a_port_in_use_is_named_with_the_remedy(base, capsys) -> None:
+def test_what_cannot_be_shown_is_refused_with_the_remedy(base, tmp_path, capsys) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        port = taken.getsockname()[1]
-        assert main.main(["view", str(base), "--no-browser", "--port", str(port)]) == 2
-    error = capsys.readouterr().err
-    assert f"--port {port}" in error
-    assert "--port 0" in error
-
-
-@pytest.mark.parametrize("port", ["-1", "65536"])
-def test_impossible_ports(base, capsys, port) -> None:
-    assert main.main(["view", str(base), "--port", port]) == 2
-    assert "between 0 and 65535" in capsys.readouterr().err
-
-
-def test_nothing_to_show(tmp_path, capsys) -> None:
-    assert main.main(["view", str(tmp_path / "none"), "--port", "0"]) == 2
-    assert "does not exist" in capsys.readouterr().err
+        port = str(taken.getsockname()[1])
+        for root, number, words in (
+            (base, port, (f"--port {port}", "--port 0")),
+            (base, "-1", ("between 0 and 65535",)),
+            (base, "65536", ("between 0 and 65535",)),
+            (tmp_path / "none", "0", ("does not exist",)),
+        ):
+            assert main.main(["view", str(root), "--no-browser", "--port", number]) == 2
+            error = capsys.readouterr().err
+            assert all(one in error for one in words), error

@@ -75,19 +75,6 @@ def test_the_schema_is_that_of_our_recordings(tmp_path, plain):
     assert way[-1] == pytest.approx(0.1 * columns["control.time"][-1], abs=0.02)
 
 
-def test_a_scan_is_the_newest_and_its_beams_are_in_order(dataset):
-    columns = read_episode(dataset, 0)
-    scans = columns["observation.state"][:, 2:]
-    angle = 2 * np.pi * np.arange(360) / 360
-    stamps = np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec
-                       for topic, _, message in drive() if topic == "/scan"])  # fmt: skip
-    start = source_of(dataset)["start_ns"]
-    received = np.array([at for topic, at, _ in drive() if topic == "/scan"])
-    for frame, scan in enumerate(scans):
-        stamp = stamps[np.searchsorted(received, start + frame * NANO // 10, side="right") - 1]
-        assert scan == pytest.approx(bags.distance(angle, (stamp - START) / NANO), abs=1e-6)
-
-
 def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     def keep(message):
         time = (message[1] - START) / NANO
@@ -286,25 +273,12 @@ def test_a_static_transform_turns_the_scanner_and_a_lost_one_must_be_replaced(tm
     assert np.array_equal(read_episode(tmp_path / "d", 0)["observation.state"], expected)
 
 
-def test_stamps_that_cannot_be_true_are_reported_and_the_reception_counts(tmp_path, capsys):
-    messages = [
-        (topic, at, bags.odometry(at - 1000 * NANO) if topic == "/odom" else message) for topic, at, message in drive()
-    ]
-    source = write(tmp_path / "bag", messages)
-    imported(source, tmp_path / "d", "--stamps=auto")
-    assert "/odom: 120 of 120 header stamps are not within 0.5 s" in capsys.readouterr().err
-    error = refused(source, tmp_path / "e", capsys, "--stamps=header")
-    assert re.search(r"/scan is (1000|999)\.\d\d s ahead of /odom. Their stamps are of different clocks", error)
-    imported(source, tmp_path / "e")
-    assert "header stamps" not in capsys.readouterr().err
-
-
 def test_an_action_is_the_answer_to_its_observation(tmp_path):
     """A brain answers each observation after a while; the action of a frame is that answer, not the one before."""
     base = [message for message in drive(seconds=4) if message[0] != "/cmd_vel"]
     imported(write(tmp_path / "silent", [*base, ("/cmd_vel", base[0][1], bags.twist(0, 0))]), tmp_path / "a")
     start = source_of(tmp_path / "a")["start_ns"]
-    for late_ms in (0, 1, 50, 99):
+    for late_ms in (0, 99):
         answers = [
             ("/cmd_vel", start + frame * NANO // 10 + late_ms * NANO // 1000, bags.twist(frame / 1000, -frame / 500))
             for frame in range(60)
@@ -314,19 +288,6 @@ def test_an_action_is_the_answer_to_its_observation(tmp_path):
         action = read_episode(root, 0)["action"]
         assert action[:, 0] == pytest.approx(np.arange(len(action)) / 1000), late_ms
         assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500), late_ms
-
-
-def test_frames_without_a_command_are_counted(tmp_path, capsys):
-    messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] < START + NANO]
-    info = imported(write(tmp_path / "bag", messages), tmp_path / "d", "--command_timeout=0.5")
-    error = capsys.readouterr().err
-    columns = read_episode(tmp_path / "d", 0)
-    silent = int((columns["control.mode"] == 2).sum())
-    assert 30 < silent < info.frames
-    assert f"{silent} of {info.frames} frames" in error
-    assert "--command_timeout=inf" in error  # it drives on
-    imported(tmp_path / "bag", tmp_path / "e")
-    assert "no command" not in capsys.readouterr().err
 
 
 def test_a_key_press_is_in_force_until_the_next(tmp_path, capsys):
@@ -425,26 +386,6 @@ def test_values_that_are_not_finite_count_as_lost(tmp_path, capsys):
     imported(write(tmp_path / "bag", messages), tmp_path / "d")
     assert "with values that are not finite, left out" in capsys.readouterr().err
     assert np.isfinite(read_episode(tmp_path / "d", 0)["action"]).all()
-
-
-def test_orientations_that_were_never_set_are_no_rotations(tmp_path, capsys):
-    def unset(every: int) -> list:
-        messages = drive()
-        odometry = [message for topic, _, message in messages if topic == "/odom"]
-        for message in odometry[::every]:
-            message.pose.pose.orientation = bags.Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
-        return messages
-
-    source = write(tmp_path / "all", unset(1))
-    error = refused(source, tmp_path / "d", capsys, "--odometry")
-    assert "all messages of /odom have the orientation 0, 0, 0, 0, which is no rotation" in error
-    assert "Leave out --odometry" in error
-    imported(source, tmp_path / "d")
-    assert "orientation" not in capsys.readouterr().err
-    imported(write(tmp_path / "some", unset(30)), tmp_path / "e", "--odometry")
-    error = capsys.readouterr().err
-    assert "/odom: 4 of 120 messages have the orientation 0, 0, 0, 0, which is no rotation, left out" in error
-    assert "not finite" not in error
 
 
 def test_images_and_gyroscope(tmp_path):

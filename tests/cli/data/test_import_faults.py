@@ -209,14 +209,6 @@ def test_a_command_stays_in_force_when_the_pose_starts_anew(tmp_path, messages, 
     assert "come before the first command; their action is 0, though the robot moved" in capsys.readouterr().err
 
 
-def test_a_drive_without_a_reset_stays_whole(tmp_path, messages, capsys):
-    fast = [one for number, one in enumerate(messages) if one[0] != "/odom" or number % 5 == 0]  # 4 Hz, and jittered
-    imported(write(tmp_path / "bag", fast), tmp_path / "d", "--odometry", "--beams=36", "--max_age=0.9")
-    assert "jumped" not in capsys.readouterr().err
-    assert places(tmp_path / "d")[0][0] == "start"
-    assert len(places(tmp_path / "d")) == 1
-
-
 def test_a_pose_that_was_never_set_matters_only_where_it_is_observed(tmp_path, messages, capsys):
     def unset(at):
         message = bags.odometry(at - 5 * 10**6)
@@ -356,18 +348,3 @@ def test_images_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messa
     bag = write(tmp_path / "broken", sorted([*messages, *images], key=lambda one: one[1]))
     error = refused(bag, tmp_path / "e", capsys, *arguments)
     assert "images of an episode cannot be decoded, which is more than 10 %" in error
-
-
-def test_a_scanner_of_shorter_reach_is_reported(tmp_path, messages, capsys):
-    def short(at):
-        message = bags.scan(at - 5 * 10**6)
-        message.range_min, message.range_max = 0.0, 2.0
-        message.ranges[[0, 90, 180]] = np.inf, np.nan, 3.0
-        return message
-
-    imported(write(tmp_path / "bag", changed(messages, "/scan", short)), tmp_path / "d")
-    assert "/scan: the scanner sees to 2.00 m (range_max)" in capsys.readouterr().err
-    scan = read_episode(tmp_path / "d", 0)["observation.state"][:, 2:]
-    assert (scan[:, [0, 180]] == 3.5).all()
-    assert (scan[:, 90] < 2.0).all()  # a hole of one beam is what its neighbour is
-    assert scan[scan != 3.5].max() <= 2.0

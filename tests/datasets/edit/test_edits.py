@@ -79,19 +79,6 @@ def test_merging_the_parts_of_a_split_gives_the_original(plain: Path, video_data
         assert content(folder / "again") == content(root)[:4]
 
 
-def test_stock_lerobot_reads_the_result(video_dataset: Path, tmp_path: Path) -> None:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    merge([video_dataset, record(tmp_path / "more", [9], video=True)], tmp_path / "all")
-    dataset = LeRobotDataset("t/t", root=tmp_path / "all", video_backend="pyav")
-    frames = [(episode, frame) for episode in [0, 1, 2, 3, 9] for frame in range(support.length(episode))]
-    assert len(dataset) == len(frames)
-    for index in (0, 7, len(frames) - 1):
-        episode, frame = frames[index]
-        assert abs(dataset[index][support.CAMERA].numpy().mean() * 255 - support.grey(episode, frame)) < 3
-        assert dataset[index]["task"] == support.task(episode)
-
-
 def test_data_are_those_of_lerobots_own_merge(plain: Path, tmp_path: Path) -> None:
     from lerobot.datasets.dataset_tools import merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -3,8 +3,6 @@
 import shutil
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.datasets.edit.edits import delete
@@ -15,7 +13,6 @@ from bhd_lerobot.datasets.remote.subset import files_of, is_subset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import (
-    DatasetCorruptError,
     DatasetError,
     DatasetExistsError,
     DatasetLockedError,
@@ -181,21 +178,6 @@ def test_another_pull_of_the_same_folder_is_refused(hub: FakeHub, root: Path, tm
     assert content(tmp_path / "e") == content(root)
 
 
-def test_metadata_without_the_files_of_episodes_are_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    send(root)
-    files = hub.dataset("me/d").files()
-    path = next(path for path in files if path.startswith("meta/episodes/"))
-    table = pq.read_table(next((root / "meta/episodes").rglob("*.parquet")))
-    for dropped in (["data/file_index"], ["episode_index"]):
-        sink = pa.BufferOutputStream()
-        pq.write_table(table.drop(dropped), sink)
-        files[path] = type(files[path])(sink.getvalue().to_pybytes(), lfs=True)
-        with pytest.raises(DatasetCorruptError, match=r"me/d.*corrupt"):
-            pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [0])
-        assert pull(HubDataset("me/d"), tmp_path / "all", replace=True).problem
-    assert not (tmp_path / "e").exists()
-
-
 def break_off(hub: FakeHub, target: Path, path: str) -> None:
     """Pull over what is there, and fail at one file."""
     hub.faults = [Fault(f"^(GET|HEAD) .*/resolve/.*/{path}", times=-1, status=403)]
@@ -233,12 +215,3 @@ def test_episodes_of_a_replaced_dataset_are_not_requested(hub: FakeHub, root: Pa
     report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
     assert report.episodes == [0]
     assert target.stat().st_mode & 0o777 == 0o700  # the permissions are kept
-
-
-def test_a_folder_named_by_dots_is_the_folder(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
-    send(root)
-    pull(HubDataset("me/d"), tmp_path / "e")
-    (tmp_path / "e" / layout.STATS).write_text("{}")
-    monkeypatch.chdir(tmp_path / "e/meta")
-    assert pull(HubDataset("me/d"), "..", replace=True).fetched == [layout.STATS]
-    assert content(tmp_path / "e") == content(root)

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import json
 import os
 import resource
 from collections.abc import Callable, Iterator
@@ -328,23 +327,6 @@ def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(
         raise ZeroDivisionError
     assert "could not be finalised" in caught.value.__notes__[0]
     assert support.read_back(tmp_path / "d") == 1
-
-
-def test_info_of_a_dataset(tmp_path: Path) -> None:
-    root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(2):
-        support.record(recorder)
-    info = dataset_info(root)
-    assert not info.compact
-    assert (info.files, info.recording, info.robot_type, info.fps) == (4, {"seed": 1}, "toy", 10)
-    recorder.finalize()
-    info = dataset_info(root)
-    assert info.compact
-    assert (info.files, info.frames, info.tasks) == (2, 11, ("task 0", "task 1"))
-    assert [(e.index, e.frames, e.task) for e in info.episodes] == [(0, 5, "task 0"), (1, 6, "task 1")]
-    assert info.episodes[1].metadata == support.metadata(1)
-    assert json.dumps(info.features)
 
 
 def test_flushing_to_the_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
