@@ -8,7 +8,6 @@ import pytest
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
@@ -44,7 +43,11 @@ def test_it_drives_the_robot_that_is_connected_by_the_last_observation(robot, te
     assert action == {"x.vel": 0.0, "theta.vel": 0.5}  # something is ahead now
 
 
-def test_it_needs_exactly_one_robot(tmp_path, teleop):
+def test_it_needs_exactly_one_robot_and_to_be_connected_once(tmp_path, teleop):
+    with pytest.raises(DeviceAlreadyConnectedError):
+        teleop.connect()
+    with pytest.raises(DeviceNotConnectedError):
+        BhdBrain(BhdBrainConfig(calibration_dir=tmp_path)).get_action()
     with pytest.raises(ConfigError, match="connected are: none"):
         teleop.get_action()
     configs = [TurtleBot3Config(calibration_dir=tmp_path, id=name, arena="empty") for name in ("one", "two")]
@@ -56,18 +59,6 @@ def test_it_needs_exactly_one_robot(tmp_path, teleop):
         teleop.config.robot_id = "tow"
         with pytest.raises(ConfigError, match="Did you mean 'two'"):
             teleop.get_action()
-
-
-def test_its_lifecycle(tmp_path):
-    teleop = BhdBrain(BhdBrainConfig(calibration_dir=tmp_path, brain=AvoidanceConfig(forward_speed=0.1)))
-    with pytest.raises(DeviceNotConnectedError):
-        teleop.get_action()
-    teleop.connect()
-    with pytest.raises(DeviceAlreadyConnectedError):
-        teleop.connect()
-    teleop.disconnect()
-    teleop.disconnect()
-    assert not teleop.is_connected
 
 
 def record_and_replay(robot: str, fps: int, *options: str) -> None:

@@ -91,19 +91,6 @@ def test_distances_of_the_arm_against_samples() -> None:
         np.testing.assert_allclose(heights[model.lowest(posture)], table_found, atol=1e-12)
 
 
-def test_distances_do_not_depend_on_the_batch() -> None:
-    model = CollisionModel(CHAIN)
-    postures = np.random.default_rng(1).uniform(-7, 7, (60, 6))
-    together = model.distances(postures)
-    for index, posture in enumerate(postures):
-        for one, all_ in zip(model.distances(posture), together, strict=True):
-            assert one.tobytes() == all_[index].tobytes()
-    in_grid = model.distances(postures.reshape(3, 4, 5, 6))
-    for grid, all_ in zip(in_grid, together, strict=True):
-        assert grid.shape == (3, 4, 5)
-        np.testing.assert_array_equal(grid.ravel(), all_)
-
-
 def test_without_capsules_nothing_is_near_and_unknown_ones_are_refused() -> None:
     nothing = CollisionModel(dataclasses.replace(CHAIN, capsules=(), disjoint=()))
     assert [float(distance) for distance in nothing.distances(HOME)] == [math.inf, math.inf]

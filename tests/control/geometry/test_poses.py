@@ -33,6 +33,7 @@ def test_numbers_and_matrices_are_the_same_pose(seed: int) -> None:
     rotations = Rotation.random(50, rng=rng)
     positions = rng.normal(0, 1, (50, 3))
     vectors = pose_vectors(matrices(rotations, positions))
+    assert np.array_equal(pose_vectors(matrices(rotations, positions).reshape(5, 10, 4, 4)).reshape(50, 7), vectors)
     assert np.array_equal(vectors[:, :3], positions)
     assert np.allclose(np.linalg.norm(vectors[:, 3:], axis=1), 1, atol=1e-12)
     assert (vectors[:, 3:] @ DOWN >= 0).all()
@@ -69,15 +70,6 @@ def test_orientations_on_the_border_have_one_sign_only() -> None:
             vector = pose_vectors(matrices(rotation) + noise)[0]
             assert np.linalg.norm(vector[3:]) == pytest.approx(1)
     assert pose_vectors(np.eye(4)).tolist() == [0, 0, 0, 1, 0, 0, 0]
-
-
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (0,)])
-def test_any_number_of_leading_axes(shape: tuple[int, ...]) -> None:
-    rotations = matrices(Rotation.random(6, rng=np.random.default_rng(1)))
-    count = int(np.prod(shape))
-    several = rotations[:count].reshape(*shape, 4, 4)
-    assert pose_vectors(several).shape == (*shape, 7)
-    assert np.array_equal(pose_vectors(several).reshape(-1, 7), pose_vectors(rotations)[:count])
 
 
 @each_case(

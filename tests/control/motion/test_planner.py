@@ -89,17 +89,17 @@ def test_goals_within_the_ranges_are_accepted(fields: dict[str, Any]) -> None:
 
 def test_a_plan_goes_where_the_goal_says() -> None:
     assert made(joint_target=joints(0.5)).target.tolist() == [*joints(0.5), HOME[6]]
+    trajectory = made(joint_target=joints(2.0, -0.1), max_velocity=0.5, max_acceleration=1.5).trajectory
+    assert np.abs(trajectory.velocity).max() == pytest.approx(0.5)  # the fastest joint is as fast as it may be
+    assert (np.abs(trajectory.acceleration[:, :6]) <= LIMITS.acceleration[:6] / 10 + 1e-9).all()
+    start = moving_start()
+    brake = PLANNER.brake(start, hard=False)
+    assert np.allclose(made(start, gripper=0.05).target[:6], brake.target[:6])  # the arm comes to rest
     for motion in ("joint", "line"):
         planned = made(target_pose=moved(0.1, 0.1, -0.05, 0.3), motion=motion, gripper=0.02)
         tool = KINEMATICS.tool(planned.target[:6])
         assert np.abs(tool - moved(0.1, 0.1, -0.05, 0.3).matrix()).max() < 1e-9
         assert planned.target[6] == 0.02
-
-
-def test_the_fastest_joint_is_as_fast_as_the_goal_permits() -> None:
-    trajectory = made(joint_target=joints(2.0, -0.1), max_velocity=0.5, max_acceleration=1.5).trajectory
-    assert np.abs(trajectory.velocity).max() == pytest.approx(0.5)
-    assert (np.abs(trajectory.acceleration[:, :6]) <= LIMITS.acceleration[:6] / 10 + 1e-9).all()
 
 
 @pytest.mark.parametrize("fields", [{"joint_target": joints(0.5)}, {"target_pose": moved(0.1), "motion": "line"}])
@@ -114,13 +114,6 @@ def test_the_gripper_takes_its_own_time_and_keeps_its_target(fields: dict[str, A
     assert both.ticks > alone.ticks
     assert np.array_equal(both.position[: alone.ticks, 6], alone.position[:, 6])
     assert (alone.position[:, :6] == HOME[:6]).all()
-
-
-def test_a_goal_for_the_gripper_brings_a_moving_arm_to_rest() -> None:
-    start = moving_start()
-    planned = made(start, gripper=0.05)
-    brake = PLANNER.brake(start, hard=False)
-    assert np.allclose(planned.target[:6], brake.target[:6])
 
 
 def test_a_line_from_a_moving_start_begins_where_the_arm_stops() -> None:
