@@ -88,6 +88,7 @@ def test_it_is_closed_and_fits_into_the_pool_of_a_world(name: str, seed: int) ->
         assert arena.clearance(edge + normal * WALL)[20:-20].max() < -WALL / 2
 
 
+@pytest.mark.law
 @each_case(("name", "seed"), EVERY_ARENA)
 def test_the_start_is_free(name: str, seed: int) -> None:
     arena = arena_of(name, seed)

@@ -60,6 +60,7 @@ def test_mass_and_dimensions_are_the_published_ones(model: mujoco.MjModel, data:
     assert BODY.radius == BURGER_RADIUS
 
 
+@pytest.mark.law
 def test_wheels_are_where_and_as_large_as_published(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     left, right = (data.joint(name).xanchor for name in BODY.drive.joints)
     np.testing.assert_allclose(left - right, (0, 0.160, 0), atol=1e-12)

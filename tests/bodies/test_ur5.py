@@ -59,6 +59,7 @@ def postures(count: int, seed: int = 0) -> np.ndarray:
     return np.hstack([rng.uniform(-2 * math.pi, 2 * math.pi, (count, 6)), rng.uniform(0, 0.0425, (count, 2))])
 
 
+@pytest.mark.law
 def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     for q in postures(100):
         data.qpos[:] = q

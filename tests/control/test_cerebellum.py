@@ -90,6 +90,7 @@ def between(*twists: tuple[float, float]) -> list[tuple]:
     return [step for twist in twists for _ in range(15) for step in (("send", twist, 1, 0), ("tick", 20))]
 
 
+@pytest.mark.law
 @example(between((0.0, 2.84), (0.22, 0.0)))
 @example(between((0.0, 2.84), (-0.22, 0.0)))
 @example(between((0.0, 2.84), (0.22, -2.84)))

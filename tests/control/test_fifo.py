@@ -31,6 +31,7 @@ def pop(fifo: CommandFifo) -> tuple[int, list[int]] | None:
     return result[0], np.flatnonzero(mask).tolist()
 
 
+@pytest.mark.law
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 7))
 def test_it_behaves_like_a_bounded_queue(pushes: list[bool], capacity: int) -> None:
     fifo, model = CommandFifo(1, 2, capacity), deque[int]()

@@ -60,6 +60,7 @@ REQUESTS = {
 }
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
 def test_every_request_in_every_mode(mode: Mode) -> None:
     for request in Request:
@@ -333,6 +334,7 @@ def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
     assert rig.cerebellum.state(rig.now).odometry[0].tolist() == [0, 0, 0]
 
 
+@pytest.mark.law
 @given(st.lists(st.sampled_from(["press", "tick", "reset", "activate", "send"]), min_size=1, max_size=40))
 def test_no_press_is_lost_however_presses_and_resets_meet(history: list[str]) -> None:
     """A press that no tick has seen yet is never acknowledged: the next tick latches it, whatever came first."""

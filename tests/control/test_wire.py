@@ -179,6 +179,7 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.HOLD
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("by", [3e-3, 1e-3, 5e-4])
 def test_rows_that_alternate_stop_the_arm(by: float) -> None:
     rig, link, _ = planned_arm()

@@ -14,6 +14,7 @@ def played(course: Course, seed: int | None, resets: int = 20) -> set[int]:
     return {course.advance(seed), *(course.advance() for _ in range(resets - 1))}
 
 
+@pytest.mark.law
 def test_no_two_seeds_lead_into_the_same_episodes() -> None:
     runs = {seed: played(Course(), seed) for seed in (0, 1, 2, 3, 4, 1000, STREAM - 1)}
     for one, other in itertools.combinations(runs, 2):

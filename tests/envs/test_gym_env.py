@@ -45,6 +45,7 @@ def test_registering_twice_changes_nothing() -> None:
     assert {f"bhd_lerobot/{name}" for name in ENVIRONMENTS} <= before.keys()
 
 
+@pytest.mark.law
 def test_equal_seeds_and_actions_give_equal_episodes_and_so_do_the_next_resets() -> None:
     first, second = make(seed=7), make(seed=7)
     assert_same(first.reset(seed=4), second.reset(seed=4))

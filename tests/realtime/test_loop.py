@@ -122,6 +122,7 @@ class VirtualLoop:
 LATE = st.lists(st.integers(0, 5 * TICK_NS), min_size=1, max_size=40).map(tuple)
 
 
+@pytest.mark.law
 @given(delays=LATE, work=LATE, catch_up=st.integers(1, 4))
 def test_the_grid_is_absolute_and_every_period_is_accounted_for(delays, work, catch_up):
     loop = VirtualLoop(LoopLimits(most_misses=10**6, most_catch_up=catch_up), delays, work)
@@ -237,6 +238,7 @@ def test_absent_processes_are_not_watched():
     assert set(loop.modes) == {Mode.TRACKING}
 
 
+@pytest.mark.law
 @settings(max_examples=30)
 @given(timeout_ms=st.integers(1, 100))
 def test_a_silent_plant_is_a_fault_at_its_time_out(timeout_ms):

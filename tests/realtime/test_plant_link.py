@@ -92,6 +92,7 @@ def test_silence_stops_the_plant_within_its_time_out_and_a_tick(period: int, pha
     assert rig.guard.stops == 1
 
 
+@pytest.mark.law
 def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
     rig = Rig()
     rig.stop()

@@ -127,6 +127,7 @@ def test_a_robot_without_goals_refuses_them_with_a_reason() -> None:
     assert client.request(Request.DEACTIVATE) == Reason.ACCEPTED
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("kind", RequestKind)
 def test_a_cerebellum_that_does_not_answer_is_named_and_does_nothing_later(kind: RequestKind) -> None:
     pair = Pair()

@@ -28,6 +28,7 @@ def robot(tmp_path):
         yield robot
 
 
+@pytest.mark.law
 def test_bad_actions_are_refused_and_nothing_happens(robot):
     before = robot.host.physics_state
     now = robot.host.bridge.now_ns
@@ -97,6 +98,7 @@ def test_true_speeds_stay_within_five_per_cent_of_the_limits():
         assert (fastest <= 1.05 * np.array([speed, turn, drive.max_wheel_speed])).all(), (name, fastest)
 
 
+@pytest.mark.law
 def test_emergency_stop_is_latched_until_reset_and_activate(robot):
     for _ in range(10):
         robot.send_action(GO)

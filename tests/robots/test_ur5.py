@@ -41,6 +41,7 @@ def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, space, scene):
     assert check_robot(lambda: make(tmp_path, action_space=space, scene=scene), action, adversarial=True) == ()
 
 
+@pytest.mark.law
 def test_a_setpoint_is_clipped_to_the_range_approached_within_the_limits_and_reached(robot):
     target = stay(robot)
     applied = robot.send_action({**target, "gripper.pos": 99.0, "elbow.pos": 1e9})

@@ -99,6 +99,7 @@ def test_ranges_are_the_distances_to_the_shapes(seed: Any, pose: tuple[float, fl
     assert (np.abs(measured - expected) > 1e-6).sum() <= 2
 
 
+@pytest.mark.law
 def test_beam_0_points_ahead_and_beams_run_counter_clockwise() -> None:
     ahead, left, behind = (
         Shape("cylinder", x, y, 0, radius, radius) for x, y, radius in ((1, 0, 0.1), (0, 1, 0.2), (-1, 0, 0.3))

@@ -141,6 +141,7 @@ def test_reset_of_some_leaves_the_others_alone() -> None:
     assert (world.time[ids] == 0).all()
 
 
+@pytest.mark.law
 def test_a_restored_snapshot_goes_on_bit_exactly() -> None:
     world = World(BODY, 5)
     fill(world, range(5))

@@ -69,6 +69,7 @@ def drain(streamer, commands, frames=100, behind=0.0):
     return np.array(references), results
 
 
+@pytest.mark.law
 def test_the_stream_is_the_trajectory_of_the_goal():
     goal = BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), (0.0, 1.0, 0.0, 0.0)), gripper=0.03)
     references, results = drain(GoalStreamer(ARM, RATES, HOME), [goal])

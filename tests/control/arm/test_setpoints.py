@@ -76,6 +76,7 @@ wild = st.lists(
 )
 
 
+@settings(max_examples=40)
 @given(wild, st.integers(1, 40))
 def test_no_stream_of_setpoints_breaks_a_limit(script: list, frame: int) -> None:
     stream = Stream(2, frame=frame)
@@ -90,6 +91,7 @@ def test_no_stream_of_setpoints_breaks_a_limit(script: list, frame: int) -> None
     stream.check()
 
 
+@pytest.mark.law
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_no_jitter_near_the_ends_of_the_range_breaks_a_limit(seed: int) -> None:

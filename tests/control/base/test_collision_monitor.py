@@ -100,6 +100,7 @@ def scan(rig: support.Rig, ranges: Array | float) -> None:
     rig.cerebellum.reading.sensors_ns[:] = rig.now
 
 
+@pytest.mark.law
 def test_without_scans_of_the_last_three_periods_it_stands_and_goes_on_with_the_next() -> None:
     for bad in (None, np.nan, np.inf):
         rig = watched()

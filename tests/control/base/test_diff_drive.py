@@ -52,6 +52,7 @@ def test_a_coarse_step_goes_along_the_chord_of_its_arc(turn: float) -> None:
     assert math.atan2(y, x) == pytest.approx(turn / 2, abs=2 * COUNT_RAD)
 
 
+@pytest.mark.law
 @each_case(("speed", "rate"), [(0.2, -1.0), (-0.1, 0.7), (0.0, 2.84)])
 def test_a_circle_closes(speed: float, rate: float) -> None:
     period = 2 * math.pi / abs(rate)

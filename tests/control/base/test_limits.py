@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -29,6 +30,7 @@ def test_velocity(requested: np.ndarray, limit: np.ndarray) -> None:
     assert not changed_again.any()
 
 
+@pytest.mark.law
 @given(requested=NEAR, previous=NEAR, largest=arrays(np.float64, (N, 2), elements=st.floats(1e-3, 1)))
 def test_change(requested: np.ndarray, previous: np.ndarray, largest: np.ndarray) -> None:
     out, changed = np.empty_like(requested), np.zeros((N, 2), np.bool_)
@@ -91,6 +93,7 @@ def test_jerk(targets: np.ndarray, ticks: int, jerk: np.ndarray, largest: np.nda
         assert (np.abs(last) <= np.abs(target)).all()
 
 
+@pytest.mark.law
 @given(twist=arrays(np.float64, (N, 2), elements=st.floats(-10, 10)))
 def test_wheel_speed(twist: np.ndarray) -> None:
     limited, changed = twist.copy(), np.zeros(N, np.bool_)

@@ -34,6 +34,7 @@ def point_to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
     return np.linalg.norm(points - start - share[:, None] * way, axis=1)
 
 
+@pytest.mark.law
 @each_case(
     ("points", "distance"),
     [

@@ -37,6 +37,7 @@ def at_home_open(opening: float) -> Arm:
     return replace(ARM, home=(*ARM.home[:-1], opening))
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("opening", [0.0, 0.03, MAX_OPENING])
 def test_it_agrees_with_the_engine(opening: float) -> None:
     dynamics = ArmDynamics(at_home_open(opening))

@@ -69,6 +69,7 @@ def test_jacobian_is_the_derivative() -> None:
             np.testing.assert_allclose(jacobian[3:, joint], (spin[2, 1], spin[0, 2], spin[1, 0]), atol=1e-8)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("kinematics", [KINEMATICS, TILTED])
 def test_every_solution_reaches_the_pose_and_the_generating_posture_is_among_them(kinematics: ArmKinematics) -> None:
     determinant = np.abs(np.linalg.det(kinematics.jacobian(MANY)))

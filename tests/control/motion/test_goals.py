@@ -315,6 +315,7 @@ def test_a_goal_that_takes_too_long_is_braked_and_its_time_starts_with_its_motio
     assert at_rest(rig)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("code", "hard", "phase"),
     [

@@ -63,6 +63,7 @@ REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
 ]
 
 
+@pytest.mark.law
 @each_case(("fields", "code", "words"), REFUSALS)
 def test_invalid_goals_are_refused_with_a_reason(fields: dict[str, Any], code: ResultCode, words: str) -> None:
     failure = PLANNER.check(BrainCommand("a", **fields))

@@ -63,6 +63,7 @@ states = st.lists(st.lists(st.floats(-1, 1), min_size=6, max_size=6), min_size=3
 postures = st.lists(st.floats(-4, 4), min_size=6, max_size=6).map(np.array)
 
 
+@pytest.mark.law
 @given(states, postures)
 def test_a_trajectory_keeps_the_limits_and_ends_at_rest_on_its_target(start: State, target: Array) -> None:
     trajectory = planned(to_target(start, target, ARM, HZ))

@@ -18,6 +18,7 @@ RANGE = {"arm.pos": [-90.0, 90.0], "x.vel": [-0.3, 0.3]}
 ANY = st.one_of(st.floats(-500, 500), st.sampled_from([math.nan, math.inf, -math.inf]))
 
 
+@pytest.mark.law
 @given(st.lists(st.tuples(ANY, ANY), min_size=1, max_size=40), st.floats(-120, 120))
 def test_whatever_comes_is_finite_in_range_and_near_to_what_was_before(
     stream: list[tuple[float, float]], measured: float

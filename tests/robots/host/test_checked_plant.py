@@ -151,6 +151,7 @@ def wrong_shape(out: PlantReading) -> None:
     out.position[0] = np.zeros(3)
 
 
+@pytest.mark.law
 @each_case(
     "call, how",
     [
