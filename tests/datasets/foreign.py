@@ -137,7 +137,8 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     table = pq.read_table(path)
     values = table.to_pydict()
     change(values)
-    pq.write_table(pa.table(values, schema=table.schema), path)
+    fields = [field for field in table.schema if field.name in values]
+    pq.write_table(pa.table(values, schema=pa.schema(fields)), path)
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

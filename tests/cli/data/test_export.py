@@ -24,7 +24,6 @@ from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.ros2.messages import types
-from bhd_lerobot.ros2.messages.robot_views import robot_view
 from tests.cases import each_case
 from tests.datasets import support
 from tests.recording.support import run_record
@@ -455,16 +454,6 @@ def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_they_are
 def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):
     first, second = (export(turtlebot3, tmp_path / name / "b", "--one_bag") for name in ("x", "y"))
     assert (first / "b.mcap").read_bytes() == (second / "b.mcap").read_bytes()
-
-
-def test_a_video_has_its_cameras_geometry():
-    view = robot_view("turtlebot3")
-    assert np.degrees(view.fovy["front"]) == pytest.approx(48.8)
-    optical = next(frame for frame in view.frames if frame.child == "front_optical_frame")
-    w, x, y, z = optical.rotation
-    ahead = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    assert ahead == pytest.approx((np.cos(np.radians(10)), 0, -np.sin(np.radians(10))), abs=1e-4)
-    assert robot_view("so100").frames == ()
 
 
 def test_what_cannot_be_exported_is_refused_and_changes_nothing(turtlebot3, tmp_path, capsys):

@@ -34,18 +34,6 @@ def test_info_shows_outcome_and_timing_of_every_episode(recorded, capsys, monkey
     assert "since the episode's start [s]" in text  # square brackets are not markup
 
 
-def test_the_table_of_episodes_has_a_line_for_each(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
-    assert main.main(["info", str(foreign.write(tmp_path / "d", (12, 345)))]) == 0
-    wanted = """\
-Episodes
-episode  frames  seconds  outcome  score  seed  instruction
-      0      12      1.2                        lift the cup
-      1     345     34.5                        turn around
-"""
-    assert capsys.readouterr().out.endswith(wanted)
-
-
 def test_ten_times_the_episodes_take_at_most_twice_the_work(tmp_path, capsys):
     """Counted in calls of Python's functions, which no other load changes."""
     counts = []
@@ -202,9 +190,7 @@ def test_a_recording_in_progress_is_not_called_interrupted(tmp_path, capsys, mon
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("chek x", "Did you mean 'check'?"),
         ("view x --prt 0", "Did you mean '--port'?"),
-        ("info --shrt", "Did you mean '--short'?"),
         ("check a b", "unexpected argument: b"),
         ("pull s3://bucket/data here", "unexpected argument: here. Name the folder to download to with --root=FOLDER."),
     ],

@@ -15,6 +15,8 @@ from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import RootLock
 from bhd_lerobot.errors import DatasetLockedError
 from tests.datasets.edit_support import assert_valid, content, record
+from tests.datasets.foreign import edit_json
+from tests.datasets.support import snapshot
 
 STATS, INFO = "meta/stats.json", "meta/info.json"
 
@@ -25,12 +27,6 @@ def stock(root: Path) -> Path:
     return root
 
 
-def damage(path: Path, change) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 def errors(root: Path) -> list[str]:
     return [str(finding) for finding in check_dataset(root).findings if finding.severity is Severity.ERROR]
 
@@ -38,9 +34,9 @@ def errors(root: Path) -> list[str]:
 DAMAGES = {
     "gone": lambda root: (root / STATS).unlink(),
     "no JSON": lambda root: (root / STATS).write_text("{"),
-    "wrong mean": lambda root: damage(root / STATS, lambda s: s["observation.state"].update(mean=[9.0, 9.0, 9.0])),
-    "a key is missing": lambda root: damage(root / STATS, lambda s: s.pop("observation.state")),
-    "frames": lambda root: damage(root / INFO, lambda info: info.update(total_frames=3)),
+    "wrong mean": lambda root: edit_json(root / STATS, lambda s: s["observation.state"].update(mean=[9.0, 9.0, 9.0])),
+    "a key is missing": lambda root: edit_json(root / STATS, lambda s: s.pop("observation.state")),
+    "frames": lambda root: edit_json(root / INFO, lambda info: info.update(total_frames=3)),
 }
 
 
@@ -71,12 +67,12 @@ def test_nothing_is_fixed_while_there_is_another_error(tmp_path: Path) -> None:
     """Statistics of wrong data would hide what is wrong."""
     root = record(tmp_path / "d", [0, 1, 2])
     DAMAGES["wrong mean"](root)
-    damage(root / INFO, lambda info: info["features"].pop("timestamp"))
-    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    edit_json(root / INFO, lambda info: info["features"].pop("timestamp"))
+    before = snapshot(root)
     found = check_dataset(root).findings
     assert any(is_fixable(one) for one in found)
     assert fix(root, found) == []
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert snapshot(root) == before
 
 
 def test_not_while_it_is_recorded(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from bhd_lerobot.datasets.recovery.repair import repair, settle
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
-from tests.datasets import corruption_jobs
+from tests.datasets import corruption_jobs, support
 from tests.datasets.edit_support import Episode, assert_valid, content
 from tests.forks import Fork
 
@@ -127,12 +127,12 @@ def test_losses_are_reported(recorded: Recorded, tmp_path: Path) -> None:
 
 def test_the_damaged_files_are_kept(recorded: Recorded, tmp_path: Path) -> None:
     root = recorded(tmp_path / "d", "video", 3, "encoding")
-    before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    before = support.snapshot(root)
     for number in (1, 2):
         report = repair(root)
         aside = tmp_path / f"d.damaged-{number}"
         assert report.aside == aside
-        assert {p.relative_to(aside): p.read_bytes() for p in aside.rglob("*") if p.is_file()} == before
+        assert support.snapshot(aside) == before
         shutil.rmtree(root)
         shutil.copytree(aside, root)
 
@@ -215,10 +215,10 @@ def test_lost_instructions_are_reported_and_distinguished(recorded: Recorded, tm
 def test_nothing_left_changes_nothing(recorded: Recorded, tmp_path: Path) -> None:
     root = recorded(tmp_path / "d", "none", 2, "saved")
     os.truncate(next(root.glob("data/*/*.parquet")), 40)
-    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    before = support.snapshot(root)
     with pytest.raises(DatasetCorruptError, match=r"No whole episode of .* can be recovered; nothing was changed"):
         repair(root)
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert support.snapshot(root) == before
     (root / "meta/info.json").write_text("{")
     with pytest.raises(DatasetCorruptError, match=rf"bhd-data repair {root} --info OTHER"):
         repair(root)
@@ -280,13 +280,13 @@ def test_info_of_another_robot_is_refused(recorded: Recorded, tmp_path: Path) ->
             shutil.copy(donor, info)
         else:
             info.unlink()
-        before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        before = support.snapshot(root)
         with pytest.raises(DatasetCorruptError if by_hand else ConfigError) as error:
             repair(root, None if by_hand else donor)
         assert message in str(error.value)
         assert str(info if by_hand else donor) in str(error.value)
         assert "--info" in str(error.value)
-        assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+        assert support.snapshot(root) == before
         assert not (tmp_path / "d.damaged-1").exists()
 
 
@@ -296,10 +296,10 @@ def test_info_of_another_is_given_back_if_nothing_can_be_recovered(recorded: Rec
     shutil.rmtree(root / "videos")
     for break_it in (lambda path: path.write_text("{"), Path.unlink):
         break_it(root / "meta/info.json")
-        before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        before = support.snapshot(root)
         with pytest.raises(DatasetCorruptError, match="No whole episode"):
             repair(root, donor)
-        assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+        assert support.snapshot(root) == before
         assert not (tmp_path / "d.damaged-1").exists()
 
 
@@ -329,9 +329,9 @@ def test_a_recording_that_goes_on_is_left_alone(recorded: Recorded, tmp_path: Pa
 
 def test_a_valid_dataset_of_lerobot_is_not_changed(recorded: Recorded, tmp_path: Path) -> None:
     root = recorded(tmp_path / "d", "video", 3)
-    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    before = support.snapshot(root)
     assert not repair(root)
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert support.snapshot(root) == before
     assert not (tmp_path / "d.damaged-1").exists()
 
 

@@ -1,6 +1,5 @@
 """A valid dataset has no finding; each kind of damage has one, which names the place."""
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -8,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -18,6 +15,7 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
+from tests.datasets.foreign import edit, edit_json
 from tests.datasets.loader import support as loader_support
 from tests.datasets.support import snapshot
 
@@ -90,21 +88,6 @@ def copy(root: Path, tmp_path: Path) -> Path:
 
 def data_file(root: Path) -> Path:
     return next((root / "data").rglob("*.parquet"))
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Change columns of a Parquet file: dictionaries of lists."""
-    table = pq.read_table(path)
-    rows = table.to_pydict()
-    change(rows)
-    fields = [field for field in table.schema if field.name in rows]
-    pq.write_table(pa.table(rows, schema=pa.schema(fields)), path)
-
-
-def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    values = json.loads(path.read_text())
-    change(values)
-    path.write_text(json.dumps(values))
 
 
 def bad(found: DatasetCheck) -> list[Finding]:
