@@ -88,6 +88,7 @@ def test_every_command_begins_this_way(script: str) -> None:
     assert callable(importlib.import_module(*begin.args).main)
 
 
+@pytest.mark.law
 def test_every_command_names_the_nearest_option_with_status_2(capsys: pytest.CaptureFixture[str]) -> None:
     for module, arguments in (
         ("cli.record", ["--sed=1"]),

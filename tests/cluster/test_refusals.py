@@ -90,6 +90,7 @@ def test_a_cluster_that_does_not_exist_is_reported_soon(tmp_path, monkeypatch):
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.law
 def test_workers_that_share_the_processors_of_this_machine_are_reported(monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(cluster_module, "free_places", lambda config: 99)  # as many as Ray was started with

@@ -16,6 +16,7 @@ from tests.cases import each_case
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
 
 
+@pytest.mark.law
 def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_path):
     path = tmp_path / "c.yaml"
     path.write_text("robot: {type: turtlebot3, beams: 36}\nseed: 3\nn_envs: 4\ndataset: {repo_id: a/b, fps: 20}\n")
@@ -27,6 +28,7 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_
     assert config.dataset.num_episodes == 50
 
 
+@pytest.mark.law
 def test_encoded_configurations_parse_back(tmp_path):
     import yaml
 

@@ -115,6 +115,7 @@ def test_an_existing_root_is_refused_and_left_alone(recorded):
         run_record(recorded[0])
 
 
+@pytest.mark.law
 def test_resume_adds_the_episodes_that_an_undisturbed_run_has(tmp_path):
     run_record(tmp_path / "whole", dataset__num_episodes=5, n_envs=2)
     run_record(tmp_path / "parts", dataset__num_episodes=2, n_envs=3)
@@ -283,6 +284,7 @@ def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
     assert list(loop.run(specs, stop)) == []
 
 
+@pytest.mark.law
 @each_case(
     ("change", "message"),
     [

@@ -41,6 +41,7 @@ def test_it_waits_for_its_simulation_and_not_for_the_next_episode() -> None:
     assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("hard", [Event.ESTOP, Event.FAULT])
 def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
     marks = Marks(2)
@@ -113,6 +114,7 @@ class Keyboard:
         return int(self.marks.frame(np.zeros(1, np.int64), np.ones(1, np.bool_))[0][0])
 
 
+@pytest.mark.law
 @each_case(("first_s", "then_s"), [(0.66, 0.04), (0.25, 0.03), (0.5, 0.1)])
 def test_a_key_that_is_held_is_one_key_whatever_it_means(first_s: float, then_s: float) -> None:
     for one in KEYS:

@@ -21,6 +21,7 @@ def recorded(tmp_path_factory):
     return root
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("episode", [0, 3])
 def test_open_loop_repeats_the_recording_bit_for_bit(recorded, episode):
     result = Replay(recorded, episode).open_loop()

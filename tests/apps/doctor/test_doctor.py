@@ -314,6 +314,7 @@ def test_every_row_has_its_test() -> None:
     assert set(BROKEN) == set(ROWS)
 
 
+@pytest.mark.law
 @each_case("key", ROWS)
 def test_what_is_wrong_is_reported_with_symptom_cause_and_remedy(key: str, tmp_path: Path) -> None:
     check, part = BROKEN[key]

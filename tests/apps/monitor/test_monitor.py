@@ -104,6 +104,7 @@ def only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor, "names", lambda: [name for name in names() if name.startswith(NAME)])
 
 
+@pytest.mark.law
 def test_who_watches_can_write_nothing_but_the_emergency_stop(robot: Robot) -> None:
     _, block = robot.sampler()
     with pytest.raises(ValueError, match="read-only"):
@@ -206,6 +207,7 @@ def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
     block.close()
 
 
+@pytest.mark.law
 def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     words = robot.block.words
     robot.block.fifo.push(1, 0, np.zeros((1, 2)), np.ones(1, np.bool_))

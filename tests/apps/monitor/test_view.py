@@ -4,6 +4,7 @@ import dataclasses
 import io
 from typing import Any
 
+import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
@@ -108,6 +109,7 @@ def lines(shown: MonitorState, width: int = 80, height: int | None = None, **opt
     return console.file.getvalue().splitlines()
 
 
+@pytest.mark.law
 @each_case("shown", [state(), EXTREME, EMPTY])
 @each_case(("width", "height"), [(80, 24), (120, 40), (80, 10), (200, 60)])
 def test_it_fits_and_the_keys_are_always_there(shown: MonitorState, width: int, height: int) -> None:

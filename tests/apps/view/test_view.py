@@ -153,6 +153,7 @@ def test_images_in_the_data_files(stock) -> None:
 # -- who is served -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.law
 @each_case(
     ("host", "is_ours"),
     [

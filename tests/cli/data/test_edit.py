@@ -20,6 +20,7 @@ def recorded(tmp_path_factory) -> Path:
     return record(tmp_path_factory.mktemp("edit") / "d", list(range(6)))
 
 
+@pytest.mark.law
 def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) -> None:
     whole = content(recorded)
     two = shutil.copytree(recorded, tmp_path / "two")

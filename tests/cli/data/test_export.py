@@ -539,6 +539,7 @@ def test_an_episode_that_was_marked_later_comes_back(turtlebot3, tmp_path):
     assert read_episode(tmp_path / "back", 1)["event"][-1] == 11
 
 
+@pytest.mark.law
 @each_case(("fps", "names"), [(24, ["x.vel", "theta.vel"]), (60, {"motors": ["a", "b"]})])
 def test_frames_at_any_rate_come_back_with_their_own_action(tmp_path, fps, names):
     root, frames = tmp_path / "d", 40

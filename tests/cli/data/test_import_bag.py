@@ -34,6 +34,7 @@ def source_of(root, episode=0):
     return json.loads(dataset_info(root).episodes[episode].metadata["source"])
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(("storage", "stamped"), [("sqlite3", False), ("mcap", True)])
 def test_bags_of_humble_and_jazzy_become_what_was_measured(tmp_path, storage, stamped):
     source = write(tmp_path / "bag", drive(stamped=stamped), storage)

@@ -93,6 +93,7 @@ def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
     assert columns == data_columns(simulated)
 
 
+@pytest.mark.law
 def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
     report = timing_report.load_timing(measured)
     parts, total = [episode.summary for episode in report.episodes], report.total.summary

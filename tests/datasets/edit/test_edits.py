@@ -61,6 +61,7 @@ def test_filter_gives_the_wanted_episodes_in_the_wanted_order(plain: Path, video
         assert_valid(tmp_path / str(number))
 
 
+@pytest.mark.law
 def test_delete_leaves_the_others(plain: Path, tmp_path: Path) -> None:
     root, left = shutil.copytree(plain, tmp_path / "d"), content(plain)
     for gone in ([5], [0], [1, 3]):

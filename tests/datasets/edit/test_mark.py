@@ -65,6 +65,7 @@ def test_an_outcome_is_written_to_every_column(tmp_path: Path) -> None:
         former = outcome
 
 
+@pytest.mark.law
 def test_marks_can_be_undone(tmp_path: Path) -> None:
     root = recorded(tmp_path / "d")
     before = content(root)

@@ -87,6 +87,7 @@ def test_a_file_with_a_footer_is_read(tmp_path: Path) -> None:
     assert not found.problem
 
 
+@pytest.mark.law
 def test_only_whole_row_groups_of_a_truncated_file_are_found(tmp_path: Path) -> None:
     tables = [table(5 + seed, seed) for seed in range(4)]
     ends = write(tmp_path / "f.parquet", tables)

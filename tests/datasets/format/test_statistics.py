@@ -13,6 +13,7 @@ SHAPES = st.tuples(st.integers(1, 60), st.integers(1, 40))
 VALUES = st.floats(-1e6, 1e6, width=32)
 
 
+@pytest.mark.law
 @given(SHAPES.flatmap(lambda shape: arrays(np.float32, shape, elements=VALUES)), st.booleans())
 def test_columns_against_numpy(values: np.ndarray, double: bool) -> None:
     values = values.astype(np.float64) if double else values
@@ -70,6 +71,7 @@ def test_images_against_numpy(size: tuple[int, int]) -> None:
     assert stats["mean"].shape == (3, 1, 1)
 
 
+@pytest.mark.law
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=5), st.integers(0, 1000))
 def test_aggregation_is_exact_where_it_can_be(lengths: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)

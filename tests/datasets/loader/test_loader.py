@@ -57,6 +57,7 @@ def assert_equal_datasets(root: Path, **options: Any) -> TableDataset:
     return ours
 
 
+@pytest.mark.law
 @each_case(
     ("episodes", "deltas"),
     [

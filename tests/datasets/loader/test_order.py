@@ -23,6 +23,7 @@ def flat(batches: list[list[int]]) -> list[int]:
     return [sample for batch in batches for sample in batch]
 
 
+@pytest.mark.law
 def test_every_epoch_has_every_sample_once_in_another_order() -> None:
     first, second = (flat(epoch) for epoch in epochs(BatchOrder(SAMPLES, 5, 3), 2))
     assert sorted(first) == sorted(second) == SAMPLES.tolist()
@@ -76,6 +77,7 @@ def test_the_ranks_are_dealt_what_accelerate_deals() -> None:
             assert epochs(ours, 1)[0] == list(theirs), (count, batch_size, world_size, rank)
 
 
+@pytest.mark.law
 @given(
     batches=st.integers(0, 40),
     world_size=st.integers(1, 2),

@@ -107,6 +107,7 @@ def test_a_file_that_was_being_written_is_no_unfinished_recording(tmp_path: Path
         assert not part.parent.exists()
 
 
+@pytest.mark.law
 def test_everything_is_corrected_in_one_step(tmp_path: Path) -> None:
     root = record(tmp_path / "d", [0, 1, 2])
     before = content(root)

@@ -45,6 +45,7 @@ def without_metadata(root: Path) -> list[Any]:
     return [(one.task, one.columns, one.videos) for one in content(root)]
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("is_ours", [True, False])
 def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path, tmp_path: Path, is_ours: bool) -> None:
     for size in (1, 1000):

@@ -104,6 +104,7 @@ def test_an_upload_that_dies_anywhere_shows_no_part(root: Path, tmp_path: Path, 
     assert found == ["old", *["none"] * (len(found) - 3), *["d"] * 2]
 
 
+@pytest.mark.law
 def test_a_download_that_dies_leaves_nothing(root: Path, near_url: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(remote_store, "WORKERS", 1)
     push(root, StoreDataset(near_url))

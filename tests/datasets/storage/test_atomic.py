@@ -82,6 +82,7 @@ def test_files_that_others_write_during_an_edit_stay(root: Path, monkeypatch: py
     assert root.stat().st_ino == inode, "who stands in it, or has mounted it, sees the new content"
 
 
+@pytest.mark.law
 def test_a_mixture_of_old_and_new_never_loads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between any two changes of the disk a stock LeRobot finds the old dataset or the new one, or is refused."""
     old = content(root)

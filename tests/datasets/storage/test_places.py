@@ -146,6 +146,7 @@ def test_a_pull_refuses_a_staging_folder_of_another_user(tmp_path: Path) -> None
             pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
 
 
+@pytest.mark.law
 def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path) -> None:
     data, video = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
     episodes = "meta/episodes/chunk-000/file-000.parquet"

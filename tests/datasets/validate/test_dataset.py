@@ -94,6 +94,7 @@ def bad(found: DatasetCheck) -> list[Finding]:
     return [finding for finding in found.findings if finding.severity > Severity.NOTE]
 
 
+@pytest.mark.law
 def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
     before = snapshot(valid)
     found = check_dataset(valid, limits)
@@ -186,6 +187,7 @@ DAMAGED_NUMBERS = (
 )
 
 
+@pytest.mark.law
 def test_damaged_numbers_are_found(valid: Path, tmp_path: Path) -> None:
     root = copy(valid, tmp_path)
     origin = data_file(root).read_bytes()

@@ -104,6 +104,7 @@ def test_finalising_that_is_stopped_at_any_step_can_be_done_again(
     assert support.verify(root, 3, stats=True) == 3
 
 
+@pytest.mark.law
 def test_an_interrupt_at_any_step_of_a_save(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C raises between any two steps; leaving the block must still finalise all that was committed."""
     step, done = 0, False

@@ -79,6 +79,7 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return theirs, ours
 
 
+@pytest.mark.law
 def test_data_equals_lerobots(roots: tuple[Path, Path]) -> None:
     theirs, ours = (pq.read_table(root / "data/chunk-000/file-000.parquet") for root in roots)
     assert theirs.equals(ours)
