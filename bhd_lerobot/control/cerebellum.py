@@ -167,8 +167,10 @@ class Cerebellum:
         bad: NDArray[np.bool_] = np.asarray(~np.isfinite(reading.values).all(axis=(0, 2)))
         if wrong is not None:
             bad |= wrong
-        # What is no measurement must not spread: it is treated as a joint at rest where the encoder last was.
-        reading.velocity[bad] = reading.effort[bad] = 0.0
+        # What is no measurement must not spread: it is treated as a joint at rest where the encoder last was. Efforts
+        # do not depend on encoders.
+        misread = bad & ~np.isfinite(reading.effort).all(axis=1)
+        reading.velocity[bad] = reading.effort[misread] = 0.0
         self._set_mode((reading.safety == SafetyStatus.EMERGENCY_STOP) & (self.mode != Mode.ESTOP), Mode.ESTOP)
         faulty = bad | (reading.safety != SafetyStatus.NORMAL)
         faulty &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)

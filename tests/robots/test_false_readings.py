@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from benchmarks import wire
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.control.messages import Mode, Reason, Request, Watchdog
+from bhd_lerobot.control.messages import Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from tests.robots.forces import Wall
 
 Array = NDArray[np.float64]
 Lie = Callable[[PlantReading, float], None]
@@ -104,10 +105,13 @@ def test_an_encoder_that_drifts_brings_the_joint_no_further_than_one_that_is_blo
     lied.turn(6.0)
     assert (lied.moved() < 0.1 + 0.07 * np.abs(rate) + BRAKES).all()
     assert np.ptp(np.array(lied.true)[-HZ:], axis=0).max() < 1e-3
-    # By its efforts, in the posture that is read, something hangs on an arm whose encoder is that wrong.
-    reasons = lied.cerebellum.request(Request.RESET).reasons
-    assert set(reasons.tolist()) == {Reason.ACCEPTED, Reason.PRESSED}
-    assert (joints[reasons == Reason.PRESSED] == 1).all()  # the shoulder lift, which carries the weight
+    # After a reset it stays where it is, and is stopped again.
+    lied.reset()
+    where = lied.true[-1]
+    lied.action = lied.cerebellum.command.copy()
+    lied.turn(0.5)
+    assert (lied.cerebellum.mode == Mode.FAULT).all()
+    assert np.abs(lied.true[-1] - where).max() < BRAKES
 
 
 def test_an_encoder_that_freezes_with_fresh_stamps() -> None:
@@ -122,6 +126,42 @@ def test_an_encoder_that_freezes_with_fresh_stamps() -> None:
     lied.turn(3.0)
     assert (lied.moved() < 0.1 + 0.1 * 0.4 + BRAKES).all()
     assert (lied.watchdog & Watchdog.BLOCKED).all()
+
+
+def _drift(out: PlantReading, seconds: float) -> None:
+    out.position[:, 1] += [0.3 * seconds, -0.3 * seconds, min(seconds, 1.0), 2.0 * seconds]
+    out.velocity[:, 1] += [0.3, -0.3, seconds < 1.0, 2.0]
+
+
+def _jump(out: PlantReading, _: float) -> None:
+    out.position[np.arange(4), [0, 1, 2, 3]] += 0.5
+
+
+def _break(out: PlantReading, _: float) -> None:
+    out.position[np.arange(4), [0, 1, 2, 3]] = np.nan
+
+
+def _freeze() -> Lie:
+    held: list[Array] = []
+
+    def freeze(out: PlantReading, _: float) -> None:
+        held[:] = held or [out.position[:, :6].copy()]
+        out.position[:, :6], out.velocity[:, :6] = held[0], 0.0
+
+    return freeze
+
+
+@pytest.mark.parametrize("lie", [_freeze(), _drift, _jump, _break], ids=["frozen", "drifting", "jumping", "broken"])
+def test_an_arm_whose_encoders_are_wrong_gives_way_by_its_efforts(lie: Lie) -> None:
+    lied = Lied([0, 1, 2, 3], lie)
+    lied.turn(2.5)
+    assert (lied.moved() < 0.1 + 0.1 * 0.4 + 0.07 * 2.0 + BRAKES).all()
+    wall, most = Wall(lied.arm, [(1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0), (0.3, 0.4, 1.0)], 0.05, 2.0), np.zeros(4)
+    for _ in range(75):
+        lied.arm.step(None)
+        np.maximum(most, wall.force, out=most)
+    assert ((most > 0.0) & (most < 250.0)).all()
+    assert (wall.force < 20.0).all()
 
 
 @pytest.mark.parametrize("lie", ["drifting", "frozen", "counting twice"])
@@ -176,6 +216,63 @@ def test_after_an_emergency_stop_an_arm_gives_way_once_and_not_again_to_the_same
     lied.cerebellum.estop.press()
     lied.turn(3.0)
     assert (lied.moved(Mode.ESTOP) < 0.09 + 0.05 + BRAKES).all()
+
+
+def _zeros(out: PlantReading, _: float) -> None:
+    out.effort[:] = 0.0
+
+
+@pytest.mark.parametrize("is_moving", [True, False])
+def test_efforts_of_zero_are_a_fault_that_names_them_and_moves_nothing(is_moving: bool) -> None:
+    lied = Lied([0, 1, 5], _zeros)
+    if is_moving:
+        lied.turn(0.8)
+    else:
+        for _ in range(20):
+            lied.arm.step(None)
+    assert (lied.moved() < BRAKES).all()
+    assert (lied.modes[-1] == Mode.FAULT).all()
+    assert "efforts that the plant reads are 0 while the motors carry the arm" in lied.cerebellum.controller.cause
+    for _ in range(2):  # and again after each reset, for as long as it is so
+        lied.reset()
+        for _ in range(5):
+            lied.arm.step(None)
+        assert (lied.cerebellum.mode == Mode.FAULT).all()
+    assert (lied.moved() < BRAKES).all()
+
+
+def test_efforts_that_are_zero_in_between_leave_the_limit_of_force_as_it_is() -> None:
+    """As of a driver that fills the field with zeros in every other message: nothing else is less."""
+    rng = np.random.default_rng(3)
+
+    def lie(out: PlantReading, _: float) -> None:
+        out.effort[rng.random(2) < 0.7, :] = 0.0
+
+    lied = Lied([1, 2], lie)
+    lied.turn(1.0)
+    lied.action[:, 2] -= 0.8
+    lied.turn(0.8)
+    assert (lied.cerebellum.mode == Mode.TRACKING).all()
+    assert lied.cerebellum.controller.force.force.max() < 60.0
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+@pytest.mark.parametrize("stop", [Mode.ESTOP, Mode.FAULT])
+def test_an_arm_that_is_stopped_takes_efforts_of_zero_for_none(value: float, stop: Mode) -> None:
+    """It gives way by what is read of its joints, and not to a weight that it does not feel."""
+
+    def lie(out: PlantReading, seconds: float) -> None:
+        if seconds > 0.2:
+            out.effort[:] = value
+
+    lied = Lied([0, 1], lie)
+    lied.turn(0.6)
+    if stop == Mode.ESTOP:
+        lied.cerebellum.estop.press()
+    else:
+        lied.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)
+    lied.turn(3.0)
+    assert (lied.moved(stop) < BRAKES).all()
 
 
 @pytest.mark.parametrize("what", ["effort", "velocity"])

@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.held import HeldObjects
-from bhd_lerobot.control.arm.relief import ContactRelief
+from bhd_lerobot.control.arm.relief import ContactRelief, Sensed
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
@@ -36,6 +36,10 @@ _ARRIVED_RAD = 2e-4  # [rad]
 _SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 _TINY = 1e-9
 _STANDS = 0.01  # [rad, m] a joint that moved by less has not moved
+_LOST = (
+    "The efforts that the plant reads are 0 while the motors carry the arm: they are not measured, and without them "
+    "there is no limit of force. Repair them, or let the plant leave PlantReading.has_effort false."
+)
 _DEAF = "The arm has not moved since it was activated: it takes no commands, its brakes are on, or something holds it."
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
@@ -107,6 +111,8 @@ class ArmController(Controller):
         self._stopped = np.zeros(n, np.bool_)  # hard, since it was last reset
         self._rest_ticks: NDArray[np.int64] = np.zeros(n, np.int64)  # for which its reference has followed nothing
         self._blind = np.zeros(n, np.bool_)  # it is not known where it is
+        self._wrong = np.zeros((n, width - 1), np.bool_)  # joints whose encoders were found wrong since the stop
+        self._driven = np.zeros(n, np.bool_)  # their motors are on: before, and after SAFE_OFF, that is not known
         self._relief = ContactRelief(arm, n, control_hz)
         self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
         self._yield_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
@@ -181,6 +187,8 @@ class ArmController(Controller):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             self._stopped &= ~mask
+            self._wrong &= ~mask[:, None]
+            self._driven[mask] = cause == Mode.HOLD
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
@@ -202,10 +210,10 @@ class ArmController(Controller):
         np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
 
     def distrust(self, mask: NDArray[np.bool_]) -> None:
-        """Give way to nothing for now: where the arms are is not known."""
+        """Take some arms, as long as they are stopped, to be where their servos were commanded to hold them."""
         self._blind |= mask
         if self.force is not None:
-            self.force.restart(np.flatnonzero(mask))
+            self.force.restart(np.flatnonzero(mask & ~self._wrong.all(axis=1)))
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
@@ -232,22 +240,46 @@ class ArmController(Controller):
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0
-        if self.force is not None and self.force.update(reading, self._rest_ticks > 0):
+        if self.force is not None and self._feel(self.force, reading):
             # One that gives way does what it can.
-            watched = ~self._yields & (~self._stopped | self.goals.following)
-            self._protect(self.force.exceeded & watched, reading, Watchdog.FORCE, self.force.explain())
+            hard = self.force.exceeded & ~self._yields & (~self._stopped | self.goals.following)
+            misread = hard & self._misread_joints(reading).any(axis=1)  # it is the force in another posture
+            self._protect(misread, reading, Watchdog.BLOCKED, self._misread, follows=True)
+            self._protect(hard & ~misread, reading, Watchdog.FORCE, self.force.explain())
+            lost = self.force.lost & self._driven & ~self._stopped
+            self._protect(lost, reading, Watchdog.PLANT, _LOST, follows=True)
+
+    def _feel(self, force: ForceLimit, reading: PlantReading) -> bool:
+        """Estimate with what the arms press; return whether any presses too hard, or is not known to press."""
+        position = self._where(reading) if np.count_nonzero(self._wrong) else None
+        return force.update(reading, self._rest_ticks > 0, position) or bool(np.count_nonzero(force.lost))
+
+    def _where(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return where the joints are, shape (n, dof): the servo of a wrong encoder holds what it was commanded to."""
+        dof = self.width - 1
+        return np.where(self._wrong, self.command[:, :dof], reading.position[:, :dof])
 
     def _give_way(self, reading: PlantReading) -> None:
         """Let go of what stopped arms press on, once they have come to rest."""
         self._rest_ticks += 1
         self._rest_ticks *= self._stopped & ~self._yields & ~self.goals.following
-        ready, dof = self._rest_ticks > 0, self.width - 1
-        known = (self._rest_ticks > self._settled_ticks) & ~self._blind & ~self._misread_joints(reading).any(axis=1)
-        efforts = None
-        if self.force is not None and reading.has_effort:
-            efforts = self.force.torque, self.force.pressing
+        settled = self._rest_ticks > self._settled_ticks
+        position, force = reading.position[:, : self.width - 1], self.force
+        if force is None:
+            none = np.zeros(len(settled), np.bool_)
+            sensed = Sensed(position, np.zeros_like(position), np.zeros(len(settled)), none, none)
+        else:
+            measured = self._measured(reading)
+            wrong = self._misread_joints(reading) | self._blind[:, None]
+            wrong &= (settled & measured)[:, None] & ~self._wrong
+            if np.count_nonzero(wrong):
+                self._wrong |= wrong
+                force.restart(np.flatnonzero(wrong.any(axis=1)))  # what was felt was felt in another posture
+            doubtful = np.asarray(self._wrong.any(axis=1))
+            sensed = Sensed(self._where(reading), force.torque, force.pressing, measured, doubtful)
+        known = settled & (sensed.measured | ~self._blind)
         self._blind[:] = False
-        self._relief.run(ready, known, reading.position[:, :dof], efforts, self.command, self.velocity)
+        self._relief.run(self._rest_ticks > 0, known, sensed, self.command, self.velocity)
 
     def _watch(self, reading: PlantReading) -> None:
         """Find arms that do not go where they are commanded to, and stop pressing on with them.
@@ -262,16 +294,14 @@ class ArmController(Controller):
         self._off_ticks = (self._off_ticks + 1) * (off & ~self._stopped)
         blocked = self._off_ticks >= self._most_off_ticks
         if np.count_nonzero(blocked):
-            unsure = (
-                blocked.copy()
-            )  # without efforts nothing says whether it is the joint or the encoder that stays behind
-            if reading.has_effort:
-                unsure &= ((away > limit) & self._misread_joints(reading)).any(axis=1)
+            # Without efforts nothing says whether it is the joint or the encoder that stays behind.
+            measured = self._measured(reading)
+            unsure = blocked & (((away > limit) & self._misread_joints(reading)).any(axis=1) | ~measured)
             deaf = blocked & (np.abs(reading.position - self._first) < _STANDS).all(axis=1)
             self._protect(deaf & unsure, reading, Watchdog.BLOCKED, _DEAF, follows=True)
             self._protect(deaf & ~unsure, reading, Watchdog.BLOCKED, _DEAF)
-            message = self._misread if reading.has_effort else self._blocked
-            self._protect(unsure & ~deaf, reading, Watchdog.BLOCKED, message, follows=True)
+            self._protect(unsure & ~deaf & measured, reading, Watchdog.BLOCKED, self._misread, follows=True)
+            self._protect(unsure & ~deaf & ~measured, reading, Watchdog.BLOCKED, self._blocked, follows=True)
             self._protect(blocked & ~deaf & ~unsure, reading, Watchdog.BLOCKED, self._blocked)
 
     def _misread_joints(self, reading: PlantReading) -> NDArray[np.bool_]:
@@ -284,7 +314,13 @@ class ArmController(Controller):
         torque = reading.effort[:, :dof] if self.force is None else self.force.torque
         wrong = torque * np.sign(wanted[:, :dof]) < _GIVES * self._effort[:dof]
         wrong &= np.abs(wanted[:, :dof]) > _SURE * self._effort[:dof]
-        return wrong if reading.has_effort else np.zeros_like(wrong)
+        return wrong & self._measured(reading)[:, None]
+
+    def _measured(self, reading: PlantReading) -> NDArray[np.bool_]:
+        """Return whether the efforts of each arm are measurements, shape (n,)."""
+        if self.force is None or not reading.has_effort:
+            return np.full(len(self.busy), reading.has_effort)
+        return self.force.measured
 
     def _protect(
         self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str, *, follows: bool = False
@@ -379,7 +415,7 @@ class ArmController(Controller):
         self.setpoints.restart(ids)
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
-        self._yields[ids] = self._stopped[ids] = False
+        self._yields[ids] = self._stopped[ids] = self._wrong[ids] = self._driven[ids] = False
         self._rest_ticks[ids] = 0
         self.protective_stop[ids] = 0
         if self.force is not None:

@@ -26,6 +26,9 @@ _GRAVITY = 9.81  # [m/s^2]
 # lever of less than 0.1 m, by less than half.
 _FORCE_DAMPING = 0.1
 _LEAST_TORQUE = 4.0  # [N m] where no joint feels more, nothing is estimated: 10 N with a lever of 0.4 m
+# Efforts that are all exactly 0 are none that were measured: motors that carry this much [N m] give some.
+_CARRIES = 4.0
+_LOST_S = 0.1  # without any effort that was measured
 
 
 class ForceLimit:
@@ -45,6 +48,8 @@ class ForceLimit:
             points [N m], shape (n, 6); shape (n, 0) if it is not asked for.
         pressing: the forces that are more than a load which need not be declared, shape (n,); 0 for the others.
         exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
+        measured: whether the newest efforts were measurements, shape (n,): of the others nothing is known.
+        lost: whether they have been none for 0.1 s though the motors carry the arm's weight, shape (n,).
 
     Args:
         control_hz: ticks a second [Hz].
@@ -69,36 +74,52 @@ class ForceLimit:
         self._period = max(1, round(_PERIOD_S * control_hz))
         self._hz = control_hz / self._period
         self._sum, self._ticks = np.zeros((n, dof)), 0
+        self._zeros: NDArray[np.int64] = np.zeros(n, np.int64)  # readings of this period without any effort
+        self._lost_periods: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._most_lost = max(1, round(_LOST_S * control_hz / self._period))
         self._position, self._velocity, self.torque = (np.zeros((n, dof)) for _ in range(3))
         self._fresh = np.ones(n, np.bool_)
         self.force, self.pressing = np.zeros((2, n))
         self.wrench: Array = np.zeros((n, 6 if wrench else 0))
-        self.exceeded: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.exceeded, self.measured, self.lost = np.zeros((3, n), np.bool_)
 
-    def update(self, reading: PlantReading, resting: NDArray[np.bool_] | bool = False) -> bool:
+    def update(
+        self, reading: PlantReading, resting: NDArray[np.bool_] | bool = False, position: Array | None = None
+    ) -> bool:
         """Take one tick into account; return whether there is a new estimate that is too large for any arm.
 
         Args:
             resting: the arms that are at rest whatever speeds are read, shape (n,).
+            position: where the joints are, if not where they are read to be [rad], shape (n, dof).
         """
         if not reading.has_effort:
+            self.measured[:] = False
             return False
         dof = self._dof
-        self._sum += reading.effort[:, :dof]
+        position = reading.position[:, :dof] if position is None else position
+        effort = reading.effort[:, :dof]
+        self._sum += effort
+        if np.count_nonzero(effort) < effort.size:
+            self._zeros += ~effort.any(axis=1)
         self._ticks += 1
         if self._ticks < self._period:
             return False
-        position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
+        velocity = reading.velocity[:, :dof]
         middle, speed = (position + self._position) / 2, (velocity + self._velocity) / 2
         change = (velocity - self._velocity) * self._hz
         moving = np.logical_not(resting).reshape(-1, 1)
         speed, change = speed * moving, change * moving
-        residual = self._sum / self._ticks - self._dynamics.torque(middle, speed, change)
+        given = self._sum / np.maximum(self._ticks - self._zeros, 1)[:, None]
+        residual = given - self._dynamics.torque(middle, speed, change)
         self._position[:], self._velocity[:] = position, velocity
-        self._sum[:], self._ticks = 0.0, 0
+        ticks, self._sum[:], self._ticks = self._ticks, 0.0, 0
         residual[self._fresh] = 0.0  # where they came from is not known yet
         self._fresh[:] = False
         torque = self.torque
+        if self._zeros.any() or self._lost_periods.any():
+            self._judge_zeros(ticks, position, residual)
+        else:
+            self.measured[:] = True
         torque += _SHARE * (residual - torque)
         if self.wrench.size:
             every = np.ascontiguousarray(self._forward.jacobian(position))
@@ -125,6 +146,19 @@ class ForceLimit:
         self.exceeded |= self._hung >= self._most_hung
         return bool(np.count_nonzero(self.exceeded))
 
+    def _judge_zeros(self, ticks: int, position: Array, residual: Array) -> None:
+        """Keep the estimates of arms without efforts in this period; forget them of those without for longer."""
+        none = self._zeros == ticks
+        self._zeros[:] = 0
+        self._lost_periods += 1
+        self._lost_periods *= none
+        self.measured |= ~none
+        self.measured &= self._lost_periods < self._most_lost
+        self.torque[~self.measured] = 0.0
+        np.copyto(residual, self.torque, where=none[:, None])
+        weight = np.abs(self._dynamics.torque(position, np.zeros_like(position), np.zeros_like(position)))
+        self.lost[:] = (self._lost_periods >= self._most_lost) & (weight.max(axis=1) > _CARRIES)
+
     def _tool_force(self, jacobian: Array, torque: Array) -> Array:
         """Return the forces on the tools alone, without moments, that torques amount to [N], shape (k, 3)."""
         lever = jacobian[:, :3] * self._certain
@@ -147,6 +181,7 @@ class ForceLimit:
         """Forget arms that were put somewhere else."""
         self._fresh[ids] = True
         self._hung[ids] = 0
+        self._zeros[ids] = 0
         self._sum[ids] = self.torque[ids] = self.force[ids] = self.pressing[ids] = 0.0
         self.wrench[ids] = 0.0
         self.exceeded[ids] = False

@@ -1,5 +1,7 @@
 """Stopped arms that give way to what they press on, or what presses on them, for as long as it does."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +23,29 @@ _WEIGHT_N, _GENTLE = 60.0, 0.25  # because it is lighter or heavier by that when
 _STANDS = 2  # decisions after which an arm that has stopped giving way is known to stand
 _AGAIN_RAD, _AGAIN_S, _TRIES = 0.02, 0.25, 3  # so far, after this time, and so often it is tried again
 _PUSHED_RAD = 0.01  # [rad] ahead of its reference, in the direction in which it gives way, a joint is pushed
+_SLIPS = 0.8  # share of its largest stretch at which a joint is pushed away, whatever its encoder reads
 _SLACK_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
 _SPRINGS_RAD = 0.05  # [rad] farther than to where it was read an arm without efforts does not give way
+_DOUBTFUL_RAD = 1.0  # [rad] of all joints, by which an arm whose encoders are wrong gives way
 _MARGIN_RAD = 0.005  # [rad] so far from the end of its range a joint stays
+
+
+class Sensed(NamedTuple):
+    """What is known of n arms.
+
+    Attributes:
+        position: of the joints [rad], shape (n, dof).
+        torque: that the motors give more than the posture needs [N m], shape (n, dof).
+        force: on the tools, that these amount to [N], shape (n,).
+        measured: whether the efforts are measurements, shape (n,); torque and force of the others mean nothing.
+        doubtful: whether an encoder was found wrong, shape (n,).
+    """
+
+    position: Array
+    torque: Array
+    force: Array
+    measured: Mask
+    doubtful: Mask
 
 
 class ContactRelief:
@@ -34,8 +56,9 @@ class ContactRelief:
     goes on is followed for as long as it goes on, a soft one until it is relaxed. A force that stays as it is however
     the arm gives way, such as a load's, stops that; one that changes later begins it anew.
 
-    The torques are those that the motors' efforts are more than the posture needs: what encoders read decides nothing.
-    Of a plant that measures no efforts they follow from the positions that were read; the way is then bounded.
+    The torques are those that the motors' efforts are more than the posture needs: what encoders read decides nothing,
+    but the way is bounded if they were found wrong. Of a plant that measures no efforts the torques follow from the
+    positions that were read; the way is bounded more narrowly.
 
     Args:
         control_hz: ticks a second [Hz].
@@ -56,29 +79,19 @@ class ContactRelief:
         self._level, self._vain = np.zeros(n), np.zeros(n)  # a force that stays as it is [N], and the way since [rad]
         self._stood: NDArray[np.int64] = np.zeros(n, np.int64)  # decisions since it moved last
         self._waited, self._tries = np.zeros(n), np.zeros(n, np.int64)  # for how long [s], and how often tried again
-        self._room = np.full(n, np.nan)  # so far an arm without efforts may still give way [rad]
+        self._kind = np.zeros(n, np.int64)  # what the way of each arm was bounded for: 1 efforts, 2 doubtful, 3 none
+        self._room = np.full(n, np.nan)  # so far an arm may still give way of which something is not known [rad]
 
     def active(self) -> Mask:
         """Return whether each arm gives way, shape (n,)."""
         return np.asarray(self._wanted.any(axis=1))
 
-    def run(  # noqa: PLR0917
-        self,
-        mask: Mask,
-        known: Mask,
-        position: Array,
-        efforts: tuple[Array, Array] | None,
-        command: Array,
-        velocity: Array,
-    ) -> None:
+    def run(self, mask: Mask, known: Mask, sensed: Sensed, command: Array, velocity: Array) -> None:
         """Advance the references of some arms by one tick, in place.
 
         Args:
             mask: arms that were stopped and have come to rest, shape (n,).
-            known: whether what is read of them can be trusted, shape (n,); the others stop giving way.
-            position: of the joints [rad], shape (n, dof).
-            efforts: the torques that the motors give more than the posture needs [N m], shape (n, dof), and the forces
-                on the tools that they amount to [N], shape (n,); None if the plant measures none.
+            known: whether anything tells what presses on them, shape (n,); the others stop giving way.
             command: the reference [rad], shape (n, dof or more).
             velocity: its speed [rad/s], shape (n, dof or more).
         """
@@ -86,11 +99,11 @@ class ContactRelief:
         self._ticks[~trusted] = 0
         self._tries[~trusted] = 0
         self._wanted[~trusted] = self._level[~trusted] = self._vain[~trusted] = 0.0
-        self._room[~mask] = np.nan
+        self._room[~mask], self._kind[~mask] = np.nan, 0
         self._ticks[trusted] += 1
         due = trusted & (self._ticks % self._period == 0)
         if due.any():
-            self._decide(np.flatnonzero(due), position, efforts, command, velocity)
+            self._decide(np.flatnonzero(due), sensed, command, velocity)
         if not self._wanted.any() and not velocity[mask].any():
             return
         dof = self._dof
@@ -101,42 +114,22 @@ class ContactRelief:
         velocity[mask, :dof] = speed
         command[mask, :dof] = reference + speed / self._hz
 
-    def _decide(
-        self,
-        ids: NDArray[np.intp],
-        position: Array,
-        efforts: tuple[Array, Array] | None,
-        command: Array,
-        velocity: Array,
-    ) -> None:
+    def _decide(self, ids: NDArray[np.intp], sensed: Sensed, command: Array, velocity: Array) -> None:
         """Choose the speeds of the coming period."""
-        stretch: Array
-        presses: Mask
-        off = command[ids, : self._dof] - position[ids]
-        if efforts is None:
-            stretch = np.clip(off, -self._largest, self._largest)
-            presses = np.asarray((np.abs(off) > _SLACK_RAD).any(axis=1))
-            first = np.isnan(self._room[ids])
-            self._room[ids[first]] = np.abs(off[first]).sum(axis=1) + _SPRINGS_RAD
-            presses &= self._room[ids] > 0.0
-        else:
-            stretch, force = efforts[0][ids] / self._stiffness, efforts[1][ids]
-            presses = np.asarray(force > _LIGHT_N)
-            most = np.where(self._level[ids] < _WEIGHT_N, 2.0, 1.0) * _CHANGE_N
-            ahead = (off * np.sign(stretch) > _PUSHED_RAD) & (np.abs(stretch) > _SLACK_RAD)
-            same = np.abs(force - self._level[ids]) < most
-            self._stood[ids] = (self._stood[ids] + 1) * ~velocity[ids, : self._dof].any(axis=1)
-            same |= (self._vain[ids] >= _VAIN_RAD) & (self._stood[ids] <= _STANDS)  # what braked made it heavier
-            same &= presses & ~ahead.any(axis=1)
-            self._level[ids] = np.where(same, self._level[ids], force)
-            self._vain[ids] *= same
-            waits = self._vain[ids] >= _VAIN_RAD
-            self._waited[ids] = (self._waited[ids] + self._period / self._hz) * waits
-            again = ids[(self._waited[ids] > _AGAIN_S) & (self._tries[ids] < _TRIES)]
-            self._vain[again] = _VAIN_RAD - _AGAIN_RAD
-            self._tries[again] += 1
-            self._tries[ids[~same]] = 0
-            presses &= ~waits
+        measured = sensed.measured[ids]
+        off = command[ids, : self._dof] - sensed.position[ids]
+        by_position = np.clip(off, -self._largest, self._largest)
+        stretch: Array = np.where(measured[:, None], sensed.torque[ids] / self._stiffness, by_position)
+        presses = np.where(
+            measured,
+            self._presses(ids, off, stretch, sensed, velocity),
+            (np.abs(off) > _SLACK_RAD).any(axis=1),
+        )
+        kind = np.where(measured, np.where(sensed.doubtful[ids], 2, 1), 3)
+        bound = np.where(kind == 1, np.inf, np.where(kind == 2, _DOUBTFUL_RAD, np.abs(off).sum(axis=1) + _SPRINGS_RAD))
+        room = np.where(kind == self._kind[ids], self._room[ids], np.fmin(self._room[ids], bound))
+        self._kind[ids], self._room[ids] = kind, room
+        presses &= room > 0.0
         moving = self._wanted[ids].any(axis=1, keepdims=True)
         before = np.where(moving, self._stretch[ids], stretch)
         push = _FOLLOW * stretch + _EASE * (stretch - before)
@@ -144,8 +137,8 @@ class ContactRelief:
         wanted *= wanted * stretch < 0.0  # never against the push
         tools = self._forward.tool_speed(command[ids, : self._dof], wanted) / _TOOL_SPEED
         joints = np.abs(wanted).max(axis=1) / _SPEED
-        share = 1.0 if efforts is not None else _UNSURE
-        wanted *= share / np.maximum(np.maximum(joints, tools), share)[:, None]
+        share = np.where(measured, 1.0, _UNSURE)
+        wanted *= (share / np.maximum(np.maximum(joints, tools), share))[:, None]
         slower = _KEEP * self._wanted[ids]
         slower[np.abs(slower).max(axis=1) < _CREEP] = 0.0
         self._wanted[ids] = np.where(presses[:, None], wanted, slower)
@@ -153,3 +146,24 @@ class ContactRelief:
         way = np.abs(self._wanted[ids]).sum(axis=1) * self._period / self._hz
         self._vain[ids] += way
         self._room[ids] -= way
+
+    def _presses(self, ids: NDArray[np.intp], off: Array, stretch: Array, sensed: Sensed, velocity: Array) -> Mask:
+        """Return the arms on which something presses by their efforts, and is not followed in vain."""
+        force = sensed.force[ids]
+        most = np.where(self._level[ids] < _WEIGHT_N, 2.0, 1.0) * _CHANGE_N
+        presses = np.asarray(force > _LIGHT_N)
+        ahead = (off * np.sign(stretch) > _PUSHED_RAD) & (np.abs(stretch) > _SLACK_RAD)
+        ahead |= sensed.doubtful[ids, None] & (np.abs(stretch) > _SLIPS * self._largest)
+        same = np.abs(force - self._level[ids]) < most
+        self._stood[ids] = (self._stood[ids] + 1) * ~velocity[ids, : self._dof].any(axis=1)
+        same |= (self._vain[ids] >= _VAIN_RAD) & (self._stood[ids] <= _STANDS)  # what braked made it heavier
+        same &= presses & ~ahead.any(axis=1)
+        self._level[ids] = np.where(same, self._level[ids], force)
+        self._vain[ids] *= same
+        waits = self._vain[ids] >= _VAIN_RAD
+        self._waited[ids] = (self._waited[ids] + self._period / self._hz) * waits
+        again = ids[(self._waited[ids] > _AGAIN_S) & (self._tries[ids] < _TRIES)]
+        self._vain[again] = _VAIN_RAD - _AGAIN_RAD
+        self._tries[again] += 1
+        self._tries[ids[~same]] = 0
+        return presses & ~waits
