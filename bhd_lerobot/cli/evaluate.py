@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keys = [argument.partition("=")[0] for argument in given]
     if "--brain.path" in keys and "--brain.type" not in keys:
         given.append("--brain.type=learned")  # nothing else is somewhere on the disk
-    return run(program_of, given)
+    return run(program_of, given, "eval")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 error.add_note(line)
             raise
 
-    return run(Program(RecordConfig, program), given)
+    return run(Program(RecordConfig, program), given, "record")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-train`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
     if arguments is None:  # as a program of its own, not within another
         keep_memory()
-    return run(_program, arguments)
+    return run(_program, arguments, "train")
 
 
 if __name__ == "__main__":

@@ -7,5 +7,6 @@ __all__ = [
     "parse",
     "plugins",
     "registry",
+    "shipped",
     "units",
 ]

@@ -86,8 +86,15 @@ class Program:
     interrupted: str = "Stopped."
 
 
-def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequence[str] | None = None) -> int:
-    """Run a program, or that which a command line chooses, with the arguments of this process if None.
+def run(
+    program: "Program | Callable[[CommandLine], Program]", arguments: Sequence[str] | None = None, command: str = ""
+) -> int:
+    """Run a program, or that which a command line chooses.
+
+    Args:
+        program: it, or what chooses it.
+        arguments: by default those of this process.
+        command: whose configurations come with this package: `record`, `train` or `eval`.
 
     Returns:
         The exit status; 0 after the help.
@@ -95,6 +102,7 @@ def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequen
     from bhd_lerobot.options.help import help_of
     from bhd_lerobot.options.parse import CommandLine, parse, read_line
     from bhd_lerobot.options.plugins import load_named, load_plugins
+    from bhd_lerobot.options.shipped import shipped_names
 
     interrupted = "Stopped."
 
@@ -104,7 +112,7 @@ def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequen
         given = load_named(sys.argv[1:] if arguments is None else arguments)
         left = [argument for argument in given if argument not in ("-h", "--help")]
         try:
-            line = read_line(left)
+            line = read_line(left, command)
         except ConfigError:
             if left == given:
                 raise
@@ -113,7 +121,7 @@ def run(program: "Program | Callable[[CommandLine], Program]", arguments: Sequen
         interrupted = chosen.interrupted
         if left != given:
             types = re.findall(r"^--([\w.]+\.type)[=\n](\S+)$", "\n".join(left), re.MULTILINE)
-            print(help_of(chosen.config_class, dict(types)))
+            print(help_of(chosen.config_class, dict(types), shipped_names(command)))
             return 0
         return chosen.main(chosen.read(line) if chosen.read else parse(chosen.config_class, line))
 

@@ -6,7 +6,7 @@ import re
 import shutil
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from bhd_lerobot.options.parse import choices_of, entries_of, options_of, valid_names
@@ -113,11 +113,20 @@ def type_word(kind: Any) -> str:
     return _TYPES.get(getattr(kind, "__name__", ""), "VALUE")
 
 
-def help_of(config_class: type, chosen: Mapping[str, str]) -> str:
-    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option."""
+def help_of(config_class: type, chosen: Mapping[str, str], shipped: Sequence[str] = ()) -> str:
+    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option.
+
+    Args:
+        config_class: of the program.
+        chosen: types, by the options that choose them.
+        shipped: configurations of the program that come with this package.
+    """
     width = max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
     lines = textwrap.wrap(summary_of(config_class), width)
     lines += ["", "Options are written --key=value, or nested in a YAML file: --config_path=FILE.", ""]
+    if shipped:
+        names = f"--config_path=NAME takes a file that comes with the package: {', '.join(shipped)}."
+        lines += [*textwrap.wrap(names, width), ""]
     return "\n".join([*lines, *_lines(config_class, "", "", chosen, width)])
 
 

@@ -22,6 +22,7 @@ import yaml
 
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 from bhd_lerobot.options.plugins import load_lerobot, names_of_lerobot
+from bhd_lerobot.options.shipped import found_config
 
 CONFIG_PATH = "config_path"
 RUN_CONFIG = "config.yaml"
@@ -75,10 +76,12 @@ class CommandLine:
         return result
 
 
-def read_line(arguments: Sequence[str] | CommandLine) -> CommandLine:
+def read_line(arguments: Sequence[str] | CommandLine, command: str = "") -> CommandLine:
     """Return what a command line says: ``--config_path=FILE``, ``--a.b=value`` or ``--a.b value``; values are YAML.
 
-    One that was read before is returned as it is.
+    Args:
+        arguments: of the command; a line that was read before is returned as it is.
+        command: whose configurations `--config_path` can name, too; see `shipped`.
     """
     if isinstance(arguments, CommandLine):
         return arguments
@@ -99,8 +102,9 @@ def read_line(arguments: Sequence[str] | CommandLine) -> CommandLine:
             options[key] = text if key == CONFIG_PATH else yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
-    path = options.pop(CONFIG_PATH, None)
-    return CommandLine(options, None if path is None else Path(path).expanduser())
+    text = options.pop(CONFIG_PATH, None)
+    path = None if text is None else Path(text).expanduser()
+    return CommandLine(options, found_config(path, command) if path is not None and command else path)
 
 
 def parse[T](config_class: type[T], arguments: Sequence[str] | CommandLine) -> T:

@@ -18,7 +18,7 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.parse import parse, read_line
+from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.rollout.replay import ReplayConfig
@@ -140,19 +140,19 @@ def quoted_commands(path: Path) -> Iterator[str]:
     yield from (line for line in lines if re.match(r"bhd-\w+ ", line) and "…" not in line)
 
 
-def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def parse_command(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parse a command line as its program would, and run nothing."""
     monkeypatch.chdir(ROOT)
-    program, *arguments = shlex.split(line, comments=True)
+    program, *arguments = shlex.split(text, comments=True)
     if "--help" in arguments:
         return
     if program == "bhd-train":
-        parse_training(arguments)
+        parse_training(read_line(arguments, "train"))
     elif program == "bhd-eval":
-        chosen = evaluate.program_of(read_line(arguments))
-        (chosen.read or partial(parse, chosen.config_class))(read_line(arguments))
+        chosen = evaluate.program_of(line := read_line(arguments, "eval"))
+        (chosen.read or partial(parse, chosen.config_class))(line)
     elif program == "bhd-record":
-        parse(RecordConfig, arguments)
+        parse(RecordConfig, read_line(arguments, "record"))
     elif program == "bhd-replay":
         parse(ReplayConfig, arguments)
     elif program == "bhd-ros2" and arguments[:1] == ["serve"]:
@@ -172,17 +172,17 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError(f"Unknown program {program}.")
 
 
-def parse_training(arguments: list[str]) -> None:
+def parse_training(line: CommandLine) -> None:
     """Parse the arguments of `bhd-train`; checkpoints of earlier commands need not be there."""
-    algorithm = algorithm_of(read_line(arguments))
+    algorithm = algorithm_of(line)
     if algorithm == "dagger":
-        read_stages(parse_aggregation(arguments))
+        read_stages(parse_aggregation(line))
         return
     if algorithm is not None:
-        parse_rl(arguments)
+        parse_rl(line)
         return
     try:
-        parse_train(arguments)
+        parse_train(line)
     except ConfigError as error:
         if not re.search("outputs/(train|results)/", str(error)):
             raise

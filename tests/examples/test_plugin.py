@@ -3,13 +3,11 @@
 import json
 import os
 import subprocess
-import sysconfig
-import venv
-import zipfile
 from pathlib import Path
 
 import pytest
-from hatchling import build
+
+from tests.wheels import install
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN = ROOT / "examples" / "plugin"
@@ -53,28 +51,11 @@ lerobot_teleoperate.main()
 """
 
 
-def install(environment: Path, wheel: Path) -> Path:
-    """Make a virtual environment that has what this one has, and a wheel; return its interpreter."""
-    venv.create(environment, symlinks=True)
-    python = environment / "bin" / "python"
-    base = {"base": str(environment), "platbase": str(environment)}
-    site = Path(sysconfig.get_path("purelib", "posix_prefix", vars=base))
-    here = sysconfig.get_path("purelib")
-    (site / "parent.pth").write_text(f"import site; site.addsitedir({here!r})\n", encoding="utf-8")
-    with zipfile.ZipFile(wheel) as file:
-        file.extractall(site)
-    return python
-
-
 @pytest.fixture(scope="module")
 def used(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder in which every program has used the plug-in."""
     folder = tmp_path_factory.mktemp("plugin")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(PLUGIN)
-        wheel = build.build_wheel(str(folder))
-    python = install(folder / "environment", folder / wheel)
-    command = [str(python), "-c", USED, str(folder)]
+    command = [str(install(PLUGIN, folder)), "-c", USED, str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

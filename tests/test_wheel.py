@@ -1,0 +1,31 @@
+import os
+import subprocess
+from pathlib import Path
+
+from tests.arrows import ROOT
+from tests.wheels import install
+
+RECORD = """
+import sys
+from bhd_lerobot.cli import start
+print(sys.modules["bhd_lerobot"].__file__)
+sys.exit(start.record())
+"""
+
+
+def test_a_wheel_records_by_the_name_of_a_configuration(tmp_path: Path) -> None:
+    python = install(ROOT, tmp_path)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    options = (
+        "--config_path=turtlebot3_avoid",
+        "--dataset.num_episodes=1",
+        "--task.duration_s=1",
+        "--task.min_path_m=0",
+    )
+    command = [python, "-c", RECORD, *options, f"--dataset.root={tmp_path / 'avoid'}", "--preview_video=false"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(tmp_path / "environment")
+    assert len(list((tmp_path / "avoid" / "data").rglob("*.parquet"))) == 1
