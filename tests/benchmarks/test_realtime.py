@@ -18,7 +18,6 @@ from benchmarks.realtime import (
     summarise,
     summarise_blocks,
 )
-from tests.cases import each_case
 
 PERIOD = 1_000_000
 
@@ -81,19 +80,6 @@ def test_ratios_are_of_neighbouring_blocks() -> None:
     assert "x)" not in rows[f"{TWIN}, quiet"].value
 
 
-@each_case(
-    ("own", "missed"),
-    [
-        (block(OURS, 0, 11.9), {}),
-        (block(OURS, 0, 16.0), {"wake_p50 / C++ twin": "at most 1.2", "wake_p99 / C++ twin": "at most 1.5"}),
-        (block(OURS, 0, 10.0, 0.3), {"tick_p99 / period": "at most 0.25"}),
-    ],
-)
-def test_goals_are_judged_by_ratios_and_by_the_period(own: dict, missed: dict[str, str]) -> None:
-    rows = report([own, block(TWIN, 0, 10.0)])
-    assert {what.split(": ")[1]: row.goal for what, row in rows.items() if row.met is False} == missed
-
-
 def test_a_loop_that_cannot_be_measured_is_left_out_with_the_reason_and_the_rest_is_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,9 +93,3 @@ def test_a_loop_that_cannot_be_measured_is_left_out_with_the_reason_and_the_rest
     (note,) = (one for one in found["notes"] if "C++ twin" in one)
     assert "was NOT MEASURED: there is no C++ compiler (Debian and Ubuntu: package g++" in note
     assert "not to be quoted" in capsys.readouterr().out
-
-
-@each_case("option", ["--blocks=0", "--seconds=nan", "--robots=kuka"])
-def test_options_that_make_no_sense_are_refused(option: str) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([option])

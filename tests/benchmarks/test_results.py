@@ -16,17 +16,14 @@ from benchmarks._report import mean
 from benchmarks.results import __main__ as program
 from benchmarks.results import page
 from benchmarks.results.provenance import provenance
-from benchmarks.results.rows import Rows, chance, is_met, over_seeds, over_trainings, recovered
+from benchmarks.results.rows import is_met, over_seeds, over_trainings
 from benchmarks.results.runner import REPOSITORY, FailedError, Part, Ran, Runner
 from benchmarks.results.table import Table
 from bhd_lerobot import plugin  # noqa: F401 - registers our policies
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.registry import make_task
-from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
 
@@ -66,23 +63,6 @@ def test_the_commands_of_a_section_are_those_of_the_page_and_their_options_are_v
                 read_stages(parse_aggregation(options))
     outputs = [one for command in set(listed) for one in re.findall(r"--output_dir=(\S+)", command)]
     assert len(outputs) == len(set(outputs))
-
-
-def test_every_section_with_trainings_says_what_is_deaf_and_blind_and_shows_every_seed() -> None:
-    text = KEPT.with_suffix(".md").read_text(encoding="utf-8")
-    for section, table in TABLE.sections.items():
-        if "parts" in table:
-            shown = text.partition(f"\n## {table['title']}\n")[2].partition("\n## ")[0]
-            for word in ("deaf", "blind"):
-                assert re.search(rf"(?i)\b{word}(_\d)?\b", shown), (section, word)
-            rows = re.findall(r"^\| (.*?) \| (.*?) \|", shown, re.MULTILINE)
-            assert len({what for what, _ in rows}) == len(rows)
-            for what, value in rows:
-                rule = re.match(r"(avoidance|gap_follower|reach|pick|servo)\b(?!_)", what)
-                if "success" in what and not rule:
-                    assert re.search(r"(seed[_ ]|_)[012]\b|over [23] trainings", what), (section, what)
-                if section == "pixels" and re.match(r"[\d.]+% \(", value):
-                    assert re.search(r"; chance (45\.4|42\.2|31\.8|54\.6|57\.8)%$", value), what
 
 
 def test_a_section_shows_rows_seeds_remarks_and_each_command_once(tmp_path: Path) -> None:
@@ -127,39 +107,6 @@ def test_a_goal_is_for_the_value_or_the_end_that_it_names(goal: str, met: bool) 
     assert is_met("lower end at least 0.9", {"value": 0.9, "low": math.nan, "high": math.nan})  # no interval
 
 
-def brain(score: float, failed: int = 0) -> dict[str, Any]:
-    rate = {"value": 0.9, "low": 0.8, "high": 1.0}
-    scores = [score + 0.01 * (-1) ** i for i in range(1000)]
-    outcomes = {"success": 10 - failed, "wrong_object": failed}
-    return {"episodes": 10, "successes": 10 - failed, "success": rate, "outcomes": outcomes, "scores": scores}
-
-
-@each_case(
-    ("failures", "score", "met"),
-    [
-        (5, 0.2, [True, True, True, False]),
-        (6, 0.19, [False, False, True, False]),
-        (0, 0.18, [True, False, False, False]),
-        (0, 0.24, [True, True, True, True]),
-    ],
-)
-def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_both_rules(
-    failures: int, score: float, met: list[bool]
-) -> None:
-    measured: dict[str, Any] = {"alone": {"brains": {"avoidance": brain(0.126), "clone": brain(0.2)}}, "seconds": 5.0}
-    measured |= {"behind": {"brains": {"clone": brain(0.15), "ppo": brain(score, failures)}}, "best": 0}
-    parts = {("monitored", 2): Part("", [], measured)}
-    parts["aggregate", 2] = Part("", [], {"brains": {"gap_follower": brain(0.2)}})
-    make = Rows("monitored", parts, TABLE.seeds).make
-    rows = [row for entry in TABLE.expand(TABLE.sections["monitored"]["rows"]) for row in make(*entry)]
-    assert [row.met for row in rows[2:]] == [None, None, None, *met[:2], None, *met[2:], None, None]
-    assert rows[3].what == "with the collision monitor, clone_2, from privileged state: success in 10"
-    assert [row.what for row in rows if "PPO kept the start" in row.value] == [
-        "ppo_2 / clone_2, both with the monitor: mean score, paired",
-        "ppo_2: environment steps behind the best checkpoint",
-    ]
-
-
 def test_the_interval_over_trainings_is_over_the_episodes_that_they_share_too() -> None:
     # Of equal trainings it is what one of them would have, Wilson's; of many episodes Student's: 4.3027 / sqrt(3)
     # deviations to either side, within what a rate can be.
@@ -174,50 +121,6 @@ def test_the_interval_over_trainings_is_over_the_episodes_that_they_share_too() 
     for nothing in (math.nan, None):
         assert "1.000 (no interval" in mean({"value": 1.0, "low": nothing, "high": nothing})
     assert mean({"value": None, "low": None, "high": None}) == "–"
-
-
-@each_case(
-    ("rate", "episodes", "alike", "spread"),
-    [(0.9, 500, 1.0, 0.0), (0.97, 100, 1.0, 0.0), (0.5, 100, 0.5, 0.0), (0.9, 500, 0.0, 0.0), (0.8, 200, 0.5, 0.05)],
-)
-def test_the_interval_over_trainings_covers_the_rate_of_the_recipe(
-    rate: float, episodes: int, alike: float, spread: float
-) -> None:
-    """In a share of the episodes all trainings end alike; their own rates differ by a standard deviation."""
-    rng, tables = np.random.default_rng(0), 400
-    covered = 0
-    for _ in range(tables):
-        shared, own = rng.random(episodes), rng.random((3, episodes))
-        drawn = np.where(rng.random(episodes) < alike, shared, own)
-        rates = (drawn < rate + spread * rng.standard_normal((3, 1))).mean(axis=1)
-        found = over_trainings(rates.tolist(), episodes)
-        covered += found.low <= rate <= found.high
-    assert covered / tables > 0.92
-
-
-@pytest.mark.parametrize("least", [1, 2])
-def test_chance_is_how_often_a_drawn_object_is_the_one_that_is_meant(least: int) -> None:
-    config = parse(EvalConfig, ["--config_path=configs/eval/ur5_pick_pixels.yaml", f"--task.min_objects={least}"])
-    task, rng, hits, draws = make_task(config.task, 1, config.robot.fps, ur5()), np.random.default_rng(0), 0, 20_000
-    scenes = [task.sample(episode_seed(config.seed, index, config.split)) for index in range(100)]
-    for scene in (scenes[index % 100] for index in range(draws)):
-        hits += rng.integers(len(scene.objects)) == scene.target_object
-    assert chance(100, least) == pytest.approx(hits / draws, abs=0.015)
-
-
-def test_the_recovered_share_is_of_what_was_lost() -> None:
-    before, lost = [True] * 100, [True] * 20 + [False] * 80
-    assert recovered(before, lost, lost) == (0.0, 0.0, 0.0)
-    assert recovered(before, lost, before) == (1.0, 1.0, 1.0)
-    share, low, high = recovered(before, lost, [True] * 60 + [False] * 40)
-    assert share == pytest.approx(0.5)
-    assert 0.3 < low < 0.5 < high < 0.7
-    # Half of it again, and worse than before: below 0.
-    share, _, high = recovered(before, lost, [False] * 100)
-    assert share == pytest.approx(-0.25)
-    assert high < 0
-    for nothing in (([True, False], [True, True], [True, True]), ([], [], [])):
-        assert all(math.isnan(one) for one in recovered(*nothing))
 
 
 def ran(folder: Path) -> list[str]:

@@ -11,9 +11,7 @@ from benchmarks._report import Report, Row
 from benchmarks.realtime import NotMeasuredError
 from benchmarks.sight import (
     ATTEMPTS,
-    BESIDE,
     HEIGHT,
-    NOOP,
     PERCEPTION,
     SAME,
     WIDTH,
@@ -22,7 +20,6 @@ from benchmarks.sight import (
 )
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptions
-from tests.cases import each_case
 
 
 def block(brain: str, number: int, wake: float, *, core: str = SAME) -> dict[str, Any]:
@@ -37,33 +34,6 @@ def report(blocks: list[dict[str, Any]]) -> dict[str, Row]:
     found, first, second = Report(""), "UR5 at 500 Hz beside ", " at 25 Hz, cerebellum"
     summarise_blocks(found, blocks)
     return {row.what.replace(first, "").replace(second, ""): row for row in found.rows}
-
-
-def test_a_ratio_is_taken_within_a_round_and_on_the_same_core() -> None:
-    blocks = [block(NOOP, 0, 10.0), block(PERCEPTION, 0, 12.0), block(NOOP, 1, 100.0), block(PERCEPTION, 1, 140.0)]
-    blocks += [block(NOOP, 0, 1.0, core=BESIDE), block(PERCEPTION, 0, 3.0, core=BESIDE)]
-    rows = report(blocks)
-    late = "lateness of ticks p99, over that beside noop"
-    same, beside = (rows[f"{PERCEPTION} on {core}: {late}"] for core in (SAME, BESIDE))
-    assert (same.value, same.met) == ("1.30 x (76 us)", True)
-    assert (beside.value, beside.met) == ("3.00 x (3 us)", False)
-    assert rows[f"{PERCEPTION} on {SAME}"].value.endswith("10000 ticks")
-    assert not [what for what in rows if what.startswith(NOOP) and ": " in what]
-
-
-@each_case(
-    ("more", "missed"),
-    [
-        ({}, []),
-        ({"frames_per_s": 20.0}, ["frames/s"]),
-        ({"late_share": 2e-3}, []),
-        ({"late_share": 3e-3}, ["ticks later than 0.1 ms"]),
-    ],
-)
-def test_what_is_too_slow_or_too_often_late_misses_its_goal(more: dict[str, float], missed: list[str]) -> None:
-    rows = report([block(NOOP, 0, 10.0), {**block(PERCEPTION, 0, 10.0), **more}])
-    assert [what.split(": ")[1] for what, row in rows.items() if row.met is False] == missed
-    assert f"{more.get('frames_per_s', 25.0):.2f}, beside noop 25.00" in rows[f"{PERCEPTION} on {SAME}: frames/s"].value
 
 
 def test_a_block_whose_robot_was_stopped_is_run_again_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,9 @@ import pytest
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
+from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.registry import brains_for, make_brain, make_simulation, make_task, robot_of_brain
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -92,22 +92,6 @@ def test_random_actions_follow_from_the_seed_alone() -> None:
     three = actions(RandomBrain(), BASE, 20, [1, 2, 3])
     assert np.array_equal(three[:, 1], actions(RandomBrain(), BASE, 20, [2])[:, 0])
     assert not np.array_equal(three[:, 0], three[:, 1])
-
-
-@pytest.mark.parametrize("kind", ["ur5", "turtlebot3"])
-def test_random_episodes_are_the_same_for_any_number_side_by_side(kind: str) -> None:
-    one, three = run(kind, RandomBrain(), 1), run(kind, RandomBrain(), 3)
-    for a, b in zip(one, three, strict=True):
-        assert np.array_equal(a.columns["action"], b.columns["action"])
-        assert np.array_equal(a.columns["observation.state"], b.columns["observation.state"])
-
-
-def test_they_drive_every_robot() -> None:
-    for config, name in ((NoopConfig(), "noop"), (RandomConfig(), "random")):
-        assert robot_of_brain(config) == ""
-        assert make_brain(config).parameters()["type"] == name
-        assert name in brains_for("ur5")
-        assert name in brains_for("turtlebot3")
 
 
 def test_what_they_cannot_do_is_refused() -> None:

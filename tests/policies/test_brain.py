@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, find_columns, find_scan
+from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns, find_scan
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from tests.cases import each_case
@@ -70,14 +70,3 @@ def test_order_of_features_does_not_matter(brain_type: type[AvoidanceBrain] | ty
     b = other.act(Observation(back, np.hstack([blank, scan, twist[:, 1:], blank, twist[:, :1]])))
     assert np.array_equal(a, b[:, [2, 0]])
     assert (b[:, 1] == 0).all()
-
-
-@pytest.mark.parametrize("brain_type", BRAINS)
-def test_a_brain_refuses_a_robot_without_its_features(
-    brain_type: type[AvoidanceBrain] | type[GapFollowerBrain],
-) -> None:
-    brain: Brain = brain_type()
-    with pytest.raises(ConfigError, match=f"{brain.name!r} needs a range scan"):
-        brain.bind(RobotFeatures(ACTIONS, ACTIONS, 10, body=BURGER))
-    with pytest.raises(ConfigError, match=f"{brain.name!r} needs the action feature.*theta.vel"):
-        brain.bind(RobotFeatures((*ACTIONS, *scan_names(360)), ("x.vel",), 10, body=BURGER))

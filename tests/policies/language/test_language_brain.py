@@ -106,14 +106,6 @@ def test_an_instruction_of_its_own_counts_more_than_the_task_s() -> None:
     assert one.brain.parameters()["instruction"] == "grab the blue cup"
 
 
-def test_objects_are_named_by_the_nearest_colour() -> None:
-    one = desk("pick up the blue box")
-    at = OBJECT_FIELDS.index("red")
-    one.table[:, 1, at : at + 3] += [0.08, -0.08, 0.08]
-    one.look()
-    assert place(one) == pytest.approx((BOX.x, BOX.y))
-
-
 def test_an_object_that_was_not_seen_is_not_on_the_table() -> None:
     one = desk("pick up the blue cup", "pick up the cup")
     one.table[:, 2, 3] = np.nan
@@ -152,14 +144,6 @@ def test_what_is_to_be_put_down_is_put_down_where_it_stood_and_let_go(skills: tu
     assert goals["put"].motion == "line"
     assert 2 * BOX.size_y < (goals["release"].gripper or 0) <= MAX_OPENING
     assert one.brain.subtasks()[0] == "done"
-
-
-@each_case("skills", [(Skill.HOLD,), (Skill.HOLD, Skill.HAND_OVER), (Skill.HAND_OVER,)])
-def test_every_plan_that_can_be_built_is_carried_out_to_its_end(skills: tuple[Skill, ...]) -> None:
-    one = desk("anything", planner=planned(*GRASP, *skills))
-    one.look()
-    steps = carry_out(one)
-    assert steps[-1] == ("hand_over" if Skill.HAND_OVER in skills else "lift")
 
 
 def test_another_planner_is_called_once_with_what_is_on_the_table() -> None:

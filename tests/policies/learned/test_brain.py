@@ -214,8 +214,3 @@ def test_images_that_it_does_not_look_at_need_not_be_there(
         images = one.images if frame in frames else {}
         action = brain.act(Observation(one.names, one.state, images, one.environment_state, running=running))
         assert np.array_equal(np.asarray(action)[:2], wanted[frame, :2])
-
-
-def test_it_needs_images_only_if_the_policy_does(checkpoints: dict[str, Path]) -> None:
-    assert not make_brain(checkpoints["act"]).uses_images
-    assert make_brain(checkpoints["act_image"]).uses_images

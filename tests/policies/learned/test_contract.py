@@ -65,13 +65,6 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     assert [one.name for one in folder.iterdir() if one.name.startswith(".")] == []
 
 
-def test_parts_that_are_not_known_survive(tmp_path: Path) -> None:
-    folder = make_checkpoint(tmp_path / "model")
-    PolicyContract(fps=25).save(folder)
-    assert PolicyContract.load(folder) == PolicyContract(fps=25)
-    assert not PolicyContract(fps=25).is_known
-
-
 def test_a_dataset_tells_everything(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "data")
     (root / "meta" / "bhd.json").write_text(json.dumps({"recording": {"task": {"type": "avoid", "arena": "random"}}}))

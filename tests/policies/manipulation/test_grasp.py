@@ -185,8 +185,3 @@ def test_the_yaw_is_the_quaternion_s_whatever_its_sign(yaw: float) -> None:
 @each_case("value", [math.nan, math.inf])
 def test_what_is_not_a_number_was_not_seen(name: str, value: float) -> None:
     assert [one.index for one in read_objects(np.array([row(**{name: value}), row()]))] == [1]
-
-
-def test_the_outline_s_circle_holds_the_object() -> None:
-    assert cup(0.06).radius == 0.03
-    assert box(0.08, 0.06).radius == pytest.approx(0.05)

@@ -87,15 +87,6 @@ def test_when_even_the_way_home_fails_it_ends_too() -> None:
     assert desk.brain.subtasks()[0].startswith("give up")
 
 
-def test_a_second_attempt_may_succeed() -> None:
-    desk = Desk()
-    desk.look()
-    desk.end(success=False)
-    desk.end()
-    assert desk.end() is None
-    assert desk.brain.subtasks()[0] == "hold"
-
-
 @each_case("target", [[np.nan] * 7, [0] * 7, [0.5, np.nan, 0.3, 0, 1, 0, 0], [np.inf, 0, 0, 0, 1, 0, 0]])
 def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
     desk = Desk(2)

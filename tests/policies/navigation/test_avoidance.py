@@ -28,19 +28,9 @@ def one_reading(degrees: int, distance: float, elsewhere: float = 3.5) -> np.nda
     return scan
 
 
-def test_defaults_are_those_of_the_articles() -> None:
-    config = AvoidanceConfig()
-    assert (config.front_sector_deg, config.safe_distance_m) == (30.0, 0.5)
-    assert (config.forward_speed, config.turn_speed) == (0.2, 0.5)
-
-
-@each_case("degrees", range(-180, 180, 5))
-def test_only_the_front_sector_counts(degrees: int) -> None:
-    expected = LEFT if abs(degrees) <= 30 else AHEAD
-    assert tuple(decide(one_reading(degrees, 0.3))[0]) == expected
-
-
-@each_case(("degrees", "expected"), [(-31, AHEAD), (-30, LEFT), (30, LEFT), (31, AHEAD)])
+@each_case(
+    ("degrees", "expected"), [(-90, AHEAD), (-31, AHEAD), (-30, LEFT), (0, LEFT), (30, LEFT), (31, AHEAD), (180, AHEAD)]
+)
 def test_the_edges_belong_to_the_sector(degrees: int, expected: tuple[float, float]) -> None:
     assert tuple(decide(one_reading(degrees, 0.49))[0]) == expected
 

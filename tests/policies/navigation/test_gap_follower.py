@@ -160,18 +160,11 @@ def test_reset_forgets_only_the_given_simulations() -> None:
     assert np.array_equal(see(brain, scans[:2]), fresh[:2])
 
 
-def test_an_unexpected_number_of_robots_is_refused() -> None:
+def test_a_robot_that_it_cannot_drive_is_refused() -> None:
     with pytest.raises(ConfigError, match="was reset for 2 robots and sees 3"):
         see(bound(90, 2), np.full((3, 90), 1.0))
-
-
-@each_case("beams", [1, 12, 30])
-def test_too_few_beams_are_refused(beams: int) -> None:
-    with pytest.raises(ConfigError, match=f"needs at least 36 beams; this robot has {beams}"):
-        bound(beams, 1)
-
-
-def test_the_measured_twist_is_needed() -> None:
+    with pytest.raises(ConfigError, match="needs at least 36 beams; this robot has 30"):
+        bound(30, 1)
     with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
         GapFollowerBrain().bind(RobotFeatures(("x.vel", *names_of(90)[2:]), ACTIONS, 10, body=BURGER))
 
@@ -248,12 +241,7 @@ def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float
     return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
 
 
-def test_episodes_do_not_depend_on_how_many_run() -> None:
-    seeds = [episode_seed(3, episode, "train") for episode in range(7)]
-    together = run(GapFollowerBrain(), seeds, 7, seconds=6)
-    assert run(GapFollowerBrain(), seeds[:3], 1, seconds=6) == together[:3]
-
-
+@pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("beams", [36, 360])
 def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     """A corridor 0.7 m wide and 1.2 m deep, closed behind the robot's nose."""

@@ -188,27 +188,28 @@ def test_it_gets_out_of_a_dead_end_to_a_goal_behind_its_wall() -> None:
     assert episode.outcome.score > 0.8
 
 
-def test_an_episode_does_not_depend_on_how_many_run_beside_it() -> None:
-    seeds = [episode_seed(1, episode, "train") for episode in range(2)]
-    for one, other in zip(run(seeds, 1), run(seeds, 2), strict=True):
-        assert one.outcome == other.outcome
-        assert all(np.array_equal(value, other.columns[key]) for key, value in one.columns.items())
-
-
-def test_a_task_without_a_goal_is_refused_with_what_is_missing() -> None:
+def test_what_it_cannot_drive_is_refused_with_what_is_missing() -> None:
     with pytest.raises(ConfigError, match=r"'navigator' needs the environment feature.*goal_x.*does not report"):
         NavigatorBrain().bind(RobotFeatures(names_of(90), ACTIONS, 10, (), body=BURGER))
     with pytest.raises(ConfigError, match="received none"):
         bound().act(Observation(names_of(360), np.zeros((1, 362))))
-
-
-def test_a_robot_without_a_scan_or_with_few_beams_is_refused() -> None:
     with pytest.raises(ConfigError, match="needs a range scan"):
         NavigatorBrain().bind(RobotFeatures(("x.vel", "theta.vel"), ACTIONS, 10, GOAL, body=BURGER))
     with pytest.raises(ConfigError, match="needs at least 36 beams"):
         bound(beams=20)
-
-
-def test_another_number_of_robots_than_it_was_reset_for_is_refused() -> None:
     with pytest.raises(ConfigError, match="reset for 1 robots and sees 2"):
         see(bound(), np.vstack([goal_at(1, 0)] * 2), np.vstack([OPEN] * 2))
+
+
+def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
+    rng, n = np.random.default_rng(7), 5
+    goals = np.vstack([goal_at(*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)) for _ in range(n)])
+    scans = np.clip(np.cumsum(rng.normal(0, 0.1, (6, n, 360)), axis=2) / 2 + 1.5, 0.3, 3.5)
+
+    def drive(ids: list[int]) -> np.ndarray:
+        brain = bound(len(ids))
+        return np.array([see(brain, goals[ids], scan[ids]) for scan in scans])
+
+    together = drive(list(range(n)))
+    for sim in range(n):
+        assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()

@@ -2,13 +2,12 @@
 
 import copy
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
@@ -117,20 +116,6 @@ def test_a_new_look_at_held_out_images_replaces_the_calibration(trained: Percept
         trained.factor.fill_(before)
     assert before > 0
     assert len({before, added, alone}) == 3
-
-
-def test_without_held_out_images_it_refuses_to_see() -> None:
-    with pytest.raises(ConfigError, match=r"has no estimate of its errors.*eval_split"):
-        PerceptionPolicy(config()).detect(torch.zeros(1, 3, HEIGHT, WIDTH))
-
-
-def test_a_saved_one_sees_the_same(trained: PerceptionPolicy, tmp_path: Path) -> None:
-    images = painted(states(4))
-    trained.save_pretrained(tmp_path)
-    loaded = get_policy_class("bhd_perception").from_pretrained(str(tmp_path))
-    for one, other in zip(trained.detect(images), loaded.detect(images), strict=True):
-        assert torch.equal(one.position, other.position)
-        assert torch.equal(one.scale, other.scale)
 
 
 def test_nothing_is_normalised() -> None:
