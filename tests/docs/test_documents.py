@@ -97,10 +97,6 @@ def broken_references(document: Path) -> list[str]:
     return broken
 
 
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
-
-
 def test_every_link_and_every_file_exists() -> None:
     assert [(by_name(path), target) for path in DOCUMENTS for target in broken_references(path)] == []
 

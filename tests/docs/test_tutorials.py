@@ -1,6 +1,5 @@
 """The tutorials run as they stand: each notebook is its tutorial, and every cell of it works."""
 
-import os
 import re
 from pathlib import Path
 
@@ -60,18 +59,6 @@ def test_outputs_are_those_of_the_whole_tutorial() -> None:
         assert path.stem in LONG or outputs, path
         if path.stem not in SHORTER:
             assert [shown for shown in SHOWN[path.stem] if shown not in outputs] == [], path
-
-
-def test_an_output_replaces_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("COLUMNS", "PATH"):
-        monkeypatch.setenv(name, os.environ.get(name, "80"))
-    script = load_script("make_notebooks")
-    text = "# Title\n\n```python\nprint('in', 2)\n```\n\n```output\nold\n```\n\nText.\n\n```bash\nseq 30; pwd\n```\n"
-    once = script.run(text)
-    assert "```output\nin 2\n```\n\nText." in once
-    assert "\n16\n… 11 lines …\n28\n" in once
-    assert "old" not in once
-    assert script.run(once).count("```output") == 2
 
 
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)

@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,7 +19,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, DatasetMismatchError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.evaluation import run as evaluation_run
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate, print_summary
+from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
@@ -272,14 +271,6 @@ def test_a_sequential_test_ends_a_run_that_is_certain_and_says_so(tmp_path):
     assert "Newcombe" not in result.report.read_text(encoding="utf-8")
 
 
-def test_a_sequential_test_of_equal_brains_runs_all_episodes_and_is_not_certain(tmp_path):
-    brains = {"brains__new__type": "avoidance", "n_episodes": 5, "n_envs": 2, "sequential": "true"}
-    result, printed = run_eval(tmp_path / "e", **brains)
-    assert [one.episodes for one in result.results.brains.values()] == [5, 5]
-    assert "The sequential test is not certain after 5 pairs of episodes" in printed
-    assert result.results.paired["new"].success.low < 0 < result.results.paired["new"].success.high
-
-
 def test_a_brain_that_does_not_fit_fails_before_any_episode_and_is_named(tmp_path, monkeypatch):
     def bind(self, *arguments):
         raise ConfigError("The brain 'gap_follower' needs the observation feature(s) sonar.pos.")
@@ -349,25 +340,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be written"):
         run_eval(tmp_path / "file" / "run")
-
-
-def test_no_word_is_broken_at_80_columns(whole, tmp_path):
-    result = whole[1]
-    brains = {f"{label}_of_a_plug_in": one for label, one in result.results.brains.items()}
-    paired = {f"{label}_of_a_plug_in": one for label, one in result.results.paired.items()}
-    shown = replace(result, results=replace(result.results, brains=brains, paired=paired))
-    console = Console(file=io.StringIO(), width=80)
-    print_summary(console, parse(EvalConfig, options(tmp_path, n_episodes=9)), shown)
-    printed = console.file.getvalue()
-    words = set(printed.split())
-    for label, one in brains.items():
-        assert label in words
-        assert f"{one.successes}/{one.episodes}" in words
-        assert (
-            f"{label} failed: {', '.join(f'{name} {n}' for name, n in one.outcomes.items() if name != 'success')}"
-            in printed
-        )
-    assert str(result.report) in words
 
 
 def test_results_that_are_there_are_not_overwritten(whole):

@@ -92,31 +92,6 @@ def test_the_page_says_what_the_results_say(page):
     assert digest[1] == hashlib.sha256((result.output_dir / "results.json").read_bytes()).hexdigest()
 
 
-def test_the_page_says_why_the_interval_of_a_score_is_wide_and_what_a_return_is(page):
-    result, text = page
-    assert "<th>score ¹</th>" in text
-    assert "<th>return ²</th>" in text
-    note = re.search(
-        r"4 episodes prove .* up to 53 % of all\..* of old would be ([\d.]+); .* scored 1, ([\d.]+)\.", text
-    )
-    assert note is not None
-    score = result.results.brains["old"].means["score"]
-    low, high = map(float, note.groups())
-    assert score.low - 5e-4 <= low < score.value < high <= score.high + 5e-4  # it is in the interval above it
-    assert "² Return: the sum of an episode's rewards" in text
-
-
-def test_a_chart_that_is_wider_than_a_phone_says_that_it_scrolls(page):
-    _, text = page
-    charts = [
-        attributes["class"] for tag, attributes in Page(text).tags if tag == "div" and "scroll" in str(attributes)
-    ]
-    assert charts.count("scroll wide") == text.count('class="chart"') == 5
-    width = int(re.search(r"img.chart \{ min-width: (\d+)px", text)[1])
-    hint = re.search(r'@media \(max-width: (\d+)px\) \{\s+\.wide::before \{ content: "Scroll sideways', text)
-    assert int(hint[1]) == width + 2 * 14 - 1  # as soon as the chart and the page's margins need more
-
-
 def test_charts_are_well_formed_and_name_every_brain(page):
     result, text = page
     charts = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', text)
@@ -145,25 +120,17 @@ def test_videos_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
     assert text.count("<video") == len(videos) == text.count('poster="data:image/jpeg')
 
 
-def test_videos_that_are_too_large_stay_beside_the_page(tmp_path, monkeypatch):
+def test_of_one_brain_nothing_is_paired_problems_are_no_markup_and_large_videos_stay_beside_the_page(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("bhd_lerobot.evaluation.report.VIDEO_BYTES", 10)
-    result, _ = run_eval(tmp_path, only="[old]", videos=None, n_episodes=1)
-    text = result.report.read_text()
-    assert "<video" not in text
-    assert "too large for this page" in text or "No videos:" in text
-
-
-def test_a_brain_without_a_rival_has_no_paired_section(tmp_path):
-    result, _ = run_eval(tmp_path, only="[old]", n_episodes=1)
+    monkeypatch.setattr("bhd_lerobot.evaluation.run.measure", _with_problem(run.measure))
+    result, _ = run_eval(tmp_path, only="[old]", videos=None, n_episodes=2, task__min_path_m=100)
     text = result.report.read_text()
     assert 'id="summary"' in text
     assert 'id="paired"' not in text
-
-
-def test_labels_and_problems_are_text_not_markup(tmp_path, monkeypatch):
-    monkeypatch.setattr("bhd_lerobot.evaluation.run.measure", _with_problem(run.measure))
-    result, _ = run_eval(tmp_path, only="[old]", n_episodes=2, task__min_path_m=100)
-    text = result.report.read_text()
+    assert "<video" not in text
+    assert "too large for this page" in text or "No videos:" in text
     assert "<b>no</b> cup &" not in text
     assert "&lt;b&gt;no&lt;/b&gt; cup &amp;" in text
 

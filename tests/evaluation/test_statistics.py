@@ -45,12 +45,6 @@ def test_paired_rates_have_the_interval_of_newcombes_paper():
     assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.2, 0.0569, 0.3404), abs=5e-5)
 
 
-def test_paired_rates_turn_round_with_the_brains():
-    one, two = outcomes(40, 9, 3, 8)
-    forward, back = rate_difference(one, two), rate_difference(two, one)
-    assert (forward.low, forward.high) == pytest.approx((-back.high, -back.low), abs=1e-12)
-
-
 def test_two_equal_brains_do_not_differ():
     one, _ = outcomes(80, 20, 0, 0)
     one[80:] = False

@@ -62,11 +62,6 @@ def used(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_is_at_most_120_lines() -> None:
-    files = [path for path in PLUGIN.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in files) <= 120
-
-
 @pytest.mark.thorough
 def test_it_is_recorded_replayed_bit_for_bit_and_evaluated(used: Path) -> None:
     results = json.loads((used / "eval" / "results.json").read_text())

@@ -1,13 +1,13 @@
 """What holds of every task: its episodes follow from seeds, and none depends on another."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import ARENAS
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.registry import make_task
@@ -18,6 +18,8 @@ from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import SPLITS, Event, TaskConfig, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
+from tests.tasks import test_pick as pick
+from tests.tasks import test_reach as reach
 from tests.tasks.support import Judged
 
 WILD = RandomisationConfig(enabled=True)
@@ -125,16 +127,94 @@ def test_episodes_to_choose_by_are_none_of_those_that_are_learned_from_or_report
     assert all(seed % 2 for seed in sets["validation"] | sets["held_out"])
 
 
-@pytest.mark.parametrize(("seed", "episode"), [(-1, 0), (0, -1)])
-def test_negative_numbers_are_refused(seed: int, episode: int) -> None:
-    with pytest.raises(ConfigError, match="-1"):
-        episode_seed(seed, episode, "train")
+@each_case(
+    ("arguments", "message"), [((-1, 0, "train"), "-1"), ((0, -1, "train"), "-1"), ((0, 0, "test"), "train, held_out")]
+)
+def test_seeds_that_cannot_be_are_refused(arguments: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        episode_seed(*arguments)
 
 
-def test_an_unknown_split_is_an_error_that_lists_the_valid_ones() -> None:
-    with pytest.raises(ConfigError, match="train, held_out"):
-        episode_seed(0, 0, "test")  # type: ignore[arg-type]
-    assert SPLITS == ("train", "held_out", "validation")
+class Held(NamedTuple):
+    """A task of which something has to be held for a time, and frames in which it is, just is, and is not."""
+
+    run: Any
+    config: Any
+    good: dict[str, Any]
+    just: dict[str, Any]
+    bad: dict[str, Any]
+    breaks: list[dict[str, Any]]
+
+
+HELD = {
+    "reach": Held(
+        *(reach.Run, ReachConfig, {"away": 0.001}, {"away": 0.0049, "degrees": 1.99}, {"away": 0.2}),
+        [{"away": 0.0051}, {"degrees": 2.01}, {"away": 0.0051, "degrees": 2.01}],
+    ),
+    "pick": Held(
+        *(pick.Run, PickConfig, {"lift": 0.11}, {"lift": 0.101}, {"lift": 0.0}),
+        [{"lift": 0.099}, {"lift": 0.11, "gripped": False}],
+    ),
+}
+
+
+@each_case("name", HELD)
+def test_success_needs_the_whole_hold_time_which_a_break_starts_anew(name: str) -> None:
+    task = HELD[name]
+    for pause in ({}, *task.breaks):
+        run = task.run(task.config(hold_s=0.5))
+        frames = run.task.in_frames(0.5)
+        run.frame(**task.bad)
+        for _ in range(frames - 1):
+            run.frame(**task.good)
+            assert run.running[0]
+        if pause:
+            run.frame(**pause)
+            for _ in range(frames - 1):
+                run.frame(**task.good)
+                assert run.running[0]
+        run.frame(**task.just)
+        assert run.events[0] == Event.SUCCESS
+        assert (run.outcome().success, run.outcome().score) == (True, 1.0)
+
+
+@each_case("name", HELD)
+def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late(name: str) -> None:
+    task = HELD[name]
+    run, late = (task.run(task.config(duration_s=2.0, hold_s=0.5)) for _ in range(2))
+    last, hold = run.task.in_frames(2.0), run.task.in_frames(0.5)
+    for frame in range(1, last + 1):
+        run.frame(**(task.good if frame > last - hold else task.bad))
+        late.frame(**(task.good if frame > last - hold + 1 else task.bad))
+    assert (run.events[0], run.frames[0]) == (Event.SUCCESS, last)
+    assert (late.events[0], late.frames[0]) == (Event.TIMEOUT, last)
+    assert not late.outcome().success
+
+
+@each_case("name", HELD)
+@each_case("touch", ["arm_on_table", "self_contact", "arm_on_object"])
+@each_case("when", ["at once", "at success", "at the end"])
+def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(
+    name: str, touch: str, when: str
+) -> None:
+    task = HELD[name]
+    run = task.run(task.config(duration_s=2.0, hold_s=0.5))
+    frames = {"at once": 1, "at success": run.task.in_frames(0.5), "at the end": run.task.in_frames(2.0)}[when]
+    for frame in range(1, frames + 1):
+        run.frame(**(task.good if when == "at success" else task.bad), **{touch: frame == frames})
+    if (name, touch) == ("reach", "arm_on_object"):  # there is none
+        assert run.events[0] != Event.COLLISION
+        return
+    assert (run.events[0], run.frames[0]) == (Event.COLLISION, frames)
+    assert not run.outcome().success
+    assert run.outcome().score <= 0.9
+
+
+def test_a_scene_without_what_is_asked_for_is_refused() -> None:
+    empty = TableScene("empty", (), reach.SCENE.posture)
+    for config, message in ((ReachConfig(), "no target pose"), (PickConfig(), "names no object")):
+        with pytest.raises(ConfigError, match=message):
+            make_task(config, 1, 10).begin(np.array([0]), [empty])
 
 
 def test_numbers_that_are_recorded_stay_what_they_are() -> None:

@@ -43,10 +43,6 @@ def described(name: str) -> dict[str, dict]:
     return features
 
 
-def test_there_are_configurations() -> None:
-    assert len(CONFIGS) == 12
-
-
 @pytest.mark.thorough(but=4)
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_path: Path) -> None:

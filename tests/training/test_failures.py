@@ -14,7 +14,6 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
-from bhd_lerobot.cli.train import main
 from bhd_lerobot.datasets.loader.check import fingerprint
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.loader import make_loader
@@ -47,14 +46,6 @@ def refused(arguments: list[str], error: type[BhdError], match: str) -> None:
     with pytest.raises(error, match=match):
         run_train(arguments)
     assert [folder.exists() for folder in folders] == before
-
-
-def test_an_error_is_one_sentence_and_status_2(data: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
-    assert main(options(data / "nowhere", tmp_path / "run")) == 2
-    printed = capfd.readouterr().err
-    assert "error: " in printed
-    assert "nowhere" in printed
-    assert "Traceback" not in printed
 
 
 def test_a_missing_dataset_names_where_it_was_looked_for(tmp_path: Path) -> None:
@@ -195,12 +186,6 @@ def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_s
         batch = {"observation.state": state, "observation.environment_state": goal}
         actions = after(policy.predict_action_chunk(before(batch)))
         assert torch.allclose(actions, state[:, None, :2].expand_as(actions), atol=1e-5)
-
-
-def test_fine_tuning_starts_from_the_weights(data: Path, trained: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "more", {}, fine_tune=trained, steps=1, log_freq=1))
-    run_train(options(data, tmp_path / "new", MLP, steps=1, log_freq=1))
-    assert curve(tmp_path / "more")[0]["loss"] < curve(tmp_path / "new")[0]["loss"]
 
 
 def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, trained: Path, tmp_path: Path) -> None:

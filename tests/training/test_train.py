@@ -238,14 +238,6 @@ def test_cameras_are_learned_from(tmp_path: Path) -> None:
     assert all(torch.isfinite(torch.tensor(row["loss"])) for row in result.rows)
 
 
-def test_help_names_lerobots_options_and_ours(capsys: pytest.CaptureFixture) -> None:
-    assert main(["--help"]) == 0
-    printed = capsys.readouterr().out
-    assert "--steps" in printed
-    assert "--selection.outcome" in printed
-    assert "bhd_mlp" in printed
-
-
 @pytest.mark.parametrize("mode", ["QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"])
 def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path, mode: str) -> None:
     """Of episodes that differ, most values lie beyond what the policy takes for nearly all."""

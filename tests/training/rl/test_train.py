@@ -386,13 +386,6 @@ def test_the_shipped_configurations_are_valid(name: str) -> None:
     assert config.max_minutes <= 20
 
 
-def test_bhd_train_with_an_algorithm_runs_reinforcement_learning(tmp_path: Path, capsys) -> None:
-    assert main(options(tmp_path / "run", steps=0)) == 2
-    assert "steps is 0" in capsys.readouterr().err
-    assert main(options(tmp_path / "run", steps=32)) == 0
-    assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
-
-
 @pytest.mark.parametrize("modes", [1, 3])
 def test_the_first_action_of_the_checkpoints_chunk_becomes_the_actors(modes: int) -> None:
     torch.manual_seed(0)
