@@ -9,7 +9,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.evaluation.metrics import JerkMeasure, measure
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES
+from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Outcome
 
@@ -60,15 +60,6 @@ def test_jerk_of_joints_is_the_length_of_the_third_derivative_without_the_grippe
     applied = np.stack([0.3 * cubic, 0.4 * cubic, *[0 * t] * 4, 5 * cubic], axis=1)
     metrics = measured(episode(applied), names=JOINT_ACTIONS)
     assert metrics.jerk_mean == pytest.approx(0.5, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("names", "columns", "order", "unit"),
-    [(BASE, (0,), 2, "m/s³"), (JOINT_ACTIONS, tuple(range(6)), 3, "rad/s³"), (TOOL_NAMES, (0, 1, 2), 3, "m/s³")],
-)
-def test_what_jerk_is_measured_of(names, columns, order, unit):
-    measure_of = JerkMeasure.of(names)
-    assert (measure_of.columns, measure_of.order, measure_of.unit) == (columns, order, unit)
 
 
 def test_a_robot_at_rest_and_one_at_constant_speed_have_no_jerk_and_a_short_episode_has_none_defined():

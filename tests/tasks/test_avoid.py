@@ -3,7 +3,6 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,17 +79,6 @@ def test_a_touch_is_a_collision_at_once_even_in_the_last_frame(when: int) -> Non
     assert not run.outcome().success
 
 
-def test_nothing_counts_in_the_frame_of_the_contact_or_after_it() -> None:
-    run = Run(AvoidConfig())
-    run.frame(np.array([[0.4, 0.0]]))
-    score = run.outcome().score
-    reward = run.frame(np.array([[0.8, 0.0]]), True)
-    assert reward[0] == 0
-    assert run.outcome().score == score
-    run.frame(np.array([[1.2, 0.0]]))
-    assert run.outcome().score == score
-
-
 @each_case(("step", "stuck_after"), [(0.0, 100), (0.0009, 100), (0.0011, None)])
 def test_less_than_a_tenth_of_a_metre_in_ten_seconds_is_stuck(step: float, stuck_after: int | None) -> None:
     run = Run(AvoidConfig())
@@ -160,33 +148,12 @@ def test_the_score_grows_by_the_rewards_and_stays_a_share(steps: list[tuple[floa
     assert run.outcome().details["cells_free"] == len(free)
 
 
-def test_visiting_every_free_cell_scores_one() -> None:
-    arena = made(2)
-    run = Run(AvoidConfig(duration_s=1e4), [arena])
-    points, free = arena.reachable
-    _, one_in_each_cell = np.unique(arena.cell_of(points[free], run.task.config.cell_m), return_index=True)
-    for point in points[free][one_in_each_cell]:
-        run.frame(point[None])
-    assert run.outcome().score == 1.0
-    assert run.first[0] + run.rewards[0] == pytest.approx(1.0)
-
-
 @each_case("place", [(9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (0.0, -9.0), (2.99, 3.01), (9.0, 9.0)])
 def test_outside_the_arena_is_no_cell(place: tuple[float, float]) -> None:
     run = Run(AvoidConfig())
     run.frame(np.array([place]))
     assert run.rewards[0] == 0
     assert run.outcome().details["cells_visited"] == 1
-
-
-def test_a_long_path_in_the_episode_before_does_not_make_a_robot_stuck() -> None:
-    run = Run(AvoidConfig())
-    for frame in range(1, 300):
-        run.frame(on_circle(frame, 0.3))
-    run.task.begin(np.array([0]), [EMPTY])
-    for frame in range(1, 150):
-        run.frame(on_circle(frame, 0.1))
-    assert run.events[0] == Event.NOTHING
 
 
 def trail(task: AvoidTask, pose: np.ndarray) -> np.ndarray:
@@ -201,22 +168,6 @@ def test_the_trail_is_reported_only_on_request() -> None:
     assert task.environment_names == ()
     assert task.environment_state(BaseTruth(np.zeros((2, 3)), np.zeros(2, np.bool_))).shape == (2, 0)
     assert len(set(AvoidTask(AvoidConfig(trail=True), 2, FPS).environment_names)) == len(TRAIL) == 128
-
-
-def test_the_trail_is_where_the_robot_was_as_it_sees_it() -> None:
-    run = Run(AvoidConfig(trail=True))
-    x, y = EMPTY.start[0] + 0.1, EMPTY.start[1] + 0.1  # away from the edges of cells
-    run.task.begin(np.array([0]), [replace(EMPTY, start=(x, y, 0.0))])
-    for step in range(11):  # one metre along x
-        run.frame(np.array([[x + 0.1 * step, y]]))
-    for bearing in range(16):
-        yaw = math.radians(22.5 * bearing)
-        seen = trail(run.task, np.array([[x + 1.0, y, yaw]]))[0]
-        behind = (8 - bearing) % 16
-        assert seen[behind, :4].tolist() == [1, 1, 1, 1]  # 0.25 m to 1 m back the way it came
-        assert not seen[behind, 5:].any()  # it never was farther back
-        assert not seen[(behind + 8) % 16].any()  # nor ahead of where it stands
-    assert not trail(run.task, np.array([[x + 1.0, y + 2.0, 0.0]]))[0, 4].any()  # nothing to the left, up there
 
 
 @given(st.integers(0, 9), st.integers(0, 2**32 - 1), st.floats(-math.pi, math.pi))
@@ -242,16 +193,6 @@ def test_the_trail_agrees_with_the_cells_that_the_score_counts(arena_seed: int, 
             # Two ways to add up a place may differ where it lies on the edge of a cell.
             edge = np.abs((points - arena.extent[0::2]) / 0.25 % 1 - 0.5).max(axis=1) > 0.5 - 1e-9
             assert ((seen[sim, b] == expected) | edge).all()
-
-
-def test_a_new_episode_has_no_trail() -> None:
-    run = Run(AvoidConfig(trail=True), [EMPTY, EMPTY])
-    for frame in range(60):
-        run.frame(np.repeat(on_circle(frame, 0.3), 2, axis=0))
-    run.task.begin(np.array([0]), [EMPTY])
-    seen = trail(run.task, np.array([EMPTY.start, EMPTY.start], float))
-    assert seen[0].sum() <= 3  # its own cell, on whose edge it stands
-    assert seen[1].sum() > 5
 
 
 def test_a_duration_in_which_no_episode_can_succeed_is_noted() -> None:

@@ -198,13 +198,6 @@ def test_a_smaller_table_leaves_nothing_of_a_larger_one() -> None:
     assert np.array_equal(used.environment_state(truth_of([small])), fresh.environment_state(truth_of([small])))
 
 
-def test_thrown_into_the_air_it_is_not_held() -> None:
-    run = Run(PickConfig(hold_s=0.5))
-    for _ in range(20):
-        run.frame(0.3, gripped=False)
-    assert run.events[0] == Event.NOTHING
-
-
 def test_what_was_up_and_is_down_again_was_dropped() -> None:
     run = Run()
     for lift in (0.0, 0.03, 0.051, 0.03, 0.016):

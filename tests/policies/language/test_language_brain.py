@@ -49,7 +49,6 @@ def carry_out(one: Desk, sim: int = 0) -> list[str]:
     [
         ("pick up the blue box", BOX),
         ("grab the red cup", CUP),
-        ("please lift the blue cup", BLUE_CUP),
         ("take the box", BOX),
         ("拿起蓝色杯子", BLUE_CUP),
         ("请把桌上的红色杯子拿起来", CUP),

@@ -158,11 +158,6 @@ def test_a_robot_whose_options_give_its_numbers_another_meaning_is_refused(neste
         contract.check(robot=robot(use_degrees=False), who="The policy")
 
 
-def test_other_units_are_refused() -> None:
-    with pytest.raises(ConfigError, match="degrees"):
-        replace(CONTRACT, units="degrees").check()
-
-
 def test_a_checkpoint_is_found_from_every_folder_above_it(tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = make_checkpoint(run / "checkpoints" / "000100" / "pretrained_model")

@@ -33,10 +33,6 @@ def test_units_scales_and_offsets() -> None:
     assert renamed({"linear_velocity": 3, "angular_velocity": 4}) == {"x.vel": 3.0, "theta.vel": 4.0}
 
 
-def test_nothing_is_nothing() -> None:
-    assert ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)({}) is None
-
-
 def test_equal_names_are_no_proof_across_projects_and_enough_within_one() -> None:
     with pytest.raises(
         ConfigError, match=r"so101_leader and ur5 both have 'shoulder_pan.pos'.*degrees.*--map.shoulder_pan.pos="

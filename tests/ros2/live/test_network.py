@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import pytest
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.ros2.live.network import NetworkConfig, Qos, Ros2Config
+from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 
 
 @pytest.mark.parametrize(("text", "number"), [(None, 0), ("", 0), ("42", 42), ("232", 232)])
@@ -60,8 +60,3 @@ def test_only_this_machine_is_looked_at_unless_an_interface_is_named(
     tree = ElementTree.fromstring(network.cyclonedds_xml())
     assert tree.findtext(".//AllowMulticast") == multicast
     assert [peer.get("address") for peer in tree.iter("Peer")] == peers
-
-
-def test_qos_in_words() -> None:
-    assert str(Qos()) == "reliable"
-    assert str(Qos(1, reliable=False, transient_local=True)) == "best effort, transient local"

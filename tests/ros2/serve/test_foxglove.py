@@ -17,9 +17,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.registry import ROBOTS
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.ros2.live.network import LATCHED, NetworkConfig
-from bhd_lerobot.ros2.live.node import Publisher
 from bhd_lerobot.ros2.messages.serialize import decode, encode
-from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode, MirroredPublisher
+from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
 from bhd_lerobot.ros2.serve.server import Counts, Input
 from tests.docs.support import load_script
@@ -115,30 +114,6 @@ def test_who_comes_later_receives_what_is_latched_and_nothing_else(
                 await asyncio.sleep(0.002)
 
     asyncio.run(scenario())
-
-
-class Channel:
-    """Stands in for the SDK's."""
-
-    def __init__(self) -> None:
-        self.sinks, self.logged = False, 0
-
-    def has_sinks(self) -> bool:
-        return self.sinks
-
-    def log(self, data: bytes) -> None:
-        self.logged += 1
-
-
-def test_nothing_is_handed_over_while_no_client_is_subscribed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Publisher, "send", lambda *_: None)
-    channel = Channel()
-    publisher = MirroredPublisher(None, None, "/a", BOOL, channel)
-    for subscribed, logged in ((False, 0), (True, 3), (False, 3)):
-        channel.sinks = subscribed
-        for _ in range(3):
-            publisher.send(b"")
-        assert channel.logged == logged
 
 
 GOOD, STAMPED_GOOD = encode(TWIST, FORWARD, 1)[0], encode(STAMPED, {"twist": FORWARD}, 1)[0]

@@ -36,6 +36,7 @@ from bhd_lerobot.training.rl.log import draw_curve
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, train
 from tests.forks import Fork
+from tests.policies.learned.rig import save_policy
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
 TOLERANCE = 2e-6
@@ -339,26 +340,8 @@ def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: 
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(finished: RlResult, tmp_path: Path) -> None:
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-    from lerobot.policies.factory import make_pre_post_processors
-
-    act = ACTConfig(
-        chunk_size=2, n_action_steps=1, dim_model=8, n_heads=1, dim_feedforward=8, n_encoder_layers=1, device="cpu",
-        use_vae=False, push_to_hub=False,
-    )  # fmt: skip
-    act.input_features = {
-        "observation.state": PolicyFeature(FeatureType.STATE, (38,)),
-        "observation.environment_state": PolicyFeature(FeatureType.ENV, (2,)),
-    }
-    act.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
-    ACTPolicy(act).save_pretrained(tmp_path)
-    sizes = {"observation.state": 38, "observation.environment_state": 2, "action": 2}
-    stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in sizes.items()}
-    for one in make_pre_post_processors(act, dataset_stats=stats):
-        one.save_pretrained(tmp_path)
     with pytest.raises(ConfigError, match="'act'; PPO starts from a 'bhd_mlp'"):
-        run(tmp_path / "run", start_from=tmp_path)
+        run(tmp_path / "run", start_from=save_policy(tmp_path / "act", "act"), robot__beams=12)
     residual = {"residual": ["*"], "residual_columns": [-1, -1]}
     for name, changed, message in (
         ("residual", residual, r"policy.residual is \['\*'\]\); PPO learns the actions themselves"),
