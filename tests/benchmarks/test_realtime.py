@@ -6,17 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks._report import Report, Row
 from benchmarks._turns import GOAL_MISSED
 from benchmarks.realtime import (
     OURS,
-    TWIN,
-    VIDEO,
     NotMeasuredError,
     Ticks,
     main,
     summarise,
-    summarise_blocks,
 )
 
 PERIOD = 1_000_000
@@ -52,32 +48,6 @@ def test_a_missing_value_is_not_a_number() -> None:
     drifting = np.repeat(np.arange(10)[:, None] * (PERIOD + 7), 3, axis=1)  # anchored anew at every tick
     with pytest.raises(NotMeasuredError, match="left its grid"):
         summarise(Ticks(drifting, PERIOD), 0.0)
-
-
-def block(loop: str, number: int, wake: float, share: float = 0.1) -> dict:
-    times = {"wake_p50": wake, "wake_p99": 2 * wake, "wake_max": 3 * wake, "tick_p99": 100.0, "share": share}
-    return {"robot": "ur5", "loop": loop, "condition": "quiet", "round": number, **times} | dict.fromkeys(
-        ("ticks", "late", "missed"), 1
-    )
-
-
-def report(blocks: list[dict]) -> dict[str, Row]:
-    found = Report("")
-    summarise_blocks(found, blocks)
-    return {row.what.removeprefix("ur5 at 1000 Hz, "): row for row in found.rows}
-
-
-def test_ratios_are_of_neighbouring_blocks() -> None:
-    noise = [1.0, 40.0, 1.0, 7.0, 1.0]  # a disturbance of both of a pair leaves their ratio alone
-    blocks = [block(OURS, k, 12.0 * f) for k, f in enumerate(noise)]
-    blocks += [block(TWIN, k, 10.0 * f) for k, f in enumerate(noise)] + [block(VIDEO, 0, 24.0)]
-    rows = report(blocks)
-    ours = rows[f"{OURS}, quiet, over {TWIN}"].value
-    assert ours.startswith("wake_p50 12.0 us (1.20 x); ")
-    assert "wake_max 1440.0 us" in ours
-    assert rows[f"{OURS}, quiet: ticks"].value == "5, 5 late by over 0.1 ms, 5 missed"
-    assert rows[f"{VIDEO}, quiet, over {OURS}"].value.startswith("wake_p50 24.0 us (2.00 x)")
-    assert "x)" not in rows[f"{TWIN}, quiet"].value
 
 
 def test_a_loop_that_cannot_be_measured_is_left_out_with_the_reason_and_the_rest_is_measured(

@@ -4,8 +4,6 @@ import json
 import math
 import re
 import shlex
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks._report import mean
-from benchmarks.results import __main__ as program
 from benchmarks.results import page
-from benchmarks.results.provenance import provenance
 from benchmarks.results.rows import is_met, over_seeds, over_trainings
 from benchmarks.results.runner import REPOSITORY, FailedError, Part, Ran, Runner
 from benchmarks.results.table import Table
@@ -145,53 +141,3 @@ def test_a_command_is_run_once_and_what_a_stopped_one_left_is_removed(tmp_path: 
     run.close()
     assert Runner(tmp_path).run(make) == first  # as in another run
     assert len(ran(tmp_path)) == 1
-
-
-def test_few_episodes_are_tried_into_a_page_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    script = tmp_path / "script.py"
-    row = {"what": "a number", "value": "1", "goal": "at least 2", "met": False}
-    writes = f"import pathlib, sys; pathlib.Path(sys.argv[2][7:]).write_text({json.dumps({'rows': [row]})!r})"
-    script.write_text(writes, encoding="utf-8")
-    lines = {"broken": f"python {tmp_path / 'none.py'}"}
-    lines["one"] = f"python {script} --n_episodes=500 --json={{out}}/one.json"
-    measured = {"rows": "rows one.json"}
-    sections = {
-        name: {"title": name, "once": {"commands": [line], "measured": measured}} for name, line in lines.items()
-    }
-    kept = {"sections": sections, "seeds": [0]}
-    monkeypatch.setattr(Table, "__init__", lambda self, out: vars(self).update(kept, _words={"out": out}))
-    folder = tmp_path / "results"
-    assert program.main([f"--folder={folder}", "--episodes=3"]) == 2
-    assert "broken: python" in capsys.readouterr().err
-    assert "--n_episodes=3" in ran(folder)[0]
-    assert "| a number | 1 | at least 2 | **missed** |" in (folder / "results.md").read_text(encoding="utf-8")
-    assert program.main([f"--folder={folder}", "--episodes=3", "--only", "one"]) == 0
-    shutil.rmtree(folder / "results")
-    assert program.main([f"--folder={folder}", "--kept"]) == 0
-    assert "a number" not in (folder / "results.md").read_text(encoding="utf-8")
-    with pytest.raises(SystemExit):
-        program.main(["--episodes=0"])
-
-
-def test_what_was_measured_names_the_commit_that_it_was_measured_with(tmp_path: Path) -> None:
-    assert "commit" not in provenance(tmp_path)  # a folder that git knows nothing of
-
-    def git(*arguments: str) -> str:
-        name = ("-c", "user.name=one", "-c", "user.email=one@example.org")
-        command = ["git", "-C", str(tmp_path), *name, *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-
-    git("init", "--quiet")
-    (tmp_path / "bhd_lerobot").mkdir()
-    source = tmp_path / "bhd_lerobot" / "brain.py"
-    source.write_text("A = 1\n", encoding="utf-8")
-    git("add", "--all")
-    git("commit", "--quiet", "--message=first")
-    (tmp_path / "README.md").write_text("No number depends on it.", encoding="utf-8")
-    first = re.search(r", with commit ([0-9a-f]+), lerobot_robot_bhd ", provenance(tmp_path))
-    assert first is not None
-    assert git("rev-parse", "HEAD").startswith(first[1])
-    source.write_text("A = 2\n", encoding="utf-8")
-    assert f"commit {first[1]} and changes, " in provenance(tmp_path)

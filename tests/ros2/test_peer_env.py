@@ -1,34 +1,10 @@
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests import requirements
 from tests.ros2 import peer_env
-
-MAKE_TWICE_AT_ONCE = """
-import sys, time
-from pathlib import Path
-from tests.ros2 import peer_env
-
-peer_env.CACHE = Path(sys.argv[1])
-def make(folder):
-    folder.mkdir()
-    time.sleep(0.3)
-    with open(sys.argv[1] + "/makers", "a") as makers:
-        print("made", file=makers)
-    (folder / "last").touch()
-assert (peer_env._made("name", [Path(__file__ if "__file__" in globals() else sys.executable)], make) / "last").exists()
-"""
-
-
-def test_two_that_ask_at_once_get_what_one_of_them_makes(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", MAKE_TWICE_AT_ONCE, str(tmp_path)]
-    both = [subprocess.Popen(command, cwd=peer_env.ROOT) for _ in range(2)]
-    assert [process.wait() for process in both] == [0, 0]
-    assert (tmp_path / "makers").read_text().splitlines() == ["made"]
 
 
 def test_what_older_or_interrupted_makers_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,16 +56,6 @@ def test_the_curve_shows_both_losses_on_a_log_scale(tmp_path: Path, monkeypatch)
     assert below.lines[0].get_xdata().tolist() == [10, 20, 30]
 
 
-def test_a_negative_log_likelihood_has_a_linear_scale(tmp_path: Path, monkeypatch) -> None:
-    rows = [{"step": 1, "loss": 1.0}, {"step": 2, "loss": -1.0}]
-    above = drawn(rows, tmp_path / "loss.png", monkeypatch).axes[0]
-    assert (above.get_yscale(), above.get_ylabel()) == ("linear", "loss of toy (l1)")
-
-
-def test_no_row_at_all_can_be_drawn(tmp_path: Path, monkeypatch) -> None:
-    assert drawn([], tmp_path / "loss.png", monkeypatch).axes[0].lines[:] == []
-
-
 @pytest.mark.parametrize(("completed", "said"), [(0, "15:00:00 left, by the first step. Take less."), (90, "")])
 def test_the_time_left_is_printed_from_the_first_step_on(
     completed: int, said: str, monkeypatch: pytest.MonkeyPatch

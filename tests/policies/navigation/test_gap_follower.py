@@ -8,7 +8,6 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.clearance import QUANTUM, ClearanceTable, Footprint, Level, make_paths
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.robots.base_simulation import BaseSimulation
@@ -274,11 +273,3 @@ def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
     outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
     assert all(outcome.success for outcome in outcomes)
     assert all(outcome.details["path_m"] > 4 for outcome in outcomes)
-
-
-@pytest.mark.thorough
-def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
-    seeds = [episode_seed(7, episode, "train") for episode in range(5)]
-    old, new = (run(brain, seeds, len(seeds), seconds=30) for brain in (AvoidanceBrain(), GapFollowerBrain()))
-    assert sum(not outcome.success for outcome in new) <= sum(not outcome.success for outcome in old)
-    assert np.mean([outcome.score for outcome in new]) > 1.2 * np.mean([outcome.score for outcome in old])

@@ -14,6 +14,7 @@ from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW
 from bhd_lerobot.training.rl.config import parse_rl
 from bhd_lerobot.training.rl.parts import seeing_more
+from tests.cases import each_case
 
 WIDTH, BEAMS, TASK = 14, 8, 9  # two numbers, the beams, four more numbers; the environment state
 IGNORED = [0, 11, 13]
@@ -57,47 +58,32 @@ def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
     return rows
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_it_does_the_same_at_first_whatever_the_ignored_numbers_are(case: str) -> None:
-    narrow = policy(**CASES[case])
-    wide = seeing_more(narrow, ignored=True)
+@each_case("case", CASES)
+@each_case("steps", [None, (3, 2)])
+def test_it_does_the_same_at_first_and_learns_from_what_it_did_not_see(
+    case: str, steps: tuple[int, int] | None
+) -> None:
+    """Whatever the ignored numbers are, and what was before."""
+    narrow = policy(**CASES[case] | ({} if steps is None else {"n_obs_steps": 1, "obs_stride": 1}))
+    wide = seeing_more(narrow, ignored=True) if steps is None else seeing_more(narrow, ignored=True, steps=steps)
     assert (wide.config.ignore, wide.config.ignored_columns) == ([], [])
     assert narrow.config.ignored_columns == IGNORED  # the checkpoint's own is left alone
+    if steps is not None:
+        assert (wide.config.n_obs_steps, wide.config.obs_stride, wide.config.history) == (3, 2, 5)
     for seed in range(3):
-        rows = batch(narrow, seed)
-        before = narrow.predict_action_chunk(rows)
-        rows["observation.state"][..., IGNORED] = 100.0 * (seed - 1)
-        torch.testing.assert_close(wide.predict_action_chunk(rows), before, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_it_can_learn_from_what_was_ignored(case: str) -> None:
-    wide = seeing_more(policy(**CASES[case]), ignored=True)
-    rows = batch(wide)
+        last, every = batch(narrow, seed), batch(wide, seed)
+        for key, rows in every.items():
+            rows[:, -last[key].shape[1] :] = last[key]
+        before = narrow.predict_action_chunk(last)
+        every["observation.state"][:, -last["observation.state"].shape[1] :, IGNORED] = 100.0 * (seed - 1)
+        torch.testing.assert_close(wide.predict_action_chunk(every), before, rtol=1e-5, atol=1e-6)
     wide.train()
-    wide._chunk(wide.features(rows), rows).square().sum().backward()
-    gradient = wide.net[0].weight.grad
-    unused = (wide.net[0].weight == 0).all(dim=0)
-    assert int(unused.sum()) == len(IGNORED) * wide.config.n_obs_steps
-    assert (gradient[:, unused].abs().sum(dim=0) > 0).all()
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_it_can_see_what_was_before_and_does_the_same_at_first(case: str) -> None:
-    narrow = policy(**{**CASES[case], "n_obs_steps": 1, "obs_stride": 1})
-    wide = seeing_more(narrow, ignored=True, steps=(3, 2))
-    assert (wide.config.n_obs_steps, wide.config.obs_stride, wide.config.history) == (3, 2, 5)
-    last, every = batch(narrow), batch(wide)
-    for key, rows in every.items():
-        rows[:, -1:] = last[key]
-    torch.testing.assert_close(
-        wide.predict_action_chunk(every), narrow.predict_action_chunk(last), rtol=1e-5, atol=1e-6
-    )
-    wide.train()
-    wide._chunk(wide.features(every), every).square().sum().backward()
-    first = wide.net[0].weight if wide.scan_encoder is None else wide.scan_encoder.layers[0].weight
+    wide({**batch(wide), "action": torch.full((5, 2, 2), 3.0)})[0].backward()
+    first = wide.net[0].weight if steps is None or wide.scan_encoder is None else wide.scan_encoder.layers[0].weight
     unused = (first == 0).all(dim=0)
     assert unused.any()
+    if steps is None:
+        assert int(unused.sum()) == len(IGNORED) * wide.config.n_obs_steps
     assert (first.grad[:, unused].abs().sum(dim=0) > 0).all()
 
 
