@@ -68,6 +68,7 @@ OUT_OF_RANGE: dict[Any, dict[str, tuple[float, ...]]] = {
 }
 
 
+@pytest.mark.law
 @each_case("kind", OUT_OF_RANGE)
 def test_a_number_that_cannot_be_honoured_is_refused_by_name(kind: Any) -> None:
     prefix = "randomisation" if kind is RandomisationConfig else "task" if "tasks" in kind.__module__ else "brain"

@@ -57,6 +57,7 @@ def test_one_brain_has_a_short_form():
     assert config.brain is None
 
 
+@pytest.mark.law
 @each_case(
     ("arguments", "message"),
     [

@@ -54,6 +54,7 @@ def test_jerk_of_a_speed_that_is_a_parabola_is_constant():
     assert metrics.jerk_max == pytest.approx(0.04, rel=1e-2)
 
 
+@pytest.mark.law
 def test_jerk_of_joints_is_the_length_of_the_third_derivative_without_the_gripper():
     t = np.arange(40) / FPS
     cubic = t**3 / 6
@@ -73,6 +74,7 @@ def test_path_is_the_length_of_the_line_in_space():
     assert measured(episode(np.zeros((5, 2))), track).path_m == pytest.approx(20.0)
 
 
+@pytest.mark.law
 def test_flags_are_counted_by_kind_in_frames():
     limits = np.array([0, Limit.VELOCITY, Limit.VELOCITY | Limit.EFFORT, Limit.ACCELERATION])
     watchdog = np.array([Watchdog.COMMAND_AGE, 0, Watchdog.COMMAND_AGE | Watchdog.BLOCKED, 0])

@@ -23,6 +23,7 @@ def test_against_equal_brains_the_bets_win_nothing_in_the_mean():
         assert mean == pytest.approx(1.0, rel=1e-9)
 
 
+@pytest.mark.law
 def test_e_values_by_hand_and_turned_round():
     assert np.exp(log_e_value(8, 0)) == pytest.approx(2**8 / 9)
     assert np.exp(log_e_value(1, 1)) == pytest.approx(2 / 3)

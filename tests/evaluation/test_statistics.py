@@ -39,6 +39,7 @@ def test_wilson_stays_within_0_and_1_and_is_a_mirror_image():
         assert one.low == pytest.approx(1 - other.high, abs=1e-12)
 
 
+@pytest.mark.law
 def test_paired_rates_have_the_interval_of_newcombes_paper():
     # Newcombe 1998, method 10, of the table 36, 12, 2, 0: difference 0.2000, 0.0569 to 0.3404.
     estimate = rate_difference(*outcomes(36, 12, 2, 0))

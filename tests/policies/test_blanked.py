@@ -34,6 +34,7 @@ class Spy(ConfiguredBrain):
         return "its command"
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(("deaf", "blind"), [(True, False), (False, True), (True, True)])
 def test_what_is_blanked_does_not_arrive_and_all_else_does(deaf: bool, blind: bool) -> None:
     spy: Any = Spy()

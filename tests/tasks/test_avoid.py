@@ -117,6 +117,7 @@ def test_the_last_frame_is_the_end_and_not_stuck() -> None:
     assert run.events[0] == Event.TIMEOUT
 
 
+@pytest.mark.law
 @given(
     st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.booleans()), min_size=1, max_size=30), st.integers(0, 9)
 )

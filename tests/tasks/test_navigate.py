@@ -117,6 +117,7 @@ def test_the_goal_is_reported_in_the_robots_frame() -> None:
     )
 
 
+@pytest.mark.law
 def test_success_needs_place_heading_rest_and_time() -> None:
     run = Run()
     drive_to_goal(run)

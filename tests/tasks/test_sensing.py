@@ -70,6 +70,7 @@ def test_noise_is_on_positions_only_and_as_large_as_it_is_set_to_be(name: str) -
     assert np.array_equal(said[~present], true[~present])
 
 
+@pytest.mark.law
 @each_case("name", TASKS)
 def test_what_is_late_was_true_some_frames_before(name: str) -> None:
     true, said = told(name, 30), told(name, 30, delay_s=0.5)

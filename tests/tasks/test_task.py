@@ -71,6 +71,7 @@ def _together(truths: list[Any]) -> Any:
     return type(truths[0])(*map(np.concatenate, fields))
 
 
+@pytest.mark.law
 @each_case(
     "config",
     [
@@ -158,6 +159,7 @@ HELD = {
 }
 
 
+@pytest.mark.law
 @each_case("name", HELD)
 def test_success_needs_the_whole_hold_time_which_a_break_starts_anew(name: str) -> None:
     task = HELD[name]
@@ -191,6 +193,7 @@ def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late(name: str) ->
     assert not late.outcome().success
 
 
+@pytest.mark.law
 @each_case("name", HELD)
 @each_case("touch", ["arm_on_table", "self_contact", "arm_on_object"])
 @each_case("when", ["at once", "at success", "at the end"])

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.figures
 ROWS = [{"step": step, "loss": 1 / step, "lr": 1e-3, "held_out_loss": 2 / step} for step in (10, 20, 30)]
 
 
+@pytest.mark.law
 def test_rows_come_back_with_all_their_bits(tmp_path: Path) -> None:
     file = MetricsFile(tmp_path / "metrics.jsonl")
     for row in ROWS:

@@ -196,6 +196,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
     assert sorted(one.name for one in (run / "checkpoints").iterdir()) == ["000010", "000020", "last"]
 
 
+@pytest.mark.law
 def test_a_full_disk_ends_with_the_checkpoint_before_intact(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,6 +84,7 @@ def test_directions_are_those_of_the_beams_that_the_camera_shows() -> None:
     assert made.scanner_ahead == lidar.ahead
 
 
+@pytest.mark.law
 def test_things_stay_where_they_are_while_the_robot_moves() -> None:
     """A point that is seen from any pose is in the same sector and distance as one that is seen from the last."""
     policy = CnnPolicy(config(scanner_ahead=-0.03, sectors=12, n_obs_steps=2)).eval()

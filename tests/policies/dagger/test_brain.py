@@ -89,6 +89,7 @@ def made(n: int = 1, **values: Any) -> tuple[DaggerBrain, Fake, Fake]:
     return brain, learner, expert
 
 
+@pytest.mark.law
 def test_the_expert_drives_to_the_end_or_for_hold_s_and_has_seen_everything() -> None:
     brain, learner, expert = made(patience_s=0.5)
     actions, taken = [], []
@@ -210,6 +211,7 @@ def test_the_parameters_name_both_and_are_plain() -> None:
     assert parameters["expert"]["type"] == "gap_follower"
 
 
+@pytest.mark.law
 def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or_backs_off_is_not() -> None:
     watch = BaseCollisionWatch(0.5, DRIVEN, BURGER)
     seen = base()
@@ -217,6 +219,10 @@ def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or
     for speed, turn, expected in [(0.22, 0.0, True), (0.0, 0.0, False), (-0.1, 0.0, False), (0.05, 0.0, False)]:
         assert watch.check(seen, np.array([[speed, turn]]), NO_ADVICE).tolist() == [expected], (speed, turn)
     assert not watch.check(base(), np.array([[0.22, 0.0]]), NO_ADVICE).any()
+    aside = base()
+    aside.state[0, 2 + 4] = 0.15  # 40 degrees to the left: it is hit by a left bend, and not by a right one
+    bends = [watch.check(aside, np.array([[0.22, turn]]), NO_ADVICE).tolist() for turn in (1.2, -1.2)]
+    assert bends == [[True], [False]]
 
 
 def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:

@@ -70,6 +70,7 @@ def scenes(draw: Callable[..., Any], smallest: int = 1) -> list[SceneObject]:
 HOLD, GIVE = Skill.HOLD, Skill.HAND_OVER
 
 
+@pytest.mark.law
 @each_case(
     ("instruction", "target", "last"),
     [
@@ -180,6 +181,7 @@ def test_names_are_those_that_people_use() -> None:
         assert set(language.names) >= {*COLOURS, *KINDS, *Relation}
 
 
+@pytest.mark.law
 @each_case(
     ("instruction", "message"),
     [

@@ -175,6 +175,7 @@ def test_it_takes_the_side_of_a_box_that_leaves_room_for_errors_unless_something
             assert closing.gripper == pytest.approx(width - 0.03)
 
 
+@pytest.mark.law
 @each_case(
     ("looks", "options", "problem"),
     [

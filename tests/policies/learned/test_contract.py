@@ -119,6 +119,7 @@ def test_what_fits_is_accepted() -> None:
     PolicyContract().check(("a",), ("b",), 3, ("c",), "ur5", cameras={})
 
 
+@pytest.mark.law
 @each_case(
     ("here", "parts"),
     [

@@ -34,6 +34,7 @@ def between_lines(first: float, second: float) -> float:
     return abs((first - second + math.pi / 2) % math.pi - math.pi / 2)
 
 
+@pytest.mark.law
 @given(angles, st.floats(0.09, 0.2), st.floats(0.01, 0.07))
 def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: float) -> None:
     for length, width, across in ((wide, narrow, yaw + math.pi / 2), (narrow, wide, yaw)):

@@ -28,6 +28,7 @@ def grasp(desk: Desk, sim: int = 0, opening: float = GRASPED) -> None:
     desk.state[sim, 1] = opening
 
 
+@pytest.mark.law
 def test_above_down_close_lift_and_done() -> None:
     desk = Desk(PickBrain(), [scene(CUP, BOX)])
     above = desk.look()[0]

@@ -118,6 +118,7 @@ def test_a_good_answer_becomes_a_plan(text: str) -> None:
     assert planned(text) == make_plan("hand me the red cup", CUP, GOOD)
 
 
+@pytest.mark.law
 @each_case(
     ("text", "message"),
     [

@@ -201,6 +201,7 @@ def test_cameras_are_left_alone() -> None:
     assert made.image_features == {}
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("loss", ["l1", "mse", "huber", "nll"])
 def test_the_loss_is_what_its_name_says_and_leaves_padding_out(loss: str) -> None:
     made = config(loss=loss, gaussian=loss == "nll", initial_log_std=-0.3)

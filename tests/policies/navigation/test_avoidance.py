@@ -1,6 +1,7 @@
 """The rule of the articles, decision by decision."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,6 +36,7 @@ def test_the_edges_belong_to_the_sector(degrees: int, expected: tuple[float, flo
     assert tuple(decide(one_reading(degrees, 0.49))[0]) == expected
 
 
+@pytest.mark.law
 @each_case(
     ("distance", "expected"),
     [

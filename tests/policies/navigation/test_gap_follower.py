@@ -86,6 +86,7 @@ def test_it_never_asks_for_more_than_the_robot_can() -> None:
         assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
 
 
+@pytest.mark.law
 @each_case("beams", [36, 360])
 @each_case("distance", [0.12, 0.2])
 def test_it_does_not_drive_into_a_wall(beams: int, distance: float) -> None:
@@ -99,6 +100,7 @@ def test_wedged_in_a_slot_it_backs_off() -> None:
     assert turn == 0
 
 
+@pytest.mark.law
 @each_case("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
 def test_blind_it_stops_and_sees_again(blind: float) -> None:
     brain = bound(90, 2)

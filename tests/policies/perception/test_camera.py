@@ -19,6 +19,7 @@ WIDTH, HEIGHT = 320, 240
 PROJECTION = Projection(SCENE_CAMERA, WIDTH, HEIGHT)
 
 
+@pytest.mark.law
 @given(st.tuples(st.floats(0.2, 0.8), st.floats(-0.5, 0.5), st.floats(0.0, 0.2)))
 def test_the_pixel_of_a_point_shows_that_point(point: tuple[float, float, float]) -> None:
     pixel = PROJECTION.pixels(np.array(point))

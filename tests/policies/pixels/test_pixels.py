@@ -140,6 +140,7 @@ def test_what_is_seen_of_an_image_does_not_depend_on_the_others_of_a_batch() -> 
             assert torch.equal(one, other)
 
 
+@pytest.mark.law
 def test_actions_behind_the_end_do_not_count() -> None:
     policy, samples = PixelsPolicy(made()).eval(), batch()
     padded = torch.zeros(8, CHUNK, dtype=torch.bool)

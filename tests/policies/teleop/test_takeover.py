@@ -57,6 +57,7 @@ class Counting(ConfiguredBrain):
         self.closed = True
 
 
+@pytest.mark.law
 def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afresh() -> None:
     brain, person = Counting("policy", 0.0), Counting("teleop", 100.0)
     taken = [False, False, True, True, False, False]

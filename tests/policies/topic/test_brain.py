@@ -99,6 +99,7 @@ def test_another_robot_is_driven_by_numbers_in_order_or_by_a_mapping(node: Node,
             brain.close()
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -76,6 +76,7 @@ def test_on_the_senders_own_clock_the_age_is_that_of_the_stamp(
         assert age == pytest.approx((latency + network * is_synchronised) * SECOND, abs=1000)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("step", [-5.0, -2.5, -0.5, 0.5, 3600.0])
 @pytest.mark.parametrize("whose", ["stamps", "machine"])
 def test_a_clock_that_is_set_makes_nothing_old(step: float, whose: str) -> None:

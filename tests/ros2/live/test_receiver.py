@@ -43,6 +43,7 @@ def taken(stamps: list[float]) -> list[float]:
     return found
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("stamps", "wanted"),
     [

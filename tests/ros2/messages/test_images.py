@@ -40,6 +40,7 @@ def file(image, kind, mode=None):
     return buffer.getvalue()
 
 
+@pytest.mark.law
 @each_case(
     ("encoding", "pixels", "seen"),
     [

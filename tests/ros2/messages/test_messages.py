@@ -21,6 +21,7 @@ from tests.ros2.bag.support import STORE, odometry, scan
 SCAN, JOINTS = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/JointState"
 
 
+@pytest.mark.law
 def test_trees_of_arrays_become_messages():
     stamps = np.array([5 * 10**9 + 7, 6 * 10**9])
     ranges = np.random.default_rng(0).random((2, 37)).astype(np.float32)
@@ -115,6 +116,7 @@ def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
         types.require_rosbags()
 
 
+@pytest.mark.law
 def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
     """On the wall clock the age includes the way to the brain: 5 ms here, for a scan 1 ms after an observation."""
     lidar = turtlebot3_burger().lidar

@@ -105,6 +105,7 @@ def element(field: str, kind: str = FLOATS) -> dict[str, str]:
     return {"topic": "/commands", "type": kind, "field": field}
 
 
+@pytest.mark.law
 @each_case(
     ("action", "message"),
     [

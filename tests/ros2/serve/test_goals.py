@@ -86,6 +86,7 @@ def test_speed_is_limited() -> None:
     assert 0.04 < max(action[0, 0] for action in base.sent) <= 0.05
 
 
+@pytest.mark.law
 def test_each_goal_ends_in_one_result_whatever_ends_it() -> None:
     base = Base()
     goals = BaseGoals(base)  # type: ignore[arg-type]

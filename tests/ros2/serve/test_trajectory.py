@@ -24,6 +24,7 @@ def made(*points: Any, joints: tuple[str, ...] = JOINTS, passed_s: float = 0.0) 
     return JointTrajectory(SimpleNamespace(joint_names=list(joints), points=list(points)), JOINTS, START, passed_s)
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("with_speeds", [False, True])
 def test_it_passes_its_points_in_time_and_holds_the_last(with_speeds: bool) -> None:
     speeds = [0.5, 0.5] if with_speeds else None
@@ -46,6 +47,7 @@ def test_joints_are_found_by_name() -> None:
     np.testing.assert_allclose(one.at(1.0), [1.0, 2.0])
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("points", "joints", "text"),
     [

@@ -397,6 +397,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path, capsys: pyte
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.law
 def test_the_algorithm_decides_which_training_is_asked_for(tmp_path: Path) -> None:
     assert algorithm_of(read_line(["--algorithm=ppo"])) == "ppo"
     assert algorithm_of(read_line(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"])) == "ppo"

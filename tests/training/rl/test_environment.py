@@ -169,6 +169,7 @@ def test_the_learner_adds_the_value_of_what_would_have_come_to_truncated_episode
     assert learner.rollout_buffer.episode_starts[10].all()
 
 
+@pytest.mark.law
 def test_shaping_leaves_the_tasks_reward_alone_and_a_potential_cancels_out_over_an_episode() -> None:
     shaping = Shaping(RewardConfig(potential="pose"), 1.0, 2)
     potentials = np.array([[-3.0, -1.0], [-2.0, -4.0], [-0.5, -2.5]])

@@ -58,6 +58,7 @@ def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
     return rows
 
 
+@pytest.mark.law
 @each_case("case", CASES)
 @each_case("steps", [None, (3, 2)])
 def test_it_does_the_same_at_first_and_learns_from_what_it_did_not_see(

@@ -70,6 +70,7 @@ def test_what_comes_after_t_changes_nothing_until_t(a, b, c, data):
         assert {**first, **second}[time][-1]
 
 
+@pytest.mark.law
 @settings(max_examples=200)
 @given(steps, steps)
 def test_a_frame_has_the_newest_message_until_then(a, b):
@@ -162,6 +163,7 @@ def test_stamps_of_headers_count_where_they_are_sane():
     assert message_times(received, None, "header") is received
 
 
+@pytest.mark.law
 def test_ranges_without_a_return_read_the_maximum_and_what_is_too_near_the_minimum():
     raw = np.array([0.0, np.inf, np.nan, -1.0, -np.inf, 0.05, 0.119, 0.13, 3.5, 8.0], np.float32)
     far, near = LIDAR.range_max, LIDAR.range_min
@@ -184,6 +186,7 @@ def world(angle):
     return 1.5 + 0.5 * np.cos(angle) + 0.3 * np.sin(2 * angle)
 
 
+@pytest.mark.law
 def test_scanners_of_every_kind_become_ours_by_angle():
     for count, angle_min, sign, beams in itertools.product(
         [360, 361, 230, 720], [0.0, -np.pi, 0.3], [1, -1], [360, 36]

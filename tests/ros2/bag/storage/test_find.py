@@ -119,6 +119,7 @@ PROFILE = {
 NAMED = {**PROFILE, "history": "keep_last", "reliability": "reliable", "durability": "volatile"}
 
 
+@pytest.mark.law
 @each_case(
     ("profiles", "count"),
     [

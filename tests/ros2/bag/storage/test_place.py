@@ -20,6 +20,7 @@ from bhd_lerobot.ros2.messages.views import RobotView
 from tests.datasets import support
 
 
+@pytest.mark.law
 def test_a_living_attempt_keeps_its_folder_and_the_first_to_end_has_the_place(tmp_path: Path) -> None:
     target = tmp_path / "bags"
     named = ("--output", "write bags", "Nothing was written.")
