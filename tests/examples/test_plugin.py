@@ -2,11 +2,9 @@
 
 import json
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
-from hatchling import build
 from lerobot.scripts import lerobot_teleoperate
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
@@ -16,6 +14,7 @@ from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.rollout import replay
 from tests.forks import Fork
+from tests.wheels import wheel_of
 
 PLUGIN = Path(__file__).resolve().parents[2] / "examples" / "plugin"
 
@@ -49,11 +48,8 @@ def use(folder: Path) -> int:
 def used(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder in which every program has used the plug-in."""
     folder = tmp_path_factory.mktemp("plugin")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(PLUGIN)
-        wheel = build.build_wheel(str(folder))
-    with zipfile.ZipFile(folder / wheel) as file:
-        file.extractall(folder / "site")
+    with wheel_of(PLUGIN, folder) as wheel:
+        wheel.extractall(folder / "site")
     process = Fork(use, folder, output=folder / "log")
     assert process.wait() == 0, (folder / "log").read_text()
     return folder
