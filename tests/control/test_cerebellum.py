@@ -94,6 +94,7 @@ def between(*twists: tuple[float, float]) -> list[tuple]:
 @example(between((0.0, 2.84), (0.22, 0.0)))
 @example(between((0.0, 2.84), (-0.22, 0.0)))
 @example(between((0.0, 2.84), (0.22, -2.84)))
+@settings(max_examples=50)
 @given(st.lists(STEP, min_size=1, max_size=30))
 def test_every_tick_is_safe(history: list[tuple]) -> None:
     rig = Rig()

@@ -183,6 +183,7 @@ def test_the_poses_of_a_chunk_follow_each_other() -> None:
     assert abs(abs(simulation.cerebellum.command[0, 5] - before[5]) - 0.04 * 59) < 0.02  # a brake at its end
 
 
+@pytest.mark.thorough
 def test_a_stream_whose_poses_were_refused_is_taken_again_only_near_to_the_tool() -> None:
     """Streams of 0.2 m/s that leave the workspace and come back to it elsewhere, and then to where they left it."""
     corners = ([(0.60, -0.79, 0.73), (-0.60, -0.22, 0.22)], [(0.89, 0.51, 0.39), (-0.14, 0.68, 0.05)])

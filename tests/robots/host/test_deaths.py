@@ -37,30 +37,22 @@ from tests.waiting import until
 TIMEOUT_S = 0.3
 
 
-def test_a_killed_recorder_a_killed_cerebellum_and_life_after_both():
+def test_a_cerebellum_that_is_killed_or_stopped_is_reported_and_ended_and_there_is_life_after_it(monkeypatch):
+    monkeypatch.setattr(link, "_END_S", 0.5)
     name = unique("killed")
-    robot = turtlebot(name, recorder_timeout_s=TIMEOUT_S)
-    for victim, message in (
-        ("recorder", "recorder's process was killed by signal 9. The robot decelerates and holds"),
-        ("cerebellum", "cerebellum's process was killed by signal 9. The simulated robot ended with it"),
+    robot = turtlebot(name)
+    for number, message in (
+        (signal.SIGKILL, "cerebellum's process was killed by signal 9. The simulated robot ended with it"),
+        (signal.SIGSTOP, "published nothing for"),
     ):
         with robot:
             drive(robot)
             pids = robot.host.link.pids
-            states = States(name)
-            os.kill(pids[victim], signal.SIGKILL)
+            os.kill(pids["cerebellum"], number)
             until(lambda wanted=message: wanted in complaint(robot.get_observation), "the robot says what happened")
             assert message in complaint(lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0}))
-            if victim == "recorder":
-                until(lambda read=states: read.has(Mode.HOLD), "the base holds")
-                assert watchdog_count(states.read().all[-1], Watchdog.RECORDER) >= 1
-                expect_exact_timeout(states, Word.RECORDER_ALIVE)
-        states.block.close()
         assert is_gone(name)
         assert not any(is_alive(pid) for pid in pids.values())
-    with robot:
-        drive(robot)
-    assert is_gone(name)
 
 
 @pytest.mark.thorough
@@ -109,7 +101,7 @@ def expect_exact_timeout(states: States, word: Word) -> None:
     assert states.all[hold]["command"].tolist() == [[0.0, 0.0]]
 
 
-def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
+def test_a_stopped_recorder_loses_states_that_are_counted_exactly_and_a_killed_one_is_reported():
     name = unique("stopped")
     with turtlebot(name, recorder_timeout_s=TIMEOUT_S, buffer_s=0.5) as robot:
         drive(robot)
@@ -150,6 +142,10 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
                 gaps += 1
                 assert passed - frame <= lost < passed
         assert gaps >= 1
+        os.kill(recorder, signal.SIGKILL)
+        message = "recorder's process was killed by signal 9. The robot decelerates and holds"
+        until(lambda: message in complaint(robot.get_observation), "the robot says what happened")
+        assert message in complaint(lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0}))
     states.block.close()
     assert is_gone(name)
 
@@ -174,22 +170,6 @@ def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_e
         until(lambda: not any(is_alive(pid) for pid in pids), "the processes end by themselves")
     sweep()  # this test may have been the last that held it
     assert is_gone(name)
-
-
-def test_a_cerebellum_that_is_stopped_is_reported_and_ended(monkeypatch):
-    monkeypatch.setattr(link, "_END_S", 0.5)
-    name = unique("frozen")
-    with turtlebot(name) as robot:
-        drive(robot)
-        pids = robot.host.link.pids
-        os.kill(pids["cerebellum"], signal.SIGSTOP)
-        newest = robot.host.bridge
-        until(lambda: time.monotonic_ns() - int(newest.latest["sensed_ns"]) > 2.1e9, "it has been silent for 2 s")
-        for call in (robot.get_observation, lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})):
-            with pytest.raises(RealtimeError, match=r"published nothing for .* stopped"):
-                call()
-    assert is_gone(name)
-    assert not any(is_alive(pid) for pid in pids.values())
 
 
 PR_CAPBSET_DROP, CAP_SYS_NICE = 24, 23

@@ -1,7 +1,6 @@
 """Sensors that lie, on the wall clock and with real processes: what is written after the stop."""
 
 import os
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +12,7 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
 from tests.robots.host import lying_arm
 from tests.robots.host.support import mode, relaxed, unique
+from tests.waiting import until
 
 BRAKES, BLOCKED = 0.03, 0.2  # [rad] from 0.4 rad/s; by which a joint is away that is found to be blocked
 WORDS = {
@@ -45,19 +45,19 @@ def test_a_false_reading_is_a_fault_that_moves_nothing(arm: tuple[UR5, Any], lie
     action = {name: robot.get_observation()[name] for name in robot.action_features}
     start = int(shared["count"])
 
-    def turned(until_mode: Mode | None = None, most: float = 60.0) -> None:
-        end = time.monotonic() + most
-        while time.monotonic() < end and mode(robot) not in (Mode.FAULT, until_mode):
-            action["shoulder_pan.pos"] -= 0.4 / 25
-            robot.host.send(np.array([list(action.values())]))
-            robot.host.step(None)
+    def turn() -> Mode:
+        action["shoulder_pan.pos"] -= 0.4 / 25
+        robot.host.send(np.array([list(action.values())]))
+        robot.host.step(None)
+        return mode(robot)
 
-    turned(most=1.0)
-    assert mode(robot) == Mode.TRACKING
+    for _ in range(25):
+        turn()
+    until(lambda: turn() == Mode.TRACKING, "it is on its way")
     shared["lie"] = lying_arm.LIES.index(lie)
-    turned(Mode.FAULT)
-    assert mode(robot) == Mode.FAULT
-    time.sleep(1.0)
+    until(lambda: turn() == Mode.FAULT, "it is a fault")
+    stopped = int(shared["count"])
+    until(lambda: int(shared["count"]) > stopped + 125, "it has held for a second")
     robot.host.link.pause()
     end = int(shared["count"])
     modes, written = shared["mode"][start:end], shared["written"][start:end]
