@@ -66,7 +66,7 @@ class ResultCode(IntEnum):
     BAD_TIMEOUT = 16
     """`timeout_s` is not positive and finite."""
     DUPLICATE_ID = 17
-    """The episode already had a goal of this name."""
+    """A goal of this name has not ended yet."""
     UNKNOWN_ID = 18
     """No goal of this name is followed or waits."""
     QUEUE_FULL = 19

@@ -179,7 +179,7 @@ class RequestClient:
     def submit(self, command: BrainCommand) -> CommandResult | None:
         """Send a goal.
 
-        A goal that does not fit into a record is refused here: its name does not count as used.
+        A goal that does not fit into a record is refused here.
 
         Returns:
             None if it was accepted: its one result comes later, by `take_results`. Otherwise the refusal, which is also

@@ -92,7 +92,7 @@ def test_a_duplicate_name_leaves_the_live_goal_its_result(again: BrainCommand) -
     assert pair.results() == []
     pair.rest()
     assert pair.results() == [("a", ResultCode.SUCCEEDED)]
-    refusal = pair.client.submit(again)
+    refusal = pair.client.submit(BrainCommand("a", joint_target=(1.0,)))
     assert refusal is not None
     pair.tick()
     assert pair.client.take_results() == [refusal]

@@ -105,12 +105,12 @@ class Side:
         self.states = node.subscription("/cerebellum/state", STATE)
         self.results = node.subscription(RESULT_TOPIC, RESULT, EVERY)
         self.diagnostics = node.subscription("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-        self._publishers: dict[str, Publisher] = {}
+        self._publishers: dict[tuple[str, str], Publisher] = {}
 
     def publisher(self, topic: str, msgtype: str) -> Publisher:
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.publisher(topic, msgtype, EVERY)
-        publisher = self._publishers[topic]
+        if (topic, msgtype) not in self._publishers:
+            self._publishers[topic, msgtype] = self.node.publisher(topic, msgtype, EVERY)
+        publisher = self._publishers[topic, msgtype]
         until(lambda: publisher.receivers, f"the robot receives {topic}")
         return publisher
 

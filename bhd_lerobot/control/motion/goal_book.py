@@ -21,7 +21,7 @@ _CAPACITY = 8  # goals that may wait
 
 
 class GoalBook:
-    """Ensures that every goal of one episode ends in exactly one result.
+    """Ensures that every goal ends in exactly one result.
 
     Attributes:
         followed: the goal that is followed, or None.
@@ -32,7 +32,6 @@ class GoalBook:
         self.waiting: deque[BrainCommand] = deque()
         self.followed: BrainCommand | None = None
         self.cancelled = False
-        self._used: set[str] = set()
         self._results: list[CommandResult] = []
 
     def admit(
@@ -47,13 +46,9 @@ class GoalBook:
             blocked: why the arm takes no goals now; None if it does.
         """
         name = command.task_id
-        key = str(name)  # what comes from outside may be anything
-        if key in self._used:
-            message = f"A goal of this episode already had the task_id {name!r}; every goal needs another one."
-            if (self.followed is not None and self.followed.task_id == name) or self.find(name) is not None:
-                return CommandResult(name, False, ResultCode.DUPLICATE_ID, message)
-            return self.report(name, ResultCode.DUPLICATE_ID, message)
-        self._used.add(key)
+        if (self.followed is not None and self.followed.task_id == name) or self.find(name) is not None:
+            message = f"The goal {name!r} has not ended yet; its task_id can be used again after that."
+            return CommandResult(name, False, ResultCode.DUPLICATE_ID, message)
         failure = check(command) if blocked is None else PlanFailure(blocked, REASONS.get(blocked, blocked.name))
         if failure is None and not command.preempt and len(self.waiting) >= _CAPACITY:
             failure = PlanFailure(

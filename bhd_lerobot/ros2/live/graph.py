@@ -156,13 +156,15 @@ class Graph:
         return _mismatches(Endpoint(topic, msgtype, qos, is_publisher, "", is_own=True), self.endpoints())
 
     def all_mismatches(self) -> list[str]:
-        """Return the same for all topics of this process."""
+        """Return the same for all topics of this process, to which others adapt, with the remedy."""
         everyone = self.endpoints()
         texts: list[str] = []
         for other in everyone:
-            # A topic may have several subscriptions here, one of which fits.
-            found = [_mismatches(one, [other]) for one in everyone if one.is_own and _meets(one, other)]
-            texts += found[0] if found and all(found) else []
+            # A topic may have several subscriptions here, of several types, one of which fits.
+            own = [one for one in everyone if one.is_own and _meets(one, other)]
+            found = [_mismatches(one, [other]) for one in own if one.msgtype == other.msgtype]
+            found = found or [_mismatches(one, [other]) for one in own]
+            texts += [f"{text} Give it the same type and QoS." for text in found[0]] if found and all(found) else []
         return texts
 
     def doubles(self) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.robots.host.realtime import LiveHost
-from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
+from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import views
 from bhd_lerobot.ros2.messages.base import (
@@ -29,6 +29,7 @@ from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
 
+_COMMAND = "/cmd_vel"
 NODE_HZ = 20  # of turtlebot3_node's timer
 _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _BATTERY = "sensor_msgs/msg/BatteryState"
@@ -66,15 +67,15 @@ class BaseTopics:
         self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
-        command = (BareTwistPart if node.network.distro == "humble" else TwistPart).msgtype
-        self._command = node.subscription("/cmd_vel", command)
+        # The type of Jazzy, and the one of Humble and of most tutorials.
+        self._commands = [node.subscription(_COMMAND, part.msgtype) for part in (TwistPart, BareTwistPart)]
         self._odometry = node.publisher("/odom", OdometryPart.msgtype)
         self._imu = node.publisher("/imu", GyroPart.msgtype)
         self._joints = node.publisher("/joint_states", views.JOINT_STATE)
         self._battery = node.publisher("/battery_state", _BATTERY)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
-        self._scan = node.publisher("/scan", ScanPart.msgtype, SENSOR_DATA)
+        self._scan = node.publisher("/scan", ScanPart.msgtype)  # reliable: it serves both kinds of subscription
         for message in views.static_transforms(view.frames, State.of(host).stamp_ns):
             self._static.send(message)
 
@@ -84,12 +85,12 @@ class BaseTopics:
 
     def inputs(self) -> Iterable[Input]:
         """Return what commands the robot."""
-        return [Input(self._command, self._drive_by)]
+        return [Input(one, self._drive_by) for one in self._commands]
 
     def _drive_by(self, message: Any) -> bool:
         twist = getattr(message, "twist", message)
         sent = self._host.bridge.send(np.array([[twist.linear.x, twist.angular.z]]))
-        self._counts.add_result(self._command.topic, sent)
+        self._counts.add_result(_COMMAND, sent)
         if sent.reasons[0]:
             return False
         self._interrupt()

@@ -12,12 +12,10 @@ from typing import Any, override
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos
 from bhd_lerobot.ros2.live.node import MOST_TAKEN, Node, Publisher, Received, Subscription
-from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
 from bhd_lerobot.ros2.messages.types import type_store
 
 HOST = "127.0.0.1"
 _ENCODING = "cdr"
-_ALSO = {TwistPart.msgtype: BareTwistPart.msgtype}  # the panel Teleop has no stamped twist
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class FoxgloveServer:
             ) from error
         self._sdk, self._context = foxglove, foxglove.Context()
         self._latched: dict[str, MirroredPublisher] = {}
-        self._inboxes: dict[str, tuple[str, deque[Received]]] = {}  # the type and what waits, by topic
+        self._inboxes: dict[str, dict[str, deque[Received]]] = {}  # what waits, by topic and type
         self._advertised: dict[tuple[int, int], Any] = {}  # clients' channels
         self._warned: set[tuple[int, int]] = set()
         self._name, self._port = name, port
@@ -93,7 +91,7 @@ class FoxgloveServer:
 
     def inbox(self, topic: str, msgtype: str, depth: int) -> deque[Received]:
         """Return where the messages that clients publish on a topic are put; a depth of 0 keeps all."""
-        return self._inboxes.setdefault(topic, (msgtype, deque(maxlen=depth or None)))[1]
+        return self._inboxes.setdefault(topic, {}).setdefault(msgtype, deque(maxlen=depth or None))
 
     def close(self) -> None:
         """Disconnect the clients. May be called twice."""
@@ -130,19 +128,19 @@ class FoxgloveServer:
             takes = ", ".join(sorted(self._inboxes))
             self._warn(key, f"The robot does not subscribe to {channel.topic}; it subscribes to: {takes}.")
             return
-        wanted, waiting = self._inboxes[channel.topic]
+        inboxes = self._inboxes[channel.topic]
         package, _, name = (channel.schema_name or "").rpartition("/")
         given = f"{package.removesuffix('/msg')}/msg/{name}"
         times = time.time_ns(), time.monotonic_ns()
-        if channel.encoding == _ENCODING and given in (wanted, _ALSO.get(wanted)):
-            waiting.append(Received(given, bytes(data), *times))
+        if channel.encoding == _ENCODING and given in inboxes:
+            inboxes[given].append(Received(given, bytes(data), *times))
             return
         why = (
             f"A client of Foxglove publishes {channel.schema_name!r} with the encoding {channel.encoding!r}; the topic "
-            f"takes {' or '.join(filter(None, (wanted, _ALSO.get(wanted))))} with {_ENCODING!r}."
+            f"takes {' or '.join(inboxes)} with {_ENCODING!r}."
         )
         self._warn(key, f"{channel.topic}: {why}")
-        waiting.append(_Refused(given, b"", *times, why=why))
+        next(iter(inboxes.values())).append(_Refused(given, b"", *times, why=why))
 
     def _warn(self, key: tuple[int, int], message: str) -> None:
         """Show a message in the app, once for each of a client's channels."""

@@ -105,7 +105,6 @@ class BaseGoals:
         self._command: BrainCommand | None = None
         self._goal: NDArray[np.float64] = np.zeros(3)  # x, y [m], yaw [rad] in the odometry's frame
         self._due_ns = self._end_ns = 0
-        self._known: set[str] = set()
         self._results: list[CommandResult] = []
 
     def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
@@ -127,7 +126,6 @@ class BaseGoals:
         self._brain = NavigatorBrain(config)
         self._brain.bind(self._features)
         self._brain.reset(_ONE, [0], 1)
-        self._known.add(command.task_id)
         self._command, self._goal, self._due_ns = command, goal, 0
         self._end_ns = 0
         return None
@@ -140,7 +138,8 @@ class BaseGoals:
         mode = Mode(int(self._host.modes[0]))
         reasons = {
             (ResultCode.BAD_TARGET, "The goal has no name (task_id)."): not command.task_id,
-            (ResultCode.DUPLICATE_ID, f"There was a goal {command.task_id!r} already."): command.task_id in self._known,
+            (ResultCode.DUPLICATE_ID, f"The goal {command.task_id!r} has not ended yet."): self._command is not None
+            and command.task_id == self._command.task_id,
             (ResultCode.NON_FINITE, f"The target pose is {pose.position}, {pose.quaternion}."): not np.isfinite(
                 [*pose.position, *pose.quaternion]
             ).all(),

@@ -10,10 +10,9 @@ import math
 
 import node as peer
 import numpy as np
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
 parser = peer.options(__doc__)
@@ -45,8 +44,8 @@ def command(distance: float) -> tuple[float, float]:
 class Avoidance:
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.publisher = node.create_publisher(TwistStamped, "/cmd_vel", 10)
-        node.create_subscription(LaserScan, "/scan", self.on_scan, qos_profile_sensor_data)
+        self.publisher = node.create_publisher(Twist, "/cmd_vel", 10)
+        node.create_subscription(LaserScan, "/scan", self.on_scan, 10)  # reliable, as in every tutorial
         node.create_timer(1.0, self.report)
         self.distance = math.nan
         self.scans = self.turning = self.blind = 0
@@ -60,10 +59,8 @@ class Avoidance:
     def publish(self, *, zero: bool = False) -> None:
         forward, left = (0.0, 0.0) if zero else command(self.distance)
         self.turning += left > 0
-        message = TwistStamped()
-        message.header.stamp = self.node.get_clock().now().to_msg()
-        message.header.frame_id = "base_link"
-        message.twist.linear.x, message.twist.angular.z = forward, left
+        message = Twist()
+        message.linear.x, message.angular.z = forward, left
         self.publisher.publish(message)
 
     def report(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.ros2.live.network import Qos
+from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC
@@ -19,6 +19,7 @@ from tests.ros2.programs import BOOL, Served, Side, served
 from tests.waiting import until
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+STRING = "std_msgs/msg/String"
 FORWARD = {"linear": {"x": 0.1}}
 JOINTS = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 
@@ -106,6 +107,11 @@ def test_twists_with_wrong_stamps_are_taken_as_a_real_robot_does(seconds: int, b
     base.wait(lambda state: not state.is_moving, "it stands without commands")
 
 
+def test_twists_without_a_stamp_are_taken_too(base: Side) -> None:
+    base.wait(lambda state: [base.send("/cmd_vel", TWIST, FORWARD), state.is_moving][1], "it drives")
+    base.wait(lambda state: not state.is_moving, "it stands without commands")
+
+
 def test_a_flood_of_commands_is_followed_and_the_robot_still_answers(base: Side) -> None:
     flood = ("/cmd_vel", STAMPED, json.dumps({"twist": FORWARD}), "--hz=1000", "--burst=10")
     with Peer("topic.py", "pub", *flood, domain=base.node.network.domain_number):
@@ -125,13 +131,13 @@ def test_a_command_of_an_absurd_size_gets_its_result_and_others_theirs(base: Sid
 
 def test_a_node_whose_topic_does_not_fit_is_named(base: Side) -> None:
     misfits = [
-        ("of type", base.node.publisher("/cmd_vel", TWIST), f"of /cmd_vel in /other is of type {TWIST}"),
+        ("of type", base.node.publisher("/cmd_vel", STRING), f"of /cmd_vel in /other is of type {STRING}"),
         (
             "effort",
             base.node.publisher("/cmd_vel", STAMPED, Qos(1, reliable=False)),
             "/cmd_vel in /other is best effort",
         ),
-        ("scan", base.node.subscription("/scan", "sensor_msgs/msg/LaserScan"), "of /scan in /other is reliable"),
+        ("scan", base.node.subscription("/scan", "sensor_msgs/msg/LaserScan", LATCHED), "is reliable, transient local"),
     ]
     for _, end, text in misfits:
         base.served.wait_for(text)

@@ -132,15 +132,19 @@ def test_what_a_client_publishes_is_taken_by_the_topics_input_or_refused_and_cou
 ) -> None:
     taken: list[float] = []
     counts = Counts()
-    entry = Input(
-        node.subscription("/cmd_vel", STAMPED),
-        lambda message: taken.append(getattr(message, "twist", message).linear.x),
-        "each",
-    )
+    entries = [
+        Input(
+            node.subscription("/cmd_vel", msgtype),
+            lambda message: taken.append(getattr(message, "twist", message).linear.x),
+            "each",
+        )
+        for msgtype in (STAMPED, TWIST)
+    ]
     foxglove.start()
 
     def arrived() -> bool:
-        entry.run(counts)
+        for entry in entries:
+            entry.run(counts)
         return bool(taken or counts.refused)
 
     async def scenario() -> None:
