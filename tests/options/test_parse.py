@@ -49,7 +49,7 @@ def test_numbers_may_have_an_exponent(text):
     [
         (["--sed=1"], "Did you mean 'seed'"),
         (["--robot.beens=36"], "Did you mean 'robot.beams'"),
-        (["--brain.safe_distance=0.4"], "Did you mean 'brain.safe_distance_m'"),
+        (["--brain.safe_dist=0.4"], "Did you mean 'brain.safe_distance_m'"),
         (["--brain.tpye=random"], "Did you mean 'brain.type'"),
         (["--seed"], "has no value"),
         (["seed=1"], "written --key=value"),

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict, dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ class AvoidanceConfig(BrainConfig):
     """Parameters of the avoidance rule.
 
     Attributes:
+        renamed: what nodes of ROS 2 tutorials call them, whose names are read, too.
         front_sector_deg: the front sector reaches this far to either side [deg].
         safe_distance_m: nearer than this in the front sector, the robot turns [m].
         forward_speed: speed when the way is free [m/s].
@@ -25,6 +27,12 @@ class AvoidanceConfig(BrainConfig):
         range_min_m: a reading below this is not valid [m].
         range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
     """
+
+    renamed: ClassVar[dict[str, str]] = {
+        "safe_distance": "safe_distance_m",
+        "linear_speed": "forward_speed",
+        "angular_speed": "turn_speed",
+    }
 
     front_sector_deg: float = 30.0
     safe_distance_m: float = 0.5

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.options.parse import decode
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from tests.cases import each_case
@@ -99,8 +100,10 @@ def test_the_observation_is_left_alone_and_nothing_is_remembered() -> None:
         assert np.array_equal(brain.act(Observation(NAMES, scan)), first)
 
 
-def test_parameters_are_used() -> None:
+def test_parameters_are_used_under_the_names_of_the_articles_nodes_too() -> None:
     config = AvoidanceConfig(front_sector_deg=90, safe_distance_m=1.0, forward_speed=0.1, turn_speed=-0.7)
+    given = {"front_sector_deg": 90, "safe_distance": 1.0, "linear_speed": 0.1, "angular_speed": -0.7}
+    assert decode(AvoidanceConfig, given, "brain.") == config
     assert tuple(decide(one_reading(90, 0.9), config)[0]) == (0.0, -0.7)
     assert tuple(decide(one_reading(91, 0.9), config)[0]) == (0.1, 0.0)
 
