@@ -1,6 +1,8 @@
 """Messages: made of arrays, read back from either byte order, refused where they are something else."""
 
 import re
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -130,3 +132,16 @@ def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
     first, second = header_stamps([decode(SCAN, message) for message in messages])
     assert first == pytest.approx(observed[0] - 5 * 10**6, abs=100)
     assert second == observed[1] + 1
+
+
+def test_the_ament_package_lists_every_message_and_what_they_depend_on() -> None:
+    folder = Path(types.__file__).parent
+    messages = {f"msg/{path.name}": path.read_text(encoding="utf-8") for path in (folder / "msg").glob("*.msg")}
+    cmake = (folder / "CMakeLists.txt").read_text(encoding="utf-8")
+    assert set(re.findall(r'"(msg/.*)"', cmake)) == set(messages)
+    used = {package for text in messages.values() for package in re.findall(r"^(\w+)/\w+ ", text, re.MULTILINE)}
+    package = ElementTree.parse(folder / "package.xml")
+    assert {one.text for one in package.iterfind("depend")} == used
+    assert re.search(r"^  DEPENDENCIES (.*)$", cmake, re.MULTILINE)[1].split() == sorted(used)  # type: ignore[index]
+    assert used <= set(re.findall(r"find_package\((\w+) REQUIRED\)", cmake))
+    assert package.findtext("name") == types.INTERFACES
