@@ -19,7 +19,6 @@ from bhd_lerobot.policies.language.instruction import (
     instructions_for,
     parse,
 )
-from bhd_lerobot.policies.language.lexicon import CHINESE, ENGLISH, Relation
 from bhd_lerobot.policies.manipulation.skills import Plan, Planner, SceneObject, Skill
 from tests.cases import each_case
 
@@ -174,13 +173,6 @@ def test_every_colour_and_kind_has_words_in_both_languages(colour: str, kind: st
     assert describe(one) == f"{colour} {kind}"
 
 
-def test_names_are_those_that_people_use() -> None:
-    assert chinese(SCENE[RED_CUP]) == "红色杯子"
-    assert chinese(SCENE[BIG_BOX]) == "蓝色盒子"
-    for language in (ENGLISH, CHINESE):
-        assert set(language.names) >= {*COLOURS, *KINDS, *Relation}
-
-
 @pytest.mark.law
 @each_case(
     ("instruction", "message"),
@@ -211,6 +203,13 @@ def test_names_are_those_that_people_use() -> None:
         ("赤いカップを取って", "not understood"),
         ("hand me the second biggest box", "Unknown colour or property 'second'"),
         ("拿起杯子里的东西", "Unknown: '里'"),
+        ("pick up the pink cup", "Unknown colour or property 'pink'. Known: red, green, blue, yellow"),
+        ("pick up the non-red cup", "Unknown colour or property 'non-red'"),
+        ("pick up the re\u0338d cup", "Unknown"),
+        ("hand me the spoon", "Unknown thing 'spoon'. Known: cup, box."),
+        ("throw the red cup", "Unknown action 'throw'. Known: pick up, lift"),
+        ("拿起大红色的杯子", "Unknown colour or property '大红色'. Known: 红色, 绿色"),
+        ("给我红茶杯", "'红茶'"),
         ("", "The instruction is empty"),
         (None, "The instruction is None; it must be text"),
         (b"pick up the red cup", "it must be text"),
@@ -219,24 +218,6 @@ def test_names_are_those_that_people_use() -> None:
 )
 def test_what_could_be_misread_is_refused(instruction: Any, message: str) -> None:
     assert message in refusal(instruction)
-
-
-@each_case(
-    ("instruction", "unknown", "known"),
-    [
-        ("pick up the pink cup", "Unknown colour or property 'pink'", "red, green, blue, yellow"),
-        ("pick up the non-red cup", "Unknown colour or property 'non-red'", "red, green"),
-        ("pick up the re\u0338d cup", "Unknown", ""),
-        ("hand me the spoon", "Unknown thing 'spoon'", "Known: cup, box."),
-        ("throw the red cup", "Unknown action 'throw'", "pick up, lift"),
-        ("拿起大红色的杯子", "Unknown colour or property '大红色'", "红色, 绿色"),
-        ("给我红茶杯", "'红茶'", ""),
-    ],
-)
-def test_an_unknown_word_is_named_with_the_known_ones(instruction: str, unknown: str, known: str) -> None:
-    message = refusal(instruction)
-    assert unknown in message
-    assert known in message
 
 
 def test_nothing_fits() -> None:

@@ -98,6 +98,12 @@ class Table:
             return command
         return None
 
+    def grasp(self, opening: float) -> None:
+        """Go down and close on what has this width [m]."""
+        for _ in range(3):
+            self.end() if self.given else self.frame()
+        self.opening = opening
+
     def end(self, success: bool = True, message: str = "") -> BrainCommand | None:
         code = ResultCode.SUCCEEDED if success else ResultCode.PATH_TOLERANCE
         return self.frame(CommandResult(self.given[-1].task_id, success, code, message))
@@ -211,10 +217,7 @@ def test_a_camera_that_freezes_later_is_noticed_before_the_tool_goes_down_again(
     """After the image above the object, or after that of the second look; what is grasped first is missed."""
     table = Table(BOTH, BOTH)
     table.freezes_after = shown
-    table.frame()
-    table.end()
-    table.end()
-    table.opening = 0.0
+    table.grasp(0.0)
     while table.end() is not None:
         pass
     assert table.steps == ["above", "down", "close", "back", "home", "above"][: 5 + (last == "above")]
@@ -233,10 +236,7 @@ def test_an_arm_that_did_not_move_says_nothing_of_its_camera() -> None:
 
 def test_an_arm_that_does_not_get_out_of_the_way_is_not_looked_past() -> None:
     table = Table(BOTH, BOTH)
-    table.frame()
-    table.end()
-    table.end()
-    table.opening = 0.0
+    table.grasp(0.0)
     table.end()
     table.end()
     assert table.steps[-1] == "home"
@@ -249,10 +249,7 @@ def test_an_arm_that_does_not_get_out_of_the_way_is_not_looked_past() -> None:
 def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     """The object stands elsewhere the second time, and under another number."""
     table = Table(BOTH, (seen(BOX, 0), seen(CUP, 1, off=0.05)))
-    table.frame()
-    table.end()
-    table.end()
-    table.opening = 0.0  # closed on nothing
+    table.grasp(0.0)  # closed on nothing
     assert table.end() is not None
     assert table.steps[-1] == "back"
     home = table.end()
@@ -275,10 +272,7 @@ def test_after_a_miss_it_goes_home_and_looks_again() -> None:
 
 def test_what_slips_out_while_it_is_lifted_is_noticed_by_the_fingers() -> None:
     table = Table(BOTH)
-    table.frame()
-    table.end()
-    table.end()
-    table.opening = 2 * CUP.size_x
+    table.grasp(2 * CUP.size_x)
     table.end()
     table.opening = 0.0
     table.end()
@@ -335,19 +329,13 @@ def test_a_brain_that_gave_up_looks_no_more() -> None:
     assert table.brain.looks({}).tolist() == [False]
 
 
-@each_case(
-    ("options", "message"),
-    [
+def test_options_that_cannot_be_honoured() -> None:
+    for options, message in (
         ({"max_error_m": 0.0}, "max_error_m is 0.0; it must be positive"),
         ({"max_error_m": float("nan")}, "max_error_m is nan"),
         ({"min_certainty": 1.0}, "min_certainty is 1.0; it must be from 0 to below 1"),
-    ],
-)
-def test_options_that_cannot_be_honoured(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        PerceptionOptions(**options)
-
-
-def test_what_it_does_not_ask_cannot_be_wrong() -> None:
+    ):
+        with pytest.raises(ConfigError, match=message):
+            PerceptionOptions(**options)
     with pytest.raises(ConfigError, match=r"camera_error_m is \[0.01, 0, 0\].*does not use these poses"):
         LanguageBrainConfig(perception=PerceptionOptions("somewhere"), camera_error_m=[0.01, 0, 0])
