@@ -70,25 +70,18 @@ def test_weights_that_are_not_there_are_not_made_up(folder: Path) -> None:
     assert name in refused(folder)
 
 
-def test_a_policy_type_that_is_not_installed(folder: Path) -> None:
+def test_what_a_checkpoint_needs_and_this_machine_has_not(folder: Path) -> None:
+    for device in ("cuda:7", "abacus"):
+        message = refused(folder, device=device)
+        assert device in message
+        assert "--brain.device=cpu" in message
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "type": "telepathy"}))
-    message = refused(folder)
-    assert "'telepathy', which is not installed" in message
-    assert "bhd_mlp" in message
-
-
-def test_an_adapter_without_its_base(folder: Path) -> None:
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "use_peft": True}))
-    assert "Merge it into its base model" in refused(folder)
-
-
-@pytest.mark.parametrize("device", ["cuda:7", "abacus"])
-def test_a_device_that_is_not_there(folder: Path, device: str) -> None:
-    message = refused(folder, device=device)
-    assert device in message
-    assert "--brain.device=cpu" in message
+    for changed, message in (
+        ({"type": "telepathy"}, "'telepathy', which is not installed"),
+        ({"use_peft": True}, "Merge it into its base model"),
+    ):
+        (folder / "config.json").write_text(json.dumps({**config, **changed}))
+        assert message in refused(folder)
 
 
 @each_case(
@@ -182,11 +175,6 @@ def test_an_action_that_is_not_finite_names_where_and_when(folder: Path, blind: 
     assert [part for part in parts if part not in str(error.value)] == []
 
 
-def test_an_empty_path() -> None:
-    with pytest.raises(ConfigError, match=r"brain\.path is empty"):
-        LearnedBrainConfig("")
-
-
 def options(root: Path, brain: str, robot: str = "turtlebot3", task: str = "avoid") -> list[str]:
     return [
         f"--robot.type={robot}",
@@ -221,6 +209,8 @@ def test_a_configuration_is_read_before_its_policy_is_trained(tmp_path: Path) ->
     assert robot_of_brain(later.brain) == ""
     with pytest.raises(ConfigError, match="the folder does not exist"):
         make_brain(later.brain)
+    with pytest.raises(ConfigError, match=r"brain\.path is empty"):
+        LearnedBrainConfig("")
 
 
 def rename_statistics(folder: Path, old: str, new: str, *files: str) -> None:

@@ -62,11 +62,6 @@ def random_scans(n: int, beams: int = 360, seed: int = 0) -> np.ndarray:
 
 
 @each_case("beams", BEAMS)
-def test_it_drives_straight_in_the_open(beams: int) -> None:
-    assert tuple(decide(np.full(beams, 3.5))[0]) == (0.22, 0.0)
-
-
-@each_case("beams", BEAMS)
 def test_it_turns_to_the_free_side(beams: int) -> None:
     open_left = inside_box(beams, front=0.4, back=3.0, left=3.0, right=0.3)
     open_right = inside_box(beams, front=0.4, back=3.0, left=0.3, right=3.0)

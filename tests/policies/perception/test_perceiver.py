@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -73,13 +71,10 @@ def run(looks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_images_and_true_poses_are_all_that_is_loaded(looks: Path, run: Path) -> None:
+def test_it_is_evaluated_by_itself_and_reports_how_well_it_saw(run: Path, tmp_path: Path) -> None:
     saved = json.loads((run / "checkpoints/last/pretrained_model/config.json").read_text())
     assert list(saved["input_features"]) == ["observation.images.scene"]
     assert list(saved["output_features"]) == ["observation.environment_state"]
-
-
-def test_it_is_evaluated_by_itself_and_reports_how_well_it_saw(run: Path, tmp_path: Path) -> None:
     arguments = [
         "--config_path=configs/eval/ur5_look.yaml",
         f"--brain.perception.path={run}",
@@ -143,25 +138,6 @@ def images(value: Any = None, height: int = HEIGHT, width: int = WIDTH, camera: 
 def test_images_that_it_cannot_use(run: Path, given: dict[str, np.ndarray], kind: type, message: str) -> None:
     with pytest.raises(kind, match=message):
         Perceiver(PerceptionOptions(str(run))).look(given, 0)
-
-
-@each_case(
-    ("robot", "message"),
-    [
-        (["--robot.camera=false"], "looks through the camera 'scene', .* There is: none. Set --robot.camera=true"),
-        (
-            ["--robot.camera_width=96", "--robot.camera_height=48"],
-            "images of 96 x 72 px; .* are 96 x 48. Set --robot.camera_width=96 --robot.camera_height=72",
-        ),
-    ],
-)
-def test_an_evaluation_without_the_images_that_it_needs_ends_with_the_remedy(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], robot: list[str], message: str
-) -> None:
-    arguments = ["--config_path=configs/eval/ur5_look.yaml", f"--brain.perception.path={run}", *robot]
-    assert main([*arguments, "--n_episodes=1", f"--output_dir={tmp_path / 'eval'}"]) == 2
-    assert re.search(message, " ".join(capsys.readouterr().err.split()))
-    assert not list((tmp_path / "eval").rglob("report.html"))
 
 
 def test_checkpoints_that_are_none(run: Path, tmp_path: Path) -> None:

@@ -92,3 +92,15 @@ def test_a_clock_that_is_set_makes_nothing_old(step: float, whose: str) -> None:
 def test_stamps_that_stand_still_are_none() -> None:
     clock = ClockOffset()
     assert [clock.measured_ns(5, at) for at in (100, 200, 300)][1:] == [200, 300]
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 0.01, 5.0])
+def test_a_stamp_that_is_far_ahead_of_its_sending_is_of_another_clock(ahead_s: float) -> None:
+    clock = ClockOffset(is_synchronised=True)
+    for number in range(1, 100):
+        sent = (1000 + number) * SECOND // 20
+        stamp = sent + round(ahead_s * SECOND)
+        assert clock.measured_ns(stamp, sent, sent, sent) == sent
+    sent += SECOND // 20
+    late = clock.measured_ns(stamp + SECOND // 1000, sent, sent, sent)
+    assert sent - late == pytest.approx((0.049 if ahead_s == 5 else 0.049 - ahead_s) * SECOND, abs=SECOND // 1000)

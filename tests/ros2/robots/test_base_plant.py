@@ -40,6 +40,17 @@ def reading() -> PlantReading:
     return out
 
 
+def test_nothing_is_commanded_before_commands_are_let_through() -> None:
+    sent: list[np.ndarray] = []
+    plant: Any = make(0)
+    plant.link = SimpleNamespace(write=sent.append)
+    plant.write(FORWARD)
+    assert not sent
+    plant.enable()
+    plant.write(FORWARD)
+    assert len(sent) == 1
+
+
 @pytest.fixture(scope="module")
 def shared() -> Iterator[int]:
     """The domain of a robot that all tests have, which none may end."""

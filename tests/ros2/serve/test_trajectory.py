@@ -58,6 +58,7 @@ def test_joints_are_found_by_name() -> None:
         ([point(1.0, [1.0, 2.0]), point(1.0, [1.0, 2.0])], JOINTS, "do not rise"),
         ([point(-1.0, [1.0, 2.0])], JOINTS, "do not rise"),
         ([point(1.0, [1.0, 2.0], [0.1, 0.0])], JOINTS, r"velocities of the trajectory's last point are \[0.1, 0.0\]"),
+        ([point(1.0, [1.0, 2.0], [-0.1, 0.0])], JOINTS, "trajectory's last point"),
         ([point(1.0, [1.0, 2.0], [0.0])], JOINTS, "point 0 .* 2 velocities, but 1"),
         ([point(1.0, [1.0, 2.0]), point(2.0, [1.0, 2.0], [0.0] * 3)], JOINTS, "point 1 .* 2 velocities, but 3"),
         ([point(1.0, [1.0, 2.0], accelerations=[0.0])], JOINTS, "2 accelerations, but 1"),
