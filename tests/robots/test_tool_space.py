@@ -241,7 +241,9 @@ def test_after_refusals_the_first_pose_has_to_be_near_to_the_tool() -> None:
     assert answer(0.15 - 0.09) == (Reason.ACCEPTED, "")
     assert answer(0.15 + 0.09) == (Reason.ACCEPTED, "")
     assert answer(0.15, x=3.0)[0] == Reason.NO_POSTURE
-    start(simulation)  # another episode
+    start(simulation)  # another episode: in it nothing was refused yet
+    assert answer(0.15) == (Reason.ACCEPTED, "")
+    start(simulation)
     for frame in range(1, 8):  # 1 m/s, from rest
         ahead = max(ahead, home[0, 1] + 0.04 * frame - simulation.truth().tool_pose[0, 1])
         reason, _ = answer(0.04 * frame, x=3.0 * (frame == 6))
