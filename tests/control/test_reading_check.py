@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.control.reading_check import ReadingCheck
 
 HZ = 500
@@ -78,6 +78,16 @@ def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float, 
     reading.position[:] = where + 1.0
     assert check.wrong_positions(reading, 200 * PERIOD) is None
     assert not check.problem
+
+
+def test_a_robot_in_a_stop_of_its_own_may_be_moved() -> None:
+    check, reading = made()
+    assert check.wrong_positions(reading, 0) is None
+    reading.safety[0] = SafetyStatus.STOPPED
+    reading.position[0] += 0.5
+    assert check.wrong_positions(reading, PERIOD) is None
+    reading.safety[0] = SafetyStatus.NORMAL
+    assert check.wrong_positions(reading, 2 * PERIOD) is None
 
 
 def test_wheels_have_no_end_and_no_jumps() -> None:

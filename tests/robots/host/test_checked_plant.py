@@ -21,6 +21,7 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
+from tests.control.support import wheel_speeds
 
 START = np.array([3.0, -1.4, 1.5, -1.6, -1.5, 0.2, 0.04])
 FIRST = np.zeros(1, np.intp)
@@ -331,6 +332,39 @@ def test_a_base_observes_what_its_plant_measures() -> None:
     plant.sensors[3] = np.inf
     base.step(None)
     assert base.modes[0] == Mode.FAULT
+
+
+class Twisted(Perfect):
+    """A base whose own controller turns twists into wheel speeds."""
+
+    takes = "twist"
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        self.written.append(ctrl[0].copy())
+        self.position = self.position + wheel_speeds(ctrl)[0] / 200
+
+    def read(self, out: PlantReading) -> None:
+        super().read(out)
+        out.velocity[:] = wheel_speeds(np.array(self.written[-1:] or [[0.0, 0.0]]))
+
+
+def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> None:
+    plant = Twisted(sensors=36, start=[0.0, 0.0])
+    checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(TurtleBot3Config(beams=36), checked)
+    checked.prepare(base.cerebellum.reading)
+    plant.time = lambda: base.bridge.now_ns
+    base.reset(FIRST, [None], [0])
+    for action in ([0.1, 0.5], [9.0, 0.0], [-9.0, 9.0]):
+        for _ in range(20):
+            base.step(np.array([action]))
+            assert plant.written[-1].tolist() == base.cerebellum.command[0].tolist()
+    written, limits = np.array(plant.written), base.body.limits
+    assert (np.abs(written).max(axis=0) <= np.array(limits.velocity) + 1e-9).all()
+    most = np.array(limits.acceleration) / 200
+    assert (np.abs(np.diff(written, axis=0)).max(axis=0) <= most + 1e-12).all()
+    assert base.observe().state[0, :2].tolist() == pytest.approx(written[-1].tolist())
+    assert base.modes[0] == Mode.TRACKING
 
 
 def test_what_a_robot_does_not_measure_a_person_judges() -> None:
