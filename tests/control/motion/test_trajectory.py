@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.motion.line import ToolLimits, along_line
+from bhd_lerobot.control.motion import line as line_module
+from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
 from bhd_lerobot.control.motion.trajectory import (
     MotionLimits,
@@ -242,6 +243,21 @@ def test_a_line_keeps_the_jerk_of_joints_that_must_move_gently() -> None:
             made += 1
             assert excess(State.at_rest(HOME[:6]), answer, gentle) < 1e-9
     assert made > 6
+
+
+def test_a_line_takes_as_many_poses_as_it_needs_to_be_straight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_module, "_STEP", 1.0)
+    monkeypatch.setattr(line_module, "_TURN", 10.0)
+    line = Line(TOOL, moved(0.05, 0.25, 0.1, 1.0).matrix())
+    tools = KINEMATICS.tool(planned(along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).position)
+    way = (line.goal - line.start)[:3, 3] / line.length
+    beside = tools[:, :3, 3] - TOOL[:3, 3]
+    assert np.linalg.norm(beside - np.outer(beside @ way, way), axis=1).max() < 5e-5
+    # Where no number of poses suffices, the line is refused.
+    monkeypatch.setattr(line_module, "_DEVIATION", 0.0)
+    answer = along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
+    assert isinstance(answer, PlanFailure)
+    assert answer.code == ResultCode.SINGULAR
 
 
 def test_a_slow_line_keeps_the_speed_of_the_tool() -> None:

@@ -370,6 +370,23 @@ def test_an_action_that_waits_behind_a_blocked_call_is_not_sent_after_the_fault(
     assert {row[0] for row in sent(tmp_path)} == {1.0}
 
 
+def test_after_a_hold_a_base_speeds_up_from_rest(tmp_path: Path) -> None:
+    host, robot = base(tmp_path, GateConfig(max_change={"x.vel": 0.1}, brain_timeout_s=0.06))
+    with closing(host):
+        start(host)
+        for _ in range(5):
+            host.observe()
+            host.step(np.array([[0.5, 0.0]]))
+        until(lambda: robot.rows[-1][0] == 0.0, "it is held")
+        host.observe()
+        host.step(np.array([[0.5, 0.0]]))
+        host.stop(ONLY)
+    speeds = [row[0] for row in robot.rows]
+    # On a busy machine it may have been held more than once.
+    assert 0.0 in speeds[1:]
+    assert max(after - before for before, after in itertools.pairwise(speeds)) == pytest.approx(0.1)
+
+
 def test_a_robot_may_use_the_array_of_an_image_again(tmp_path: Path) -> None:
     class Reusing(MockArm):
         image = np.zeros((48, 64, 3), np.uint8)
