@@ -1,5 +1,6 @@
 """Another package's robot on an absolute grid: what it is sent, what is reported, and what can go wrong with it."""
 
+import itertools
 import re
 import time
 from contextlib import closing
