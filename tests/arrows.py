@@ -65,6 +65,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "ros2.serve": (
         *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
         *("robots", "robots.host", "ros2.live", "ros2.messages"),
+        "sim.description",
     ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
     "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),

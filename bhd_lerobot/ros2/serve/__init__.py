@@ -1,3 +1,15 @@
 """A robot of ours, on the wall clock, as a ROS 2 robot."""
 
-__all__ = ["arm", "base", "extras", "foxglove", "goals", "interface", "paths", "serve", "server", "trajectory"]
+__all__ = [
+    "arm",
+    "base",
+    "description",
+    "extras",
+    "foxglove",
+    "goals",
+    "interface",
+    "paths",
+    "serve",
+    "server",
+    "trajectory",
+]

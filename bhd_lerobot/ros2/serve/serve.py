@@ -19,12 +19,14 @@ from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
 from bhd_lerobot.ros2.serve.base import BaseTopics
+from bhd_lerobot.ros2.serve.description import publish_description
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
+from bhd_lerobot.sim.description import parts_of
 
 
 @dataclass
@@ -139,6 +141,8 @@ def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> l
     else:
         interface = InterfaceTopics(host, node, counts, config.state_hz, goals)
         parts = [interface, BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
+    if view.joints:
+        publish_description(node, config.robot.type, view, parts_of(host.body))
     if host.camera_shapes:
         parts.append(CameraTopics(host, node, view))
     if config.clock:

@@ -129,6 +129,12 @@ def test_a_command_of_an_absurd_size_gets_its_result_and_others_theirs(base: Sid
         assert (result.task_id, result.success) == (name, False)
 
 
+def test_a_node_that_comes_later_receives_the_description(base: Side) -> None:
+    subscription = base.node.subscription("/robot_description", STRING, LATCHED)
+    [received] = until(subscription.take, "the description comes")
+    assert '<robot name="turtlebot3">' in received.message().data
+
+
 def test_a_node_whose_topic_does_not_fit_is_named(base: Side) -> None:
     misfits = [
         ("of type", base.node.publisher("/cmd_vel", STRING), f"of /cmd_vel in /other is of type {STRING}"),
