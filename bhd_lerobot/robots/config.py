@@ -72,8 +72,8 @@ class BhdRobotConfig(RobotConfig):
             self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
             self.clock = "realtime"
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silent_s)
-            is_default = self.realtime.brain_timeout_s == RealtimeConfig.brain_timeout_s
-            brain_s = self.ros2.timeout_s if is_default else self.realtime.brain_timeout_s
+            brain_s = self.realtime.brain_timeout_s
+            brain_s = self.ros2.timeout_s if brain_s is None else brain_s
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s, brain_timeout_s=brain_s)
         if self.plant:
             self._check_plant()

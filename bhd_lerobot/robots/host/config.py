@@ -20,7 +20,7 @@ class RealtimeConfig:
         freeze_collector: run it without Python's garbage collector.
         affinity: the processors that it may run on; all if empty.
         brain_timeout_s: after so long without a sign of life of the brain's process the robot decelerates and holds
-            [s]. With `plant = "ros2"` the default is `ros2.timeout_s`.
+            [s]; if not set 0.5 s, with `plant = "ros2"` `ros2.timeout_s`.
         recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
@@ -36,7 +36,7 @@ class RealtimeConfig:
     hold_cpu_latency: bool = True
     freeze_collector: bool = True
     affinity: list[int] = field(default_factory=list)
-    brain_timeout_s: float = 0.5
+    brain_timeout_s: float | None = None
     recorder_timeout_s: float = 1.0
     most_misses: int = 10
     most_catch_up: int = 10
@@ -46,9 +46,9 @@ class RealtimeConfig:
 
     def __post_init__(self) -> None:
         for name in ("brain_timeout_s", "recorder_timeout_s", "plant_timeout_s", "buffer_s"):
-            if not 0 < getattr(self, name) < float("inf"):
+            if (value := getattr(self, name)) is not None and not 0 < value < float("inf"):
                 raise ConfigError(
-                    f"robot.realtime.{name} is {getattr(self, name)}; it must be positive and finite. "
+                    f"robot.realtime.{name} is {value}; it must be positive and finite. "
                     "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
                 )
         for name in ("most_misses", "most_catch_up"):
@@ -70,7 +70,7 @@ class RealtimeConfig:
     def limits(self) -> LoopLimits:
         """Return when the loop stops the robot by itself."""
         return LoopLimits(
-            brain_timeout_s=self.brain_timeout_s,
+            brain_timeout_s=LoopLimits.brain_timeout_s if self.brain_timeout_s is None else self.brain_timeout_s,
             recorder_timeout_s=self.recorder_timeout_s,
             plant_timeout_s=self.plant_timeout_s,
             most_misses=self.most_misses,

@@ -267,6 +267,7 @@ def test_a_namespace_and_another_scanner() -> None:
         ({}, 0.2, 0.5),
         ({"ros2": Ros2Config(timeout_s=0.4, silence_s=1.0)}, 0.4, 1.0),
         ({"realtime": RealtimeConfig(brain_timeout_s=20.0)}, 20.0, 0.5),
+        ({"realtime": RealtimeConfig(brain_timeout_s=0.5)}, 0.5, 0.5),
     ],
 )
 def test_the_brain_of_a_ros_robot_is_waited_for_as_long_as_its_commands(
