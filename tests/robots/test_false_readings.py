@@ -256,6 +256,21 @@ def test_efforts_that_are_zero_in_between_leave_the_limit_of_force_as_it_is() ->
     assert lied.cerebellum.controller.force.force.max() < 60.0
 
 
+@pytest.mark.parametrize("rate", [20.0, -100.0])
+def test_efforts_that_drift_move_an_arm_no_further_than_its_positions_confirm(rate: float) -> None:
+    """Nothing presses on it, and its servos are not stretched."""
+
+    def drift(out: PlantReading, seconds: float) -> None:
+        out.effort[:, 1] += rate * seconds
+
+    lied = Lied([0, 1], drift)
+    lied.turn(0.6)
+    lied.cerebellum.estop.press()
+    lied.turn(5.0)
+    assert (lied.moved(Mode.ESTOP) < 0.25).all()
+    assert np.ptp(np.array(lied.true)[-HZ:], axis=0).max() < 1e-3
+
+
 @pytest.mark.parametrize("value", [0.0, np.nan])
 @pytest.mark.parametrize("stop", [Mode.ESTOP, Mode.FAULT])
 def test_an_arm_that_is_stopped_takes_efforts_of_zero_for_none(value: float, stop: Mode) -> None:

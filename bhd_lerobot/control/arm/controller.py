@@ -124,7 +124,7 @@ class ArmController(Controller):
         self._speed = np.asarray(limits.velocity)
         self._bend = 0.9 * WireLimits.of(arm, control_hz).bend[:-1]
         self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
-        self._stamp_ns, self._silent_ticks, self._late_s = 0, 0, np.zeros(n)
+        self._stamp_ns, self._silent_ticks, self._late_s = 0, 0, self._relief.late_s  # the same array
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (

@@ -26,6 +26,7 @@ _PUSHED_RAD = 0.01  # [rad] ahead of its reference, in the direction in which it
 _SLIPS = 0.8  # share of its largest stretch at which a joint is pushed away, whatever its encoder reads
 _SLACK_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
 _SPRINGS_RAD = 0.05  # [rad] farther than to where it was read an arm without efforts does not give way
+_ALONE_RAD, _CONFIRMS = 0.15, 0.25  # [rad] of all joints by efforts alone; the share of them that positions confirm
 _DOUBTFUL_RAD = 1.0  # [rad] of all joints, by which an arm whose encoders are wrong gives way
 _MARGIN_RAD = 0.005  # [rad] so far from the end of its range a joint stays
 
@@ -56,9 +57,12 @@ class ContactRelief:
     goes on is followed for as long as it goes on, a soft one until it is relaxed. A force that stays as it is however
     the arm gives way, such as a load's, stops that; one that changes later begins it anew.
 
-    The torques are those that the motors' efforts are more than the posture needs: what encoders read decides nothing,
-    but the way is bounded if they were found wrong. Of a plant that measures no efforts the torques follow from the
-    positions that were read; the way is bounded more narrowly.
+    The torques are those that the motors' efforts are more than the posture needs. The way is bounded if encoders were
+    found wrong, and more narrowly where positions do not confirm that joints are pushed as efforts report. Of a plant
+    that measures no efforts the torques follow from the positions that were read; the way is bounded as narrowly.
+
+    Attributes:
+        late_s: by how much the servos are late [s], shape (n,).
 
     Args:
         control_hz: ticks a second [Hz].
@@ -79,6 +83,7 @@ class ContactRelief:
         self._level, self._vain = np.zeros(n), np.zeros(n)  # a force that stays as it is [N], and the way since [rad]
         self._stood: NDArray[np.int64] = np.zeros(n, np.int64)  # decisions since it moved last
         self._waited, self._tries = np.zeros(n), np.zeros(n, np.int64)  # for how long [s], and how often tried again
+        self.late_s = np.zeros(n)
         self._kind = np.zeros(n, np.int64)  # what the way of each arm was bounded for: 1 efforts, 2 doubtful, 3 none
         self._room = np.full(n, np.nan)  # so far an arm may still give way of which something is not known [rad]
 
@@ -126,8 +131,14 @@ class ContactRelief:
             (np.abs(off) > _SLACK_RAD).any(axis=1),
         )
         kind = np.where(measured, np.where(sensed.doubtful[ids], 2, 1), 3)
-        bound = np.where(kind == 1, np.inf, np.where(kind == 2, _DOUBTFUL_RAD, np.abs(off).sum(axis=1) + _SPRINGS_RAD))
-        room = np.where(kind == self._kind[ids], self._room[ids], np.fmin(self._room[ids], bound))
+        bound = np.choose(kind - 1, [_ALONE_RAD, _DOUBTFUL_RAD, np.abs(off).sum(axis=1) + _SPRINGS_RAD])
+        same = kind == self._kind[ids]
+        room = np.where(same, self._room[ids], np.fmin(self._room[ids], bound))
+        # What is read is a tick ahead of a moving reference, and behind it by the servos' latency.
+        now = off + velocity[ids, : self._dof] * (1.0 / self._hz - self.late_s[ids, None])
+        confirmed = (kind == 1) & ((now * stretch).sum(axis=1) > _CONFIRMS * (stretch * stretch).sum(axis=1))
+        stands = self._stood[ids] >= _STANDS  # in motion an inertia seems to confirm, too
+        room = np.where((confirmed & stands) | ((kind == 2) & (self._kind[ids] < 2)), bound, room)
         self._kind[ids], self._room[ids] = kind, room
         presses &= room > 0.0
         moving = self._wanted[ids].any(axis=1, keepdims=True)
@@ -145,7 +156,7 @@ class ContactRelief:
         self._stretch[ids] = stretch
         way = np.abs(self._wanted[ids]).sum(axis=1) * self._period / self._hz
         self._vain[ids] += way
-        self._room[ids] -= way
+        self._room[ids] = np.minimum(self._room[ids] + np.where(confirmed, way, -way), bound)
 
     def _presses(self, ids: NDArray[np.intp], off: Array, stretch: Array, sensed: Sensed, velocity: Array) -> Mask:
         """Return the arms on which something presses by their efforts, and is not followed in vain."""
