@@ -11,7 +11,6 @@ from bhd_lerobot.cli.data.edit import parts_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from tests.cases import each_case
 from tests.datasets.edit_support import content, record
 
 
@@ -55,44 +54,6 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
     captured = capsys.readouterr()
     assert json.loads(captured.out)["valid"] is True
     assert captured.err.startswith("fixed meta/stats.json")
-
-
-@each_case(
-    ("arguments", "words"),
-    [
-        (["merge", "R", "--output", "X"], "at least two"),
-        (["merge", "R", "N", "--output", "X"], "does not exist"),
-        (["filter", "R", "--outcome", "sucess", "--output", "X"], "Did you mean 'success'"),
-        (["filter", "R", "--outcome", "stuck", "--output", "X"], "No episode of"),
-        (["filter", "N", "--outcome", "all", "--output", "X"], "does not exist"),
-        (["filter", "R", "--output", "X"], "needs a selection of episodes: --episodes"),
-        (["filter", "R", "--min_score", "2", "--output", "X"], "0 to 1"),
-        (["delete", "R", "--episodes", "9"], "no episode 9"),
-        (["delete", "R", "--episodes", "x"], "names no episode"),
-        (["delete", "R", "--episodes", "5-1"], "runs backwards; write 1-5"),
-        (["delete", "R", "--episodes", "0-99999999999"], "at most 1000000"),
-        (["filter", "R", "--episodes", "0-2,1", "--output", "X"], "Episode 1 is named twice"),
-        (["split", "R", "--parts", "a=1", "--output", "X"], "Write a=1.0 for the share, a=1-1 for the episode"),
-        (["split", "R", "--parts", "a=0.5", "--shuffle_seed", "-1", "--output", "X"], "seeds start at 0"),
-        (["split", "R", "--parts", "a=0.7,b=0.7", "--output", "X"], "at most 1 together"),
-        (["split", "R", "--parts", "a=0.01", "--output", "X"], "would have no episode"),
-        (["split", "R", "--parts", "a,b", "--output", "X"], "not one name and its part"),
-        (["split", "R", "--parts", "../a=0.5", "--output", "X"], "not one name and its part"),
-        (["split", "R", "--parts", "a=0.5,b=3", "--output", "X"], "at most 1 together"),
-        (["split", "R", "--parts", "a=0.5,b=x", "--output", "X"], "no number"),
-        (["mark", "R", "--episodes", "0"], "Give a mark"),
-        (["mark", "R", "--episodes", "0", "--outcome", "good"], "Unknown outcome 'good'"),
-        (["mark", "R", "--episodes", "0", "--intervention", "3..5"], "FIRST-LAST"),
-        (["mark", "R", "--episodes", "0", "--intervention", "3-50"], "not frames of episode 0; valid: 0 to 4"),
-    ],
-)
-def test_bad_input_ends_in_a_message(recorded: Path, tmp_path: Path, capsys, arguments: list[str], words: str) -> None:
-    names = {"R": str(recorded), "X": str(tmp_path / "x"), "N": str(tmp_path / "none")}
-    before = {path: path.stat().st_mtime_ns for path in recorded.rglob("*")}
-    assert main.main([names.get(argument, argument) for argument in arguments]) == 2
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "x").exists()
-    assert {path: path.stat().st_mtime_ns for path in recorded.rglob("*")} == before
 
 
 def test_episode_lists_come_back() -> None:

@@ -1,6 +1,5 @@
 """Export: read by readers that are not ours, and back into a dataset of the same drives."""
 
-import os
 import re
 import shutil
 from collections import defaultdict
@@ -454,27 +453,6 @@ def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_they_are
 def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):
     first, second = (export(turtlebot3, tmp_path / name / "b", "--one_bag") for name in ("x", "y"))
     assert (first / "b.mcap").read_bytes() == (second / "b.mcap").read_bytes()
-
-
-def test_what_cannot_be_exported_is_refused_and_changes_nothing(turtlebot3, tmp_path, capsys):
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "note").write_text("mine")
-    new, inside = tmp_path / "bags", turtlebot3 / "bags"
-    for root, output, arguments, message in (
-        (turtlebot3, new, ["--episodes=7"], "no episode 7 in"),
-        (turtlebot3, new, ["--episodes=3-1"], "runs backwards; write 1-3"),
-        (turtlebot3, new, ["--episodes=a"], "such as 0,3,5-9"),
-        (turtlebot3, new, ["--start_time=-1"], "--start_time is -1"),
-        (turtlebot3, new, ["--start_time=nan"], "--start_time is nan"),
-        (turtlebot3, inside, [], "which must not change"),
-        (turtlebot3, mine, [], "exists already"),
-        (tmp_path / "none", new, [], "none"),
-    ):
-        assert main.main(["export", str(root), f"--output={output}", *arguments]) == 2
-        assert message in capsys.readouterr().err
-        assert not inside.exists()
-        assert (os.listdir(tmp_path), os.listdir(mine)) == (["mine"], ["note"])
 
 
 def test_an_exported_bag_that_was_cut_is_imported_without_the_outcome(turtlebot3, base_bags, tmp_path, capsys):

@@ -448,27 +448,6 @@ def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, dataset, capsy
     assert "--robot=turtlebot3" in capsys.readouterr().err
 
 
-def test_options_that_cannot_be_honoured_are_refused(tmp_path, plain, capsys):
-    for argument, message in (
-        ("--robot=ur5", "Unknown robot 'ur5'"),
-        ("--fps=0", "--fps is 0"),
-        ("--beams=7", "it must divide 360"),
-        ("--stamps=mine", "Unknown stamps 'mine'"),
-        ("--outcome=winning", "Unknown outcome 'winning'"),
-        ("--max_gap=0.1", "--max_gap is 0.1"),
-        ("--max_gap=nan", "--max_gap is nan"),
-        ("--max_age=-1", "--max_age is -1"),
-        ("--command_timeout=0", "--command_timeout is 0"),
-        ("--min_episode_s=inf", "--min_episode_s is inf"),
-        ("--min_episode_s=100", "No episode of 100 s or more"),
-        ("--camera=front", "NAME=TOPIC"),
-        ("--camera=front=/nothing", "no topic /nothing"),
-        ("--scan_yaw=nan", "--scan_yaw is nan"),
-        ("--task=", "Describe the robot's task"),
-    ):
-        assert message in refused(plain, tmp_path / "d", capsys, argument), argument
-
-
 def test_an_existing_dataset_stays_and_a_refused_import_leaves_none(tmp_path, plain, capsys):
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "mine").write_text("x")

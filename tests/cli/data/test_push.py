@@ -124,48 +124,6 @@ def test_images_of_cameras_and_of_curves(hub: FakeHub, lesson: Path, tmp_path: P
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
 
 
-BAD_ARGUMENTS = [
-    (["push"], "Give the target"),
-    (["push", "ROOT"], "Give the target"),
-    (["push", "ROOT", "me"], "neither a name on the Hub"),
-    (["push", "ROOT", "me/a", "me/b"], "Unexpected argument: me/b"),
-    (["push", "ROOT", "s3://b/d", "--tag=x"], "is a URL"),
-    (["push", "ROOT", "me/a", "--storage_options={}"], "is for URLs"),
-    (["push", "ROOT", "memory://b/d", "--storage_options=[1]"], "give a JSON object"),
-    (["push", "ROOT", "memory://b/d", "--storage_options={"], "is not JSON"),
-    (["push", "memory://b/d"], "Name the folder"),
-    (["push", "nowhere", "me/a"], "does not exist"),
-    (["push", "", "me/a"], "A name is empty"),
-    (["push", "ROOT", "me/a", "--tag="], "--tag is empty"),
-    (["push", "a\0b", "me/a"], "cannot be the folder"),
-    (["push", "~nobodyatall/d", "me/a"], "cannot be the folder"),
-    (["push", "ROOT", "ftp://"], "names no folder"),
-    (["pull"], "Give one source"),
-    (["pull", "me/a", "--repo_id=me/b"], "Give one source"),
-    (["pull", "memory://b/d"], "Give the target"),
-    (["pull", "memory://b/d", "--root=x", "--revision=main"], "has no revisions"),
-    (["pull", "me/a", "--root=x", "--episodes=all"], "such as 0,3,5-9"),
-    (["pull", "me/a", "--root=x", "--outcome=good"], "Unknown outcome 'good'"),
-    (["pull", "me/a", "--root=x", "--min_score=2"], "from 0 to 1"),
-    (["pull", "me/a", "--root="], "--root is empty"),
-    (["pull", ""], "A name is empty"),
-    (["pull", "me/a", "--root=a\0b"], "cannot be the folder"),
-    (["pull", "me/a", f"--root={'x' * 5000}"], "File name too long"),
-    (["pull", "memory://b/d", "--root=x", "--episodes=1"], "only whole datasets"),
-]
-
-
-@pytest.mark.usefixtures("hub")
-def test_bad_arguments_are_refused_and_change_nothing(lesson: Path, empty: Path, capsys) -> None:
-    for arguments, message in BAD_ARGUMENTS:
-        assert main.main([str(lesson) if word == "ROOT" else word for word in arguments]) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: "), arguments
-        assert message in error, arguments
-        assert "\0" not in error
-        assert list(empty.iterdir()) == []
-
-
 def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     hub.expired.add("hf_me")
     assert main.main(["push", str(lesson), "me/d", "--branch=b", "--private", "--tags=a b,c"]) == 2

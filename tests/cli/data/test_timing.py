@@ -186,29 +186,3 @@ def test_a_dataset_of_another_program(tmp_path, capsys):
     capsys.readouterr()
     assert main.main(["timing", str(tmp_path / "d")]) == 2
     assert "another program recorded it" in capsys.readouterr().err
-
-
-def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("not a dataset")
-    (tmp_path / "folder").mkdir()
-    save(tmp_path / "empty", [])
-    before = sorted(tmp_path.rglob("*"))
-    for arguments, words in (
-        (["none"], "does not exist"),
-        (["file"], "file is not a LeRobot dataset"),
-        (["folder"], "has no meta/info.json"),
-        (["empty"], "holds no episode yet"),
-        (["empty", "--episode", "0"], "no episode 0"),
-        ([str(measured), "--episode", "3"], "no episode 3 in"),
-        ([str(measured), "--episode", "-1"], "from 0 to 2"),
-        ([str(measured), "--output", "t.txt"], ".png, .pdf, .svg"),
-        ([str(measured), "--output", "file/t.png"], "cannot be written"),
-    ):
-        assert main.main(["timing", *arguments]) == 2
-        assert words in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before
-    for arguments in ([], ["d", "--episode", "one"]):
-        with pytest.raises(SystemExit) as stop:
-            main.main(["timing", *arguments])
-        assert stop.value.code == 2

@@ -55,7 +55,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"outcome": ["collision", "timeout"]}, [2, 3]),
         ({"min_score": 0.5}, [4]),
         ({"outcome": "all", "min_score": 0.25}, [1, 2, 3, 4]),
-        ({"outcome": "all", "exclude_late": True}, [0, 1, 3, 4]),  # a tenth of ten frames may be late
+        ({"outcome": "all", "exclude_late": True}, [0, 1, 3, 4]),
     ],
 )
 def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, Any], wanted: list[int]) -> None:
