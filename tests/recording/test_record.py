@@ -36,10 +36,10 @@ ARM = {"robot__type": "ur5", "brain__type": "language", "task__type": "pick", "r
 
 def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
     reference = None
-    for n_envs, threads in ((1, 1), (7, 2), (12, 2)):
+    for n_envs, threads in ((1, 1), (7, 2)):
         root = tmp_path / f"n{n_envs}"
         # 9 episodes on 7 simulations: two of them start when others end, in the middle of the run.
-        run_record(root, n_envs=n_envs, threads=threads, dataset__num_episodes=9, seed=5, robot__beams=360)
+        run_record(root, n_envs=n_envs, threads=threads, dataset__num_episodes=9, seed=5)
         table = pq.read_table(root / "data").drop_columns(["task_index"])
         content = {name: table[name].combine_chunks() for name in table.column_names}
         rows = episode_rows(root)
@@ -143,16 +143,16 @@ def test_resume_refuses_another_recording_and_shows_the_difference(recorded):
 
 
 def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
-    many = {"dataset__num_episodes": 20, "n_envs": 2, "seed": 1}
+    many = {"dataset__num_episodes": 10, "dataset__episode_time_s": 2, "n_envs": 2, "seed": 1}
     run_record(tmp_path / "whole", **many)
     generator = random.Random(1)
     root = tmp_path / "killed"
-    for wanted in (1, 13):
+    for wanted in (1, 6):
         process = start(root, wanted, resume="true", **many)
         time.sleep(generator.random() * 0.05)
         process.kill()
     result, _ = run_record(root, resume="true", **many)
-    assert result.episodes == 20
+    assert result.episodes == 10
     assert data_columns(root) == data_columns(tmp_path / "whole")
     assert dataset_info(root).compact
 

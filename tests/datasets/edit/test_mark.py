@@ -10,6 +10,8 @@ from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.edit.edits import edits_of
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.loader.selection import frame_weights
+from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
@@ -95,6 +97,9 @@ def test_recorded_interventions_keep_their_reasons(tmp_path: Path) -> None:
     assert metadata["interventions"] == '[[2, 4, "no progress"], [6, 8, "marked afterwards"]]'
     assert metadata["intervened_frames"] == 4
     assert stack(root, "event")[LENGTH : 2 * LENGTH].tolist() == [0, 0, 5, 5, 0, 0, 5, 4]
+    weights = frame_weights(open_metadata(root), [1], learner=0.0)
+    assert weights is not None
+    assert weights.tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
     mark(root, [1], clear_interventions=True)
     metadata = dataset_info(root).episodes[1].metadata
     assert (metadata["interventions"], metadata["intervened_frames"]) == ("[]", 0)

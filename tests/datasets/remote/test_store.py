@@ -201,7 +201,8 @@ def test_episodes_that_were_deleted_before_the_copy_excuse_nothing(root: Path, t
     assert content(tmp_path / "e") == content(longer)
 
 
-@pytest.mark.parametrize("place", ["", "there/d/"])
+@pytest.mark.thorough(but=1)
+@pytest.mark.parametrize("place", ["there/d/", ""])
 def test_the_folders_of_a_console_are_no_files(
     root: Path, s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:

@@ -202,6 +202,19 @@ def test_damaged_numbers_are_found(valid: Path, tmp_path: Path) -> None:
         assert {one.check for one in bad(found)} <= ({check, "stats", "limits"} if severity else set())
 
 
+def test_a_number_that_rests_at_an_end_of_its_range_is_no_broken_sensor(valid: Path, tmp_path: Path) -> None:
+    """It may be clipped there."""
+    root = copy(valid, tmp_path)
+    for value in (-2.0, 2.0):
+
+        def rest(rows: dict[str, Any], value: float = value) -> None:
+            for row in range(length(0), length(0) + length(1)):
+                rows["observation.state"][row][0] = value
+
+        edit(data_file(root), rest)
+        assert not [one for one in check_dataset(root).findings if one.check == "frozen"]
+
+
 def test_a_column_with_gaps_is_found_and_the_rest_is_checked(valid: Path, tmp_path: Path) -> None:
     def gap(rows: dict[str, Any]) -> None:
         rows["observation.state"][3] = None

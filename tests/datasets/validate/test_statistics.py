@@ -207,6 +207,8 @@ def test_no_edit_passes_on_a_deviation_that_cannot_be(tmp_path: Path, change: An
 def test_a_true_deviation_is_possible(values: np.ndarray) -> None:
     (stats,) = column_stats({"action": values}).values()
     assert are_possible(stats).all()
+    span = stats["max"] - stats["min"]
+    assert (are_possible({**stats, "std": 0.51 * span}) == (span == 0)).all()
 
 
 def test_a_training_does_not_divide_by_zero(tmp_path: Path) -> None:
