@@ -373,6 +373,29 @@ def test_a_lost_file_costs_its_own_episodes_only(sessions: Path, tmp_path: Path,
     assert_valid(root)
 
 
+def test_a_video_that_was_being_moved_is_taken_from_the_folder_for_temporary_files(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless it is another user's, for that folder is everybody's."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    for owner in (os.getuid(), *([65534] if not os.getuid() else [])):
+        root = recorded(tmp_path / f"d{owner}", "video", 3, "saved")
+        video = next(root.glob("videos/*/*/*.mp4"))
+        shutil.copy(video, tmp_path / "whole.mp4")
+        os.chown(tmp_path / "whole.mp4", owner, -1)
+        os.truncate(video, video.stat().st_size - 120)
+        assert (repair(root).episodes == 3) == (owner == os.getuid())
+
+
+def test_what_the_video_behind_a_torn_one_shows_is_not_guessed(sessions: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(sessions, tmp_path / "d")
+    shutil.rmtree(root / "meta/episodes")
+    video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    os.truncate(video, video.stat().st_size - 120)
+    repair(root)
+    assert numbers(root) in ([0], [0, 1])
+
+
 def test_a_video_with_unused_frames_is_valid(sessions: Path, tmp_path: Path) -> None:
     """LeRobot reads where the rows say; a video may hold more."""
     root = shutil.copytree(sessions, tmp_path / "d")
