@@ -164,13 +164,6 @@ def test_a_folder_in_use_or_a_file_in_its_place_is_refused_and_nothing_changes(s
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
 
-def test_unknown_options_end_with_status_2(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["--steps=3"])
-    assert ended.value.code == 2
-    assert "--steps" in capsys.readouterr().err
-
-
 def test_a_signal_in_a_step_ends_the_demo_with_its_status(small, tmp_path, monkeypatch, capsys):
     stop = StopRequest()
     stop.signal = signal.SIGTERM

@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +23,8 @@ from bhd_lerobot.hub.card import CardOptions, make_card
 from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.report import print_summary
 from bhd_lerobot.registry import make_brain
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.signals import StopRequest
 from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
 
@@ -209,19 +206,6 @@ def test_the_run_folder_has_the_resolved_configuration_and_an_image(recorded):
     assert (folder / "trajectories.png").is_file()
     for part in (f"{result.successes} of 3", "mean score", "real time", "trajectories.png"):
         assert part in text
-
-
-def test_late_frames_and_what_becomes_of_dropped_episodes_are_said(recorded, tmp_path):
-    _, result, _ = recorded
-    stopped = StopRequest()
-    stopped.signal = signal.SIGINT
-    for clock, again in (("realtime", "recorded anew"), ("lockstep", "repeated identically")):
-        console = Console(file=io.StringIO(), width=200)
-        config = parse(RecordConfig, options(tmp_path / "d", robot__clock=clock))
-        print_summary(console, config, replace(result, late=result.frames // 4, stopped_by=stopped), False)
-        printed = console.file.getvalue()
-        assert again in printed
-        assert f"{result.frames // 4} frames, {100 * (result.frames // 4) / result.frames:.1f} %" in printed
 
 
 def test_the_video_is_made_where_images_can_be_rendered(tmp_path):

@@ -129,22 +129,6 @@ def test_an_arm_is_shown_completely_in_24_lines() -> None:
     assert [line.split()[0] for line in printed[-4:-1]] == ["limits", "watchdogs", "refused"]
 
 
-def test_nothing_jumps_when_numbers_change() -> None:
-    def places(shown: MonitorState) -> list[list[int]]:
-        """Return where the labels stand."""
-        labels = ("control", "executed", "overruns", "skipped", "p99", "queue", "command age", "observation age")
-        labels += ("brain", "cerebellum", "recorder ", "plant", "applied", "limits", "loop", "episode", "refused")
-        return [
-            [n, line.find(label)] for label in labels for n, line in enumerate(lines(shown, 80, 24)) if label in line
-        ]
-
-    usual = places(state())
-    assert usual == places(state(control_rate=None, frame_rate=9.0, command_rate=None, executed=1, overruns=99999))
-    assert usual == places(state(command_age=None, observation_age=0.1234, mode="HOLD", phase="STANDING"))
-    assert usual == places(state(alive={"brain": 12.34, "cerebellum": 0.12, "recorder": 99e-6, "plant": 0.999}))
-    assert usual == places(state(limits={"VELOCITY": Count(12, 0.5)}, refusals={"STALE": 3}, episode_time=None))
-
-
 def text(shown: MonitorState, **options: Any) -> str:
     return "\n".join(lines(shown, 80, 24, **options))
 

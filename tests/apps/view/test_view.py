@@ -227,16 +227,6 @@ def test_no_file_of_the_page_is_left_out_of_the_package() -> None:
     assert (found.returncode, found.stdout) == (1, ""), found.stderr
 
 
-def test_every_file_of_the_page_is_served_as_what_it_is(base_server) -> None:
-    kinds = {".js": "javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-    for path in STATIC.rglob("*.*"):
-        if path.suffix in kinds:
-            status, headers, content = base_server.ask(f"/static/{path.relative_to(STATIC).as_posix()}")
-            assert status == 200
-            assert kinds[path.suffix] in headers["content-type"]
-            assert content == path.read_bytes()
-
-
 # -- changes -----------------------------------------------------------------------------------------------------------
 
 

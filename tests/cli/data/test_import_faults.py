@@ -105,40 +105,13 @@ def test_a_topic_of_two_types_matters_only_if_it_is_read(tmp_path, capsys):
     assert "std_msgs/msg/Header" in error
 
 
-def test_other_commands_and_other_publishers_are_reported(tmp_path, messages, capsys, plain):
+def test_commands_on_other_topics_are_reported(tmp_path, messages, capsys, plain):
     imported(plain, tmp_path / "a")
     assert "/cmd_vel" not in capsys.readouterr().err
     more = [("/cmd_vel_nav", at, message) for topic, at, message in messages if topic == "/cmd_vel"]
     imported(write(tmp_path / "two_topics", sorted([*messages, *more], key=lambda one: one[1])), tmp_path / "b")
     error = capsys.readouterr().err
     assert "commands on other topics, too: /cmd_vel_nav (40). The action is of /cmd_vel alone (40)" in error
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-
-    def profile(depth):
-        times = QosTime(0, 0)
-        return Qos(
-            QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, QosDurability.VOLATILE, times, times,
-            QosLiveliness.AUTOMATIC, times, False,
-        )  # fmt: skip
-
-    for name, offered, note in (
-        ("profiles", [[profile(1), profile(10)]], "/cmd_vel had 2 publishers when the recording began. Which of them"),
-        ("connections", [[profile(1)], [profile(10)]], "/cmd_vel has messages of 2 connections (20 and 20)"),
-    ):
-        with Writer(tmp_path / name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            known, count = {}, 0
-            for topic, received, message in messages:
-                kind = message.__msgtype__
-                count += topic == "/cmd_vel"
-                key = topic, count % len(offered) if topic == "/cmd_vel" else 0
-                if key not in known:
-                    profiles = offered[key[1]] if topic == "/cmd_vel" else [profile(5)]
-                    known[key] = writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=profiles)
-                writer.write(known[key], received, STORE.serialize_cdr(message, kind))
-        imported(tmp_path / name, tmp_path / f"d_{name}")
-        assert note in capsys.readouterr().err
-        ours, theirs = read_episode(tmp_path / "a", 0), read_episode(tmp_path / f"d_{name}", 0)
-        assert np.array_equal(ours["action"], theirs["action"])
 
 
 def reset_odometry(at, *, dx=0.0, turn=0.0):

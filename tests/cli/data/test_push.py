@@ -21,7 +21,6 @@ from bhd_lerobot.datasets.remote.push import is_generated
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
-from bhd_lerobot.hub.transfer import repeat_line
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.hub import FakeHub, Fault, real_client
 from tests.forks import Fork
@@ -261,27 +260,3 @@ def test_a_name_that_could_be_a_folder_gets_a_warning(hub: FakeHub, lesson: Path
     shutil.copytree(lesson, empty / "me" / "d")
     assert main.main(["push", "me/d", "me/d"]) == 0  # the dataset itself: nobody means to copy it onto itself
     assert "is taken for" not in capsys.readouterr().err
-
-
-def test_the_command_to_repeat_has_all_options(tmp_path: Path) -> None:
-    parser = main._parser()
-    for words in (
-        "push A me/d --branch=b --tag=t --private --tags=a,b --licence=mit --no-card --replace",
-        "push --root=A --repo_id=me/d --public",
-        "push A s3://b/d --replace --no_card --storage_options={}",
-        "pull me/d --root=A --revision=r --episodes=0,2-4 --outcome=success --min_score=0.5 --replace",
-        "pull --repo_id=me/d --root=A",
-        "pull s3://b/d --root=A --storage_options={}",
-        "pull me/d --root=A --min_score=0",
-    ):
-        options = parser.parse_args(words.split())
-        source = options.repo_id or (options.places[1] if options.command == "push" else options.source)
-        places = {"root": "A"} if options.command == "pull" else {}
-        line = repeat_line(options, *([] if places else ["A"]), source, **places)
-        again = vars(parser.parse_args(shlex.split(line)[1:]))
-        ways = ("places", "root", "repo_id", "source")
-        assert {k: v for k, v in again.items() if k not in ways} == {
-            k: v for k, v in vars(options).items() if k not in ways
-        }
-        assert again.get("places", [again.get("source"), again["root"]]) in (["A", source], [source, "A"])
-    assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"

@@ -64,14 +64,6 @@ def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, A
     assert chosen == [episode for episode in wanted if episode >= 2]
 
 
-def test_no_episode_left_says_what_there_is(plain: Path) -> None:
-    meta = open_metadata(plain)
-    with pytest.raises(DatasetError, match="filtering by outcome stuck; it has 5 episodes: 3 success, 1 coll"):
-        EpisodeFilter("stuck").select(meta)
-    with pytest.raises(DatasetError, match=r"and a score of at least 0\.9; it has 2"):
-        EpisodeFilter("success", min_score=0.9).select(meta, [0, 1])
-
-
 def test_filters_of_what_was_not_recorded(foreign: Path) -> None:
     meta = open_metadata(foreign)
     with pytest.raises(DatasetError, match=r"has no bhd/outcome .* another program .* outcome 'all'"):

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
@@ -230,17 +229,6 @@ def test_leftovers_of_edits_and_recordings_are_distinguished(recorded: Path, tmp
     assert content(edited) == content(recorded)
 
 
-def test_only_a_recorder_is_advised_to_use_another_root(tmp_path: Path, capsys) -> None:
-    with support.create(tmp_path / "d") as recorder:
-        support.record(recorder)
-        assert main.main(["repair", str(tmp_path / "d")]) == 2
-        message = capsys.readouterr().err
-        assert "Wait until it ends." in message
-        assert "another root" not in message
-        with pytest.raises(DatasetError, match="or choose another root"):
-            support.resume(tmp_path / "d")
-
-
 def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) -> None:
     """Pages have checksums: no value is taken that was not written."""
     groups = pq.read_metadata(recorded / DATA)
@@ -262,24 +250,6 @@ def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) 
         assert [one[1]["observation.state"] for one in found] == [one[1]["observation.state"] for one in kept]
         assert [one[2] for one in found] == [one[2] for one in kept]
         assert_valid(root)
-
-
-def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None:
-    root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(3):
-        support.record(recorder)
-    recorder._lock.release()
-    path = root / "data/chunk-000/file-001.parquet"
-    path.write_bytes(path.read_bytes()[:100])
-    report = repair(root)
-    assert report.episodes == 2
-    assert any("file-001.parquet" in line for line in report.lost)
-    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes] == [0, 2]
-    table = pq.read_table(root / DATA)
-    assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
-    assert edits_of(root)[-1]["episodes"] == [0, 2]
-    assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == 2
 
 
 def test_an_invalid_info_is_refused(recorded: Path, tmp_path: Path) -> None:

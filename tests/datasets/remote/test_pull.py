@@ -130,29 +130,6 @@ def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: FakeHub, ro
     assert not hub.asked("GET .*/resolve/.*/data/")  # refused before everything was fetched
 
 
-def test_what_belongs_to_no_dataset_survives_an_exchange(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    """A dataset under version control, with links and folders of its own."""
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / ".git/refs/tags").mkdir(parents=True)
-    (target / ".git/HEAD").write_text("ref")
-    (target / ".cache/app").mkdir(parents=True)
-    (target / ".cache/app/x").write_text("x")
-    (target / "plots").symlink_to(tmp_path)
-    (target / "gone").symlink_to("nowhere")
-    with support.resume(root, video=True) as recorder:
-        support.record(recorder, video=True)
-    send(root)
-    assert pull(HubDataset("me/d"), target, replace=True).fetched
-    assert (target / ".git/refs/tags").is_dir()
-    assert (target / ".git/HEAD").read_text() == "ref"
-    assert (target / ".cache/app/x").read_text() == "x"
-    assert (target / "plots").is_symlink()
-    assert (target / "gone").is_symlink()
-    assert not (target / ".bhd-pull").exists()
-
-
 def test_files_that_hold_all_episodes_are_the_dataset(hub: FakeHub, tmp_path: Path) -> None:
     packed, target = tmp_path / "packed", tmp_path / "e"
     with support.create(packed) as recorder:

@@ -1,6 +1,5 @@
 """Statistics of stock LeRobot are those of its data, as far as float32 goes; those of other data are not."""
 
-import copy
 import json
 import shutil
 from collections.abc import Callable
@@ -101,26 +100,6 @@ def test_wrong_statistics_are_found(stock: Path, tmp_path: Path) -> None:
         change(stats["observation.state"])
         path.write_text(json.dumps(stats))
         assert stats_errors(root) == [f"meta/stats.json: observation.state: {name} is not that of the data"], case
-
-
-def test_statistics_without_an_episode_are_found() -> None:
-    """Also where the number of frames was made to fit."""
-    from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
-
-    rng = np.random.default_rng(0)
-    parts = [columns(rng, episode, n) for episode, n in enumerate(LENGTHS)]
-    each = [compute_episode_stats({"observation.state": part}, FEATURES) for part in parts]
-    found = Moments.of(parts[0])
-    for part in parts[1:]:
-        found.add(Moments.of(part))
-
-    def judged(chosen: list[Any]) -> str | None:
-        stored = {name: np.asarray(value, np.float64) for name, value in chosen[0]["observation.state"].items()}
-        return wrong_statistic(stored, found, max(map(len, parts)))
-
-    assert judged([aggregate_stats(copy.deepcopy(each))]) is None
-    for missing in range(len(LENGTHS)):
-        assert judged([aggregate_stats(copy.deepcopy(each[:missing] + each[missing + 1 :]))]) is not None
 
 
 @each_case("n", [2, 700, 60_000])

@@ -89,18 +89,6 @@ def test_a_process_that_dies_is_noticed_and_nothing_waits_for_it(tmp_path: Path)
             encoder.finish()
 
 
-def test_an_episode_after_the_process_died_waits_for_nothing(tmp_path: Path) -> None:
-    with closing(EncoderProcess()) as process:
-        os.kill(process.pid, signal.SIGKILL)
-        until(lambda: process.problem)
-        encoder = process.encoder(tmp_path / "a.mp4", 10, SIZE, SETTINGS)
-        with pytest.raises(OSError, match="has ended"):
-            encoder.add(images(1)[0])
-        with pytest.raises(OSError, match="has ended"):
-            encoder.finish()
-        encoder.cancel()
-
-
 def test_nobody_waits_for_an_encoder_that_does_not_keep_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Images are dropped and counted; the one before stands in the place of each, and the video is complete."""
     monkeypatch.setattr(encoder_process, "_WAITING_BYTES", 10 << 20)

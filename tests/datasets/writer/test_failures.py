@@ -160,18 +160,6 @@ def test_the_kernel_refuses_a_video(tmp_path: Path) -> None:
     assert not repair(root)
 
 
-def test_compaction_without_space_leaves_what_was_saved(tmp_path: Path) -> None:
-    root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(5):
-        support.record(recorder)
-    with file_size_limit(5000), pytest.raises(DatasetWriteError, match="bhd-data repair"):
-        recorder.finalize()
-    assert support.verify(root, 5) == 5
-    assert "statistics of 5 episodes" in str(repair(root))
-    assert support.verify(root, 5, stats=True) == 5
-
-
 def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(DatasetWriteError, match="is a file, not a folder"):
