@@ -184,9 +184,11 @@ def test_only_one_writer_at_a_time(tmp_path: Path) -> None:
     root.mkdir()  # an empty folder becomes a dataset
     recorder = support.create(root)
     support.record(recorder)
+    files = os.listdir("/proc/self/fd")
     for call in (support.create, support.resume, repair):
         with pytest.raises(DatasetLockedError, match="is being recorded, repaired or edited by another process"):
             call(root)
+    assert len(os.listdir("/proc/self/fd")) == len(files)
     recorder.finalize()
     with support.resume(root) as again:
         assert again.num_episodes == 1
