@@ -110,6 +110,16 @@ def test_random_transforms_draw_as_in_lerobot(video_dataset: Path) -> None:
     assert not torch.equal(ours.batch(torch.tensor([5, 1, 9]))[FRONT], wanted[FRONT])
 
 
+def test_other_decoders_run_through_lerobot(video_dataset: Path) -> None:
+    ours = TableDataset("t/t", video_dataset, video_backend="video_reader", return_uint8=True)
+    cache = frame_cache.FrameCache(ours.table, [FRONT], 1e-4)
+    slow = frame_cache.FrameCache.__new__(frame_cache.FrameCache)
+    slow.__dict__.update(cache.__dict__, _backend="pyav", images={FRONT: torch.zeros_like(cache.images[FRONT])})
+    for job in slow._jobs():
+        slow._decode_lerobot(job)
+    assert torch.equal(slow.images[FRONT], cache.images[FRONT])
+
+
 def test_a_language_column_is_in_samples_and_in_batches_where_lerobot_has_it(tmp_path: Path) -> None:
     root = support.record_light(tmp_path / "d", 2, language=True)
     ours = assert_equal_datasets(root, delta_timestamps={"action": CHUNK})

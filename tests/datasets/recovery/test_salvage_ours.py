@@ -252,6 +252,24 @@ def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) 
         assert_valid(root)
 
 
+def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    for _ in range(3):
+        support.record(recorder)
+    recorder._lock.release()
+    path = root / "data/chunk-000/file-001.parquet"
+    path.write_bytes(path.read_bytes()[:100])
+    report = repair(root)
+    assert report.episodes == 2
+    assert any("file-001.parquet" in line for line in report.lost)
+    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes] == [0, 2]
+    table = pq.read_table(root / DATA)
+    assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
+    assert edits_of(root)[-1]["episodes"] == [0, 2]
+    assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == 2
+
+
 def test_an_invalid_info_is_refused(recorded: Path, tmp_path: Path) -> None:
     root = copied(recorded, tmp_path / "d")
     (root / "meta/bhd.json").unlink()

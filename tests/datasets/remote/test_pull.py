@@ -192,3 +192,12 @@ def test_episodes_of_a_replaced_dataset_are_not_requested(hub: FakeHub, root: Pa
     report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
     assert report.episodes == [0]
     assert target.stat().st_mode & 0o777 == 0o700  # the permissions are kept
+
+
+def test_a_folder_named_by_dots_is_the_folder(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
+    send(root)
+    pull(HubDataset("me/d"), tmp_path / "e")
+    (tmp_path / "e" / layout.STATS).write_text("{}")
+    monkeypatch.chdir(tmp_path / "e/meta")
+    assert pull(HubDataset("me/d"), "..", replace=True).fetched == [layout.STATS]
+    assert content(tmp_path / "e") == content(root)

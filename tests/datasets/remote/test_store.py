@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import ConfigError, DatasetExistsError, TransferError
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.datasets import support
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
 from tests.datasets.support import snapshot as content
@@ -116,6 +116,21 @@ def test_a_download_that_dies_leaves_nothing(root: Path, near_url: str, tmp_path
     assert not {one.name for one in tmp_path.iterdir()} & {"e", ".e.pull"}
     pull(StoreDataset(near_url), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
+
+
+def test_a_change_during_the_upload_is_not_shown(root: Path, monkeypatch) -> None:
+    store = StoreDataset("memory://b/changed")
+    put = store._fs.put_file
+
+    def put_and_change(*args: object, **kwargs: object) -> object:
+        (root / layout.STATS).write_text("{}")
+        return put(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store._fs, "put_file", put_and_change)
+        with pytest.raises(DatasetError, match="changed by another program"):
+            push(root, store)
+    assert layout.INFO not in StoreDataset("memory://b/changed").files()
 
 
 def test_places_that_do_not_exist(root: Path, s3_url: str, tmp_path: Path, monkeypatch) -> None:
@@ -259,6 +274,21 @@ def test_what_is_written_there_during_a_pull_is_noticed(
         with pytest.raises(TransferError, match=rf"was changed while it was read: {changed}"):
             pull(source, tmp_path / "e")
     assert not (tmp_path / "e").exists()
+
+
+def test_a_dataset_that_was_changed_here_is_kept_unless_it_is_given_up(
+    root: Path, near_url: str, tmp_path: Path
+) -> None:
+    push(root, StoreDataset(near_url))
+    target = tmp_path / "e"
+    pull(StoreDataset(near_url), target)
+    (target / layout.STATS).write_text("{}")
+    before = content(target)
+    with pytest.raises(DatasetExistsError, match=layout.STATS):
+        pull(StoreDataset(near_url), target)
+    assert content(target) == before
+    pull(StoreDataset(near_url), target, replace=True)
+    assert content(target) == content(root)
 
 
 def test_episodes_of_a_url_are_not_chosen(root: Path, tmp_path: Path) -> None:

@@ -187,6 +187,25 @@ def test_edits_put_the_episodes_in_order(tmp_path: Path, case: str) -> None:
         assert served(tmp_path / name) == truth(foreign.LENGTHS)
 
 
+def test_instructions_numbered_with_gaps_keep_their_words(tmp_path: Path) -> None:
+    """Also where no row of an episode tells which number has which words."""
+    numbers = (5, 15, 25)
+
+    def change(episode: int, columns: foreign.Columns) -> None:
+        columns["task_index"][:] = numbers[episode]
+        columns["task_index"][:3] = numbers[0]
+
+    root = foreign.write(tmp_path / "d", (5, 4, 7), change=change)
+    foreign.write_tasks(root, dict(zip(numbers, foreign.TASKS, strict=True)))
+    first, *others = foreign.TASKS
+    foreign.edit(root / ROWS, put("tasks", [[first], *([first, other] for other in others)]))
+    report = repair(root)
+    assert (report.episodes, report.lost) == (3, ())
+    assert foreign.errors(root) == []
+    wanted = [first if frame < 3 else foreign.TASKS[episode] for episode, frame, *_ in truth((5, 4, 7))]
+    assert [task for *_, task in served(root)] == wanted
+
+
 @each_case("case", ["numbers of instructions", "episodes in each other's file"])
 def test_edits_refuse_what_repair_corrects(tmp_path: Path, case: str) -> None:
     CASES[case][0](tmp_path / "d")

@@ -54,6 +54,16 @@ def test_more_images_than_shared_memory_holds(process: EncoderProcess, tmp_path:
     assert len(encoder.finish()) == count_frames(tmp_path / "large.mp4") == 100
 
 
+def test_a_cancelled_episode_leaves_the_others_alone(process: EncoderProcess, tmp_path: Path) -> None:
+    kept, dropped = (process.encoder(tmp_path / f"{name}.mp4", 10, SIZE, SETTINGS) for name in ("kept", "dropped"))
+    for image in images(10):
+        kept.add(image)
+        dropped.add(image)
+    dropped.cancel()
+    dropped.cancel()
+    assert len(kept.finish()) == 10
+
+
 def test_what_the_disk_refuses_is_raised_here(process: EncoderProcess, tmp_path: Path) -> None:
     encoder = process.encoder(tmp_path / "missing" / "a.mp4", 10, SIZE, SETTINGS)
 
@@ -87,6 +97,29 @@ def test_a_process_that_dies_is_noticed_and_nothing_waits_for_it(tmp_path: Path)
             until(lambda: [encoder.add(image) for image in images(10)] and False)
         with pytest.raises(OSError, match="has ended"):
             encoder.finish()
+
+
+def test_an_episode_after_the_process_died_waits_for_nothing(tmp_path: Path) -> None:
+    with closing(EncoderProcess()) as process:
+        os.kill(process.pid, signal.SIGKILL)
+        until(lambda: process.problem)
+        encoder = process.encoder(tmp_path / "a.mp4", 10, SIZE, SETTINGS)
+        with pytest.raises(OSError, match="has ended"):
+            encoder.add(images(1)[0])
+        with pytest.raises(OSError, match="has ended"):
+            encoder.finish()
+        encoder.cancel()
+
+
+def test_it_ends_with_the_process_that_started_it() -> None:
+    before = threading.active_count()
+    process = EncoderProcess()
+    pid = process.pid
+    process.close()
+    process.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    assert threading.active_count() == before
 
 
 def test_nobody_waits_for_an_encoder_that_does_not_keep_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
