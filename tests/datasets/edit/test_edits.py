@@ -108,14 +108,16 @@ def test_unchanged_files_are_linked(tmp_path: Path) -> None:
 
 
 def test_full_files_are_not_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a file is full the next one is begun, for data and for videos."""
+    """Where the next one would not fit into a file another is begun, for data and for videos."""
     parts = [record(tmp_path / f"d{i}", [i, i + 1], video=True) for i in range(3)]
-    monkeypatch.setattr("bhd_lerobot.datasets.assembly.files.MEBIBYTE", 10)
-    merge(parts, tmp_path / "all")
-    assert len(list((tmp_path / "all/data").rglob("*.parquet"))) == 3
-    assert len(list((tmp_path / "all/videos").rglob("*.mp4"))) == 3
-    assert content(tmp_path / "all") == [episode for part in parts for episode in content(part)]
-    assert_valid(tmp_path / "all")
+    whole = [episode for part in parts for episode in content(part)]
+    for kind, megabytes in (("data", layout.DATA_FILES_SIZE_IN_MB), ("videos", layout.VIDEO_FILES_SIZE_IN_MB)):
+        size = max(path.stat().st_size for part in parts for path in (part / kind).rglob("file-*"))
+        monkeypatch.setattr("bhd_lerobot.datasets.assembly.files.MEBIBYTE", 1.5 * size / megabytes)
+        merge(parts, tmp_path / kind)
+        assert len(list((tmp_path / kind / kind).rglob("file-*"))) == 3
+        assert content(tmp_path / kind) == whole
+        assert_valid(tmp_path / kind)
 
 
 def test_edits_are_logged(tmp_path: Path) -> None:

@@ -96,10 +96,11 @@ def test_folders_that_hold_something_else_are_never_replaced(hub: FakeHub, root:
 def test_a_full_disk_is_seen_before_and_during(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) -> None:
     send(root)
     usage = shutil.disk_usage(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(remote_pull.shutil, "disk_usage", lambda path: usage._replace(free=100))
-        with pytest.raises(TransferError, match=r"MB are missing.*0.0 MB free"):
-            pull(HubDataset("me/d"), tmp_path / "e")
+    for free in (100, sum(map(len, content(root).values()))):  # a disk is not filled to its last byte
+        with monkeypatch.context() as patch:
+            patch.setattr(remote_pull.shutil, "disk_usage", lambda path, free=free: usage._replace(free=free))
+            with pytest.raises(TransferError, match=r"MB are missing.* MB free"):
+                pull(HubDataset("me/d"), tmp_path / "e")
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
