@@ -53,19 +53,20 @@ def test_a_missing_dataset_names_where_it_was_looked_for(tmp_path: Path) -> None
         options(tmp_path / "none", tmp_path / "run"), DatasetError, rf"{tmp_path / 'none'} does not exist.*dataset.root"
     )
     refused(options(tmp_path, tmp_path / "run", dataset__root=None), DatasetError, r"lerobot/t/t does not exist")
+    refused(["--policy.type=bhd_mlp"], ConfigError, r"No dataset is given; set --dataset.root=FOLDER, or ")
 
 
-def test_an_empty_dataset(data: Path, tmp_path: Path) -> None:
-    (tmp_path / "set" / "meta").mkdir(parents=True)
-    info = json.loads((data / "meta" / "info.json").read_text())
-    (tmp_path / "set" / "meta" / "info.json").write_text(json.dumps({**info, "total_episodes": 0, "total_frames": 0}))
-    refused(options(tmp_path / "set", tmp_path / "run"), DatasetError, "no episode")
-
-
-def test_a_dataset_without_statistics(tmp_path: Path) -> None:
-    root = make_dataset(tmp_path / "set", episodes=2)
+def test_a_dataset_that_lacks_what_is_needed(trained: Path, tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, environment=False)
+    message = r"'act' cannot be made.*observation.state, action.*environment state"
+    refused(options(root, tmp_path / "run"), ConfigError, message)
+    arguments = options(root, tmp_path / "run", {}, policy__path=trained)
+    refused(arguments, DatasetError, r"needs 'observation.environment_state' of shape \(2,\)")
     (root / "meta" / "stats.json").unlink()
     refused(options(root, tmp_path / "run"), DatasetError, "no statistics.*bhd-data repair")
+    info = root / "meta" / "info.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "total_episodes": 0, "total_frames": 0}))
+    refused(options(root, tmp_path / "run"), DatasetError, "no episode")
 
 
 def test_a_selection_that_leaves_nothing_to_learn_from(data: Path, tmp_path: Path) -> None:
@@ -89,45 +90,22 @@ def test_a_value_that_is_not_finite_is_named(tmp_path: Path, value: float) -> No
     assert result.step == 2
 
 
-def test_a_policy_without_the_input_that_it_needs(tmp_path: Path) -> None:
-    root = make_dataset(tmp_path / "set", episodes=2, environment=False)
-    refused(
-        options(root, tmp_path / "run"),
-        ConfigError,
-        r"'act' cannot be made.*observation.state, action.*environment state",
-    )
-
-
-def test_a_dataset_that_lacks_what_a_checkpoint_reads(trained: Path, tmp_path: Path) -> None:
-    root = make_dataset(tmp_path / "set", episodes=2, environment=False)
-    arguments = options(root, tmp_path / "run", {}, policy__path=trained)
-    refused(arguments, DatasetError, r"needs 'observation.environment_state' of shape \(2,\)")
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"robot": "other"}, r"robot 'toy'.*'other'"),
-        ({"fps": 20}, r"10 frames a second.*20"),
-        ({"environment": False}, r"environment features.*goal_x"),
-    ],
-)
-def test_fine_tuning_on_what_does_not_fit_is_refused(
-    trained: Path, tmp_path: Path, change: dict[str, Any], match: str
-) -> None:
-    root = make_dataset(tmp_path / "set", episodes=2, **change)
-    refused(options(root, tmp_path / "run", {}, fine_tune=trained), DatasetMismatchError, match)
-
-
-def test_fine_tuning_on_other_units_is_refused(data: Path, trained: Path, tmp_path: Path) -> None:
-    file = trained / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
-    before = file.read_text()
-    try:
-        file.write_text(json.dumps({**json.loads(before), "units": "degrees"}))
-        arguments = options(data, tmp_path / "run", {}, fine_tune=trained)
-        refused(arguments, DatasetMismatchError, r"values are in SI.*trained on values in degrees")
-    finally:
-        file.write_text(before)
+def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, tmp_path: Path) -> None:
+    for number, (change, match) in enumerate(
+        (
+            ({"robot": "other"}, r"robot 'toy'.*'other'"),
+            ({"fps": 20}, r"10 frames a second.*20"),
+            ({"environment": False}, r"environment features.*goal_x"),
+        )
+    ):
+        arguments: dict[str, Any] = change
+        root = make_dataset(tmp_path / f"set{number}", episodes=2, **arguments)
+        refused(options(root, tmp_path / "run", {}, fine_tune=trained), DatasetMismatchError, match)
+    other = Path(shutil.copytree(trained, tmp_path / "degrees", symlinks=True))
+    file = other / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "units": "degrees"}))
+    match = r"values are in SI.*trained on values in degrees"
+    refused(options(data, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
 
 
 @pytest.mark.parametrize(("statistics", "shifts"), [("checkpoint", False), ("dataset", True)])
@@ -139,8 +117,6 @@ def test_fine_tuning_keeps_or_renews_the_statistics(
     result, _ = run_train([*arguments, "--policy.optimizer_lr=1e-5"])
     assert result.checkpoint is not None
     name = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
-    from safetensors.torch import load_file
-
     files = [folder / "pretrained_model" / name for folder in (trained / "checkpoints" / "last", result.checkpoint)]
     old, new = (load_file(file)["action.mean"] for file in files)
     assert bool(torch.allclose(new, old)) != shifts
@@ -192,8 +168,6 @@ def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, 
     changes = {"steps": 4, "save_freq": 2, "log_freq": 1, "fine_tune_parameters": "['*.bias']"}
     result, _ = run_train(options(data, tmp_path / "run", {}, fine_tune=trained, **changes))
     assert result.checkpoint is not None
-    from safetensors.torch import load_file
-
     folders = (trained / "checkpoints" / "last", result.checkpoint)
     old, new = (load_file(folder / "pretrained_model" / "model.safetensors") for folder in folders)
     assert set(old) == set(new)
@@ -333,10 +307,6 @@ def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
     assert result.step == 20
 
 
-def test_a_dataset_is_to_be_named() -> None:
-    refused(["--policy.type=bhd_mlp"], ConfigError, r"No dataset is given; set --dataset.root=FOLDER, or ")
-
-
 def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").touch()
@@ -387,9 +357,6 @@ def test_a_configuration_that_cannot_be_honoured(
     data: Path, tmp_path: Path, change: dict[str, Any], match: str
 ) -> None:
     refused(options(data, tmp_path / "run", {**ACT, **change}), ConfigError, match)
-
-
-def test_no_policy_at_all(data: Path, tmp_path: Path) -> None:
     arguments = [one for one in options(data, tmp_path / "run", {}) if "policy" not in one]
     refused(arguments, ConfigError, "No policy is given.*bhd_mlp")
 

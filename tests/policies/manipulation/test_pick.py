@@ -216,7 +216,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
 
 
 def test_it_picks() -> None:
-    seeds = [episode_seed(11, episode, "train") for episode in range(4)]
+    seeds = [episode_seed(11, episode, "train") for episode in range(2)]
     for episode in episodes(PickBrain(), PickTask, PickConfig(), seeds):
         assert episode.outcome.success, episode.plan
         assert episode.plan["attempts"] == 1

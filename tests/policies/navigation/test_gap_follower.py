@@ -267,6 +267,6 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("beams", [36, 180])
 def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
-    outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
+    outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(2)], 2, beams, seconds=25)
     assert all(outcome.success for outcome in outcomes)
     assert all(outcome.details["path_m"] > 4 for outcome in outcomes)

@@ -1,4 +1,4 @@
-"""Publishers whose messages are late, gone, without a number, from another frame or another time."""
+"""Publishers whose messages are late, gone, without a number or from another time."""
 
 import argparse
 import math
@@ -17,9 +17,7 @@ def at(kind: str) -> Callable[[str], tuple[Any, ...]]:
         parts = text.split(":")
         if len(parts) != len(names):
             raise argparse.ArgumentTypeError(f"{text!r} is not {kind}")
-        return tuple(
-            part if name in ("TOPIC", "FRAME") else float(part) for name, part in zip(names, parts, strict=True)
-        )
+        return tuple(part if name == "TOPIC" else float(part) for name, part in zip(names, parts, strict=True))
 
     return parse
 
@@ -31,7 +29,6 @@ def add_faults(parser: argparse.ArgumentParser) -> Any:
         ("--gap", "TOPIC:START:DURATION", "nothing is published for a time"),
         ("--silence", "TOPIC:START", "nothing is published any more"),
         ("--nan", "TOPIC:START:DURATION", "numbers are NaN for a time"),
-        ("--frame", "TOPIC:FRAME", "another frame_id"),
         ("--swap", "TOPIC:EVERY", "each so many messages, one is published after its successor"),
     ):
         faults.add_argument(name, action="append", default=[], type=at(kind), metavar=kind, help=text)
@@ -62,7 +59,7 @@ class Outlet:
         self.clock = lambda: clock() % args.repeat
         self.gaps = [*mine(args.gap), *((start, math.inf) for (start,) in mine(args.silence))]
         self.nans = mine(args.nan)
-        self.frame = next((name for (name,) in mine(args.frame)), frame)
+        self.frame = frame
         self.has_stamp = not set(names) & set(args.zero_stamp)
         self.every = int(next((every for (every,) in mine(args.swap)), 0))
         self.publisher = node.create_publisher(kind, topic, qos)

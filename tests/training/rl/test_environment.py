@@ -125,21 +125,15 @@ def collide(rig: Rig) -> tuple:
     raise AssertionError("No robot that drives straight on ran into anything.")
 
 
-def test_a_collision_is_no_truncation_and_costs_what_the_configuration_says() -> None:
-    rig = Rig(60, reward=RewardConfig(scale=0.5, events={"collision": -7.0}))
-    sim, _, reward, done, infos = collide(rig)
-    rig.adapter.close()
-    assert done[sim]
-    assert infos[sim]["TimeLimit.truncated"] is False
-    assert reward[sim] == pytest.approx(-7.0)
-
-
-def test_what_is_reported_is_the_tasks_own_return_whatever_the_learner_gets() -> None:
+def test_a_collision_costs_what_the_configuration_says_and_what_is_reported_is_the_tasks_own_return() -> None:
     reported = []
-    for reward in (RewardConfig(), RewardConfig(scale=100.0, frame=-1.0, events={"collision": -9.0, "stuck": -9.0})):
-        rig = Rig(60, reward=reward)
-        collide(rig)
+    for own in (RewardConfig(), RewardConfig(scale=0.5, events={"collision": -7.0, "stuck": -9.0})):
+        rig = Rig(60, reward=own)
+        sim, _, reward, done, infos = collide(rig)
         rig.adapter.close()
+        assert done[sim]
+        assert infos[sim]["TimeLimit.truncated"] is False
+        assert not own.events or reward[sim] == pytest.approx(-7.0)
         reported.append([{key: episode[key] for key in ("episode", "score", "event")} for episode in rig.episodes])
     assert reported[0] == reported[1]
     assert reported[0][0]["episode"]["r"] >= 0

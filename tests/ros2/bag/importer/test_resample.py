@@ -21,6 +21,7 @@ from bhd_lerobot.ros2.bag.importer.resample import (
     newest_before,
 )
 from bhd_lerobot.ros2.messages.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
+from tests.cases import each_case
 
 MS = 10**6
 START = 1_700_000_000 * NANO
@@ -85,9 +86,9 @@ def test_a_frame_has_the_newest_message_until_then(a, b):
                 assert age == time - times[times <= time].max()
 
 
-@pytest.mark.parametrize("fps", [1, 3, 7, 10, 15, 24, 25, 29, 30, 48, 50, 60, 90, 120, 125, 333, 500, 1000])
-@pytest.mark.parametrize("offset_s", [0.0, 1 / 3, 0.123456789])
-@pytest.mark.parametrize("writer", ["rounded", "floored", "float seconds", "sums of periods"])
+@each_case("fps", [1, 7, 24, 29, 30, 60, 333, 1000])
+@each_case("offset_s", [0.0, 0.123456789])
+@each_case("writer", ["rounded", "floored", "float seconds", "sums of periods"])
 def test_messages_at_a_fixed_rate_are_one_a_frame_however_their_times_were_rounded(fps, offset_s, writer):
     n = 700
     begin = START + round(offset_s * NANO)

@@ -48,13 +48,15 @@ def test_a_recording_that_was_split_is_one_bag(split, parts, messages):
     assert [found.path.name for found in find_bags(parts[0].parent)] == ["drive_0", "drive_1", "drive_2"]
 
 
-def test_files_that_are_listed_in_a_wrong_order_are_read_by_time(split, messages):
-    check(split(["drive_2.mcap", "drive_0.mcap", "drive_1.mcap"]), messages, "another order than that of their times")
-
-
-def test_a_file_that_is_listed_twice_is_read_once(split, messages):
-    bag = split(["drive_0.mcap", "bag/drive_0.mcap", "drive_1.mcap", "drive_2.mcap"])
-    check(bag, messages, "lists a file twice")
+@pytest.mark.parametrize(
+    ("names", "problem"),
+    [
+        (["drive_2.mcap", "drive_0.mcap", "drive_1.mcap"], "another order than that of their times"),
+        (["drive_0.mcap", "bag/drive_0.mcap", "drive_1.mcap", "drive_2.mcap"], "lists a file twice"),
+    ],
+)
+def test_files_are_read_once_and_by_time_however_they_are_listed(split, messages, names, problem):
+    check(split(names), messages, problem)
 
 
 def test_a_missing_file_is_named_with_what_can_be_done(split):
@@ -139,11 +141,8 @@ def test_profiles_of_every_version_give_the_number_of_publishers(profiles, count
     assert publishers_in(profiles) == count
     topics = [{"topic_metadata": {"name": "/cmd_vel", "offered_qos_profiles": profiles}, "message_count": 3}]
     assert publishers_of(topics) == ({"/cmd_vel": count} if count else {})
-
-
-@pytest.mark.parametrize("topics", [None, "x", 3, [None, {}, {"topic_metadata": None}, {"topic_metadata": {}}]])
-def test_malformed_topics_give_no_publishers(topics):
-    assert publishers_of(topics) == {}
+    for malformed in (None, "x", 3, [None, {}, {"topic_metadata": None}, {"topic_metadata": {}}]):
+        assert publishers_of(malformed) == {}
 
 
 def test_every_version_of_metadata_is_read(split, messages):

@@ -206,7 +206,7 @@ def test_a_write_ahead_log_is_read_where_nothing_can_be_written(logged, messages
         logged.chmod(0o755)
 
 
-def test_messages_that_the_file_lacks_are_reported(tmp_path, bags):
+def test_messages_that_the_file_lacks_and_torn_metadata_are_reported(tmp_path, bags, messages):
     shutil.copytree(bags["sqlite3"], tmp_path / "b")
     with sqlite3.connect(tmp_path / "b" / "sqlite3.db3") as connection:
         connection.execute("DELETE FROM messages WHERE id > 50")
@@ -214,6 +214,10 @@ def test_messages_that_the_file_lacks_are_reported(tmp_path, bags):
     bag.read(TOPICS)
     with Reader(bags["sqlite3"]) as reader:
         assert f"count {reader.message_count} messages; it has 50" in bag.problems[0]
+    shutil.copytree(bags["mcap"], tmp_path / "torn")
+    text = (tmp_path / "torn" / "metadata.yaml").read_text()
+    (tmp_path / "torn" / "metadata.yaml").write_text(text[: len(text) // 2] + "\n\t: [")
+    assert check(tmp_path / "torn", messages, "metadata.yaml") == len(messages)
 
 
 def test_what_is_no_bag_is_refused(tmp_path, bags):
@@ -227,22 +231,11 @@ def test_what_is_no_bag_is_refused(tmp_path, bags):
     for name in ("none", "empty", "notes.txt", "lacking"):
         with pytest.raises(DatasetError, match=name):
             find_bags(tmp_path / name)
+    packed = zstd.compress((bags["mcap"] / "mcap.mcap").read_bytes())
+    for size in (5, len(packed) // 2):
+        (tmp_path / f"{size}.mcap.zstd").write_bytes(packed[:size])
+        with pytest.raises(DatasetError, match="zstd"):
+            find_bags(tmp_path / f"{size}.mcap.zstd")[0].read(TOPICS)
     for name in ("no.mcap", "no.db3"):
         with pytest.raises(DatasetError, match=name):
             find_bags(tmp_path / name)[0].read(TOPICS)
-
-
-def test_metadata_that_cannot_be_read_are_reported(tmp_path, bags, messages):
-    shutil.copytree(bags["mcap"], tmp_path / "b")
-    text = (tmp_path / "b" / "metadata.yaml").read_text()
-    (tmp_path / "b" / "metadata.yaml").write_text(text[: len(text) // 2] + "\n\t: [")
-    assert check(tmp_path / "b", messages, "metadata.yaml") == len(messages)
-
-
-def test_a_compressed_file_that_is_cut_off(tmp_path, bags):
-    packed = zstd.compress((bags["mcap"] / "mcap.mcap").read_bytes())
-    for size in (5, len(packed) // 2):
-        path = tmp_path / "b.mcap.zstd"
-        path.write_bytes(packed[:size])
-        with pytest.raises(DatasetError, match="zstd"):
-            find_bags(path)[0].read(TOPICS)
