@@ -79,17 +79,10 @@ def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> N
         brain.reset(np.arange(1), [1], 1, ["a"])
 
 
-def test_of_a_brain_that_does_not_say_it_is_taken_for_granted_that_it_is_told_the_truth() -> None:
+def test_what_cannot_be_blanked_is_refused_and_who_does_not_say_it_is_taken_to_be_told_the_truth() -> None:
     inner: Any = ConfiguredBrain(None)
-    brain = BlankedBrain(BlankedConfig(brain=None, images=True), inner)  # type: ignore[arg-type]
-    assert brain.uses_privileged_state
-
-
-def test_a_brain_that_brings_its_own_instruction_cannot_be_deaf() -> None:
+    assert BlankedBrain(BlankedConfig(brain=None, images=True), inner).uses_privileged_state  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"brain\.brain\.instruction is 'pick up the red cup'"):
         BlankedConfig(LanguageBrainConfig(instruction="pick up the red cup"), instruction=True)
-
-
-def test_a_brain_that_lacks_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"nothing is: set brain\.instruction or brain\.images"):
         BlankedConfig(brain=None)  # type: ignore[arg-type]

@@ -136,6 +136,8 @@ def test_it_goes_where_it_sees_what_is_meant_and_needs_nothing_that_the_task_tel
         pass
     assert table.steps == ["above", "down", "close", "lift"]
     assert table.eyes.count == 1
+    assert table.brain.parameters()["perception"]["weights"] == "sha256:0"
+    assert "weights" not in LanguageBrain().parameters()["perception"]
     plan = table.brain.plan(0)
     assert plan["seen"][plan["chosen"]]["name"] == meant.name
 
@@ -198,7 +200,9 @@ def test_what_it_does_not_see_or_not_surely_enough_it_does_not_touch(
     looks: list[Any], options: dict[str, Any], problem: str
 ) -> None:
     table = Table(*looks, **options)
+    assert table.brain.looks({}).tolist() == [True]
     assert table.frame() is None
+    assert table.brain.looks({}).tolist() == [False]  # it gave up
     assert problem in table.problem
     assert table.brain.subtasks()[0].startswith("cannot: ")
     assert table.brain.plan(0)["chosen"] is None
@@ -280,12 +284,6 @@ def test_what_slips_out_while_it_is_lifted_is_noticed_by_the_fingers() -> None:
     assert table.problem == "the object was not lifted"
 
 
-def test_it_says_which_weights_it_sees_with() -> None:
-    table = Table(BOTH)
-    assert table.brain.parameters()["perception"]["weights"] == "sha256:0"
-    assert "weights" not in LanguageBrain().parameters()["perception"]
-
-
 def test_what_was_taken_for_something_else_is_what_was_asked_for_if_it_may_be_that() -> None:
     """A red cup is asked for, and seen are a box and a cup that may be red ones: the likelier of the two it is."""
     red = TableObject("box", "red", BOX.size_x, BOX.size_y, BOX.height, BOX.x, BOX.y)
@@ -320,13 +318,6 @@ def test_what_fits_twice_or_is_refused_is_not_taken_for_something_else() -> None
     table.brain._planner = Refusing()
     assert table.frame() is None
     assert (asked, table.problem) == ([2], "I would rather not.")
-
-
-def test_a_brain_that_gave_up_looks_no_more() -> None:
-    table = Table(PerceptionError("the camera 'scene' shows nothing"))
-    assert table.brain.looks({}).tolist() == [True]
-    table.frame()
-    assert table.brain.looks({}).tolist() == [False]
 
 
 def test_options_that_cannot_be_honoured() -> None:
