@@ -329,7 +329,7 @@ def test_fail_below_is_about_the_lower_end_of_the_interval(tmp_path):
 
 def test_a_path_alone_is_a_checkpoint(monkeypatch):
     seen = []
-    monkeypatch.setattr("bhd_lerobot.cli.evaluate.run", lambda program, arguments: seen.append(arguments) or 0)
+    monkeypatch.setattr("bhd_lerobot.cli.evaluate.run", lambda program, arguments, *_: seen.append(arguments) or 0)
     main(["--brain.path=outputs/x"])
     main(["--brain.path", "outputs/x", "--brain.type=other"])
     assert seen[0] == ["--brain.path=outputs/x", "--brain.type=learned"]

@@ -297,7 +297,8 @@ def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cau
     environment(messages=True)
     with Peer("ur_driver_standin.py", "--log", log, *options, domain=domain) as robot:
         robot.wait_event("ready")
-        given = (*move, "--brain.scale=0.02", "--dataset.num_episodes=9")
+        # However late the commands come, as on a loaded machine, an arm that follows is not blocked.
+        given = (*move, "--brain.scale=0.02", "--dataset.num_episodes=9", "--robot.ros2.latency_s=1")
         silence_s = 0.4 if what == "silence" else 5
         with Recording("ur5", *given, domain=domain, folder=tmp_path, silence_s=silence_s) as recording:
             recording.wait_for_episode(2)
