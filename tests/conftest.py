@@ -20,7 +20,12 @@ from tests import shortcuts
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     gc.disable()  # until everything is imported, or it is looked through again and again for what can go
-pytest_plugins = ["tests.recorded_datasets", "tests.selection"]
+pytest_plugins = [
+    "tests.datasets.remote.store_fixtures",
+    "tests.fake_hub.fixtures",
+    "tests.recorded_datasets",
+    "tests.selection",
+]
 
 _HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))
 

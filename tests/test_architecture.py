@@ -239,6 +239,13 @@ def test_a_change_concerns_the_tests_that_mirror_it_and_the_laws_of_what_may_imp
     assert not no_laws & packages
 
 
+def test_make_quick_runs_a_law_of_every_package_that_has_tests_of_its_own() -> None:
+    files = list((ROOT / "tests").rglob("test_*.py"))
+    states_law = [path for path in files if "pytest.mark.law" in path.read_text(encoding="utf-8")]
+    tested, stated = ({selection.package_of(path.parent) for path in paths} for paths in (files, states_law))
+    assert tested - stated == set()
+
+
 def test_every_package_says_what_it_is_and_lists_its_modules() -> None:
     """Its `__init__.py` imports nothing: what is needed is imported where it is used."""
     for path in SOURCE.rglob("__init__.py"):

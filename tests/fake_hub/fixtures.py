@@ -1,4 +1,4 @@
-"""Fixtures around the Hub of the tests; a test module takes them by `pytest_plugins`."""
+"""Fixtures around the Hub of the tests."""
 
 import shutil
 from collections.abc import Iterator

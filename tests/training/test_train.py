@@ -22,8 +22,6 @@ from tests.forks import Fork
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
 from tests.waiting import until
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

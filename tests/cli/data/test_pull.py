@@ -14,8 +14,6 @@ from bhd_lerobot.training.config import BhdTrainConfig
 from tests.fake_hub.hub import FakeHub
 from tests.training.support import make_dataset
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 @pytest.fixture(scope="module")
 def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:

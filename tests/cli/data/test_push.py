@@ -30,8 +30,6 @@ from tests.training.support import MLP, curve, make_dataset, run_train
 from tests.training.support import options as train_options
 from tests.waiting import until
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -11,7 +11,6 @@ from tests.datasets import support
 from tests.datasets.edit_support import record
 from tests.ros2.bag.support import drive, write
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
 IMPORT = "import bag --repo_id=t/t --root=x --task=Drive."
 
 # A command in a folder with a dataset `d` of six episodes, an empty one, a bag, a file and a folder; and what is said.

@@ -1,4 +1,4 @@
-"""Fixtures around places below a URL; a test module takes them by `pytest_plugins`."""
+"""Fixtures around places below a URL."""
 
 from collections.abc import Iterator
 from pathlib import Path

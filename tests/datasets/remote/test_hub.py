@@ -22,8 +22,6 @@ from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import EPISODES, send, stored
 from tests.fake_hub.hub import FakeHub, Fault, real_client
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 @pytest.mark.law
 def test_what_comes_back_is_what_was_recorded(hub: FakeHub, root: Path, tmp_path: Path) -> None:

@@ -24,8 +24,6 @@ from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import EPISODES, send
 from tests.fake_hub.hub import FakeHub, Fault
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 def test_some_episodes_bring_only_their_files_and_load(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

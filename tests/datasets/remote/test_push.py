@@ -22,8 +22,6 @@ from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import send, stored
 from tests.fake_hub.hub import FakeHub, Fault
 
-pytest_plugins = ["tests.fake_hub.fixtures"]
-
 
 def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: FakeHub, root: Path) -> None:
     def change() -> None:

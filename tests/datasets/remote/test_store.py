@@ -19,8 +19,6 @@ from tests.datasets import support
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
 from tests.datasets.support import snapshot as content
 
-pytest_plugins = ["tests.datasets.remote.store_fixtures", "tests.fake_hub.fixtures"]
-
 
 @pytest.fixture
 def root(few_files: Path, tmp_path: Path) -> Path:
