@@ -32,7 +32,7 @@ WALL = ("--robot.arena=random", "--robot.seed=3")  # a wall 0.73 m ahead
 
 
 def test_the_avoidance_node_drives_the_served_robot_without_contact(domain: int, tmp_path: Path) -> None:
-    seconds = 600 if IS_FULL else 10
+    seconds = 600 if IS_FULL else 4
     with (
         Served("turtlebot3", *WALL, domain=domain, log=tmp_path / "log") as robot,
         Peer("avoidance_node.py", domain=domain) as driver,
@@ -287,7 +287,7 @@ STOPPED = {  # what happens to the driver or to a process of ours; what is print
 
 
 @pytest.mark.parametrize("what", STOPPED)
-@pytest.mark.thorough(but=1)
+@pytest.mark.thorough
 def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cause(
     what: str, domain: int, tmp_path: Path
 ) -> None:
@@ -324,7 +324,7 @@ FULL_S, SHORT_S = 10, 4  # of an episode
 
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", ["rule", "checkpoint"])
-@pytest.mark.thorough(but=1)
+@pytest.mark.thorough
 def test_a_brain_does_over_ros_what_it_does_in_this_process(kind: str, domain: int, tmp_path: Path) -> None:
     episodes, seconds = (100, FULL_S) if IS_FULL else (2, SHORT_S)
     brain = ("--brain.type=avoidance",)

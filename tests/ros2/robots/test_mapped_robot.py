@@ -262,7 +262,11 @@ def test_a_frame_is_taken_when_it_is_asked_for_and_each_topic_has_an_age(tmp_pat
         until(lambda: 1.0 < device.sensor_period_s < 2.0, "the slowest topic's period is known")
 
 
-def test_a_command_that_no_node_receives_is_named_before_the_first_episode(tmp_path: Path, domain: int) -> None:
+def test_a_command_that_no_node_receives_is_named_before_the_first_episode(
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bhd_lerobot.ros2.live.link._RECEIVED_S", 2.0)
+
     def fails(message: str, *receives: tuple[str, str]) -> None:
         with (
             feed(domain, lambda _: [("/odom", ODOMETRY, odometry())], receives=receives),
