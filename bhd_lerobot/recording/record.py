@@ -34,7 +34,7 @@ from bhd_lerobot.recording.report import RecordResult, print_summary
 from bhd_lerobot.recording.reset import ResetPhase
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.recording.takes import Takes
-from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
+from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import Marks, key_help
@@ -45,7 +45,6 @@ from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.recorder import (
     Recording,
     closing_used,
-    info_of,
     language_column,
     open_recorder,
     save_episode,
@@ -67,8 +66,6 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    if config.resume and is_ours(config.robot.type) and not is_free(root):
-        _keep_to(root, config.robot, console)
     is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
     n = 1 if config.is_live or not is_here else min(config.n_envs, config.dataset.num_episodes)
     marks, is_new = _make_marks(config, n), is_free(root)
@@ -342,15 +339,6 @@ def _judged_task(config: RecordConfig, robots: Robots, console: Console) -> Task
             f"({key_help(mark_keys(config))}); otherwise it ends in a time-out."
         )
     return task
-
-
-def _keep_to(root: Path, robot: Any, console: Console) -> None:
-    """Continue as a dataset began that is older than the jerk limits."""
-    info = info_of(root)
-    recorded = info.recording.get("robot", {}) if info else {}
-    if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
-        robot.jerk_limits = False
-        console.print("The dataset was recorded without jerk limits: it continues with robot.jerk_limits=false.")
 
 
 def _trajectory(episode: Episode, robots: Robots, attempts: bool) -> Trajectory | None:

@@ -35,7 +35,7 @@ class BhdRobotConfig(RobotConfig):
             class of any package, ``"package.module:Class"``, see "Write a plant for your robot", which needs
             `clock = "realtime"`.
         ros2: the network of ``plant = "ros2"``.
-        jerk_limits: let accelerations change gradually when setpoints are followed. Off, it moves as in version 0.1.
+        jerk_limits: let accelerations change gradually when setpoints are followed. Off, they change at once.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
         seed: seed of the scene and of the sensor noise when the robot is used by itself.

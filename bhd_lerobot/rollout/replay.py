@@ -302,6 +302,5 @@ def _robot_config(recorded: dict[str, Any]) -> Any:
         raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
     known = {field.name for field in fields(kind)}
     # Replayed in simulated time, whatever clock it was recorded on.
-    recorded = {"jerk_limits": False, **recorded}  # what is older than these limits was recorded without them
     parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
     return kind(**{**parameters, "camera": False, "clock": "lockstep"})

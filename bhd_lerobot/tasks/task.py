@@ -16,13 +16,7 @@ from bhd_lerobot.options.registry import Registry
 
 
 class TaskConfig(draccus.ChoiceRegistry):
-    """Base class of task configurations.
-
-    Attributes:
-        renamed: options that had another name in earlier versions, whose files are still read: old to new.
-    """
-
-    renamed: ClassVar[dict[str, str]] = {"report": "sensing"}
+    """Base class of task configurations."""
 
 
 _OWN: dict[str, Any] = {

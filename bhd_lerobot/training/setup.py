@@ -16,7 +16,6 @@ from lerobot.configs.types import FeatureType
 from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 
-from bhd_lerobot.datasets.format.identity import with_present_names
 from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
@@ -148,9 +147,9 @@ _DIFFERS = "several values, in recordings that were merged"
 
 def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
     """Refuse a dataset whose task sensed something else than the truth, for a policy that learns what is true."""
-    task: Any = with_present_names({"task": PolicyContract.from_dataset(meta).task or {}})["task"]
+    task: Any = PolicyContract.from_dataset(meta).task or {}
     given = {}
-    if "sensing" in task:  # there was none in earlier versions
+    if "sensing" in task:  # it is a task of an arm
         given = {f"sensing.{one.name}": task["sensing"].get(one.name, _DIFFERS) for one in fields(SensingConfig)}
     randomisation = task.get("randomisation") or {}
     if randomisation.get("enabled", True):

@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.datasets.format.identity import with_present_names
 from bhd_lerobot.errors import counted, quoted
 from bhd_lerobot.options.plugins import module_to_name
 from bhd_lerobot.policies.learned.contract import PolicyContract
@@ -98,7 +97,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str, policy: Any = Non
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = robot_configs()
-    found: Any = with_present_names({"task": contract.task or {}})["task"]
+    found: Any = contract.task or {}
     kind, task, module = "" if policy is None else policy.type, found.get("type"), ""
     if kind == "bhd_perception":  # its recordings are single looks at the scenes of the task
         found = {key: value for key, value in found.items() if key != "duration_s"}

@@ -12,7 +12,7 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
-from bhd_lerobot.datasets.format.identity import FORMAT, with_present_names
+from bhd_lerobot.datasets.format.identity import FORMAT
 from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_dataset, read_json
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
@@ -71,7 +71,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
         check_alike(states)
         picks = [Pick(state, row) for state in states for row in state.rows]
         sizes = [{"root": state.root.name, "episodes": len(state.rows)} for state in states]
-        recordings = [with_present_names((state.identity or {}).get("recording", {})) for state in states]
+        recordings = [(state.identity or {}).get("recording", {}) for state in states]
         _check_units(paths, recordings)
         return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, _common(recordings))
 

@@ -62,7 +62,7 @@ def check_identity(
     recorded["features"] = comparable(state.info["features"])
     requested["features"] = comparable(schema.features)
     if recording is not None:
-        recorded["recording"] = with_present_names(state.identity["recording"])
+        recorded["recording"] = state.identity["recording"]
         requested["recording"] = as_json(recording)
     if video is not None:
         recorded["video"], requested["video"] = state.identity["video"], as_json(video)
@@ -118,27 +118,3 @@ def default_root(repo_id: str) -> Path:
     from huggingface_hub.constants import HF_HOME
 
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser() / repo_id
-
-
-_TYPES = {"corrected": "dagger"}
-"""Types of brains in the metadata of version 0.1: old to new."""
-
-_TASK_OPTIONS = {"report": "sensing"}
-"""Options of tasks until version 0.3: old to new."""
-
-
-def with_present_names(recording: Mapping[str, Any]) -> dict[str, Any]:
-    """Return metadata of a recording, as plain values, with the present names of what was renamed."""
-    values: dict[str, Any] = _present_types(recording)
-    if isinstance(task := values.get("task"), dict):
-        values["task"] = {_TASK_OPTIONS.get(name, name): value for name, value in task.items()}
-    return values
-
-
-def _present_types(recorded: Any) -> Any:
-    if isinstance(recorded, Mapping):
-        values = {key: _present_types(value) for key, value in recorded.items()}
-        if isinstance(values.get("type"), str):
-            values["type"] = _TYPES.get(values["type"], values["type"])
-        return values
-    return [_present_types(value) for value in recorded] if isinstance(recorded, list) else recorded

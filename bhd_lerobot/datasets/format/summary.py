@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.format.episode_table import PREFIX
-from bhd_lerobot.datasets.format.identity import with_present_names
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import DatasetError, DatasetLockedError
@@ -92,7 +91,7 @@ def dataset_info(root: Path | str) -> DatasetSummary:
         tasks=tuple(state.tasks[: state.info["total_tasks"]]),
         frames=state.num_frames,
         episodes=episodes,
-        recording=with_present_names((state.identity or {}).get("recording", {})),
+        recording=(state.identity or {}).get("recording", {}),
         files=len(files),
         size=sum((root / name).stat().st_size for name in files),
         compact=not state.without_stats,

@@ -28,7 +28,7 @@ _RESULT_S = 5.0  # for the result of a goal that has ended
 _ACTION = "/_action/send_goal"
 _OF_EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of services that all nodes have
 # A reliable reader has the first reply of Fast DDS late or never: Cyclone DDS waits for a heartbeat of the server's
-# writer, which comes up to some seconds after the match. See findings/cyclonedds_first_reply_of_fastdds_late.sh.
+# writer, which comes up to some seconds after the match.
 _RECEIVED = Qos(100, reliable=False)
 
 

@@ -182,16 +182,6 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
     merge([looks, noisy], tmp_path / "merged")
     with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = several values"):
         train(tmp_path / "merged", tmp_path / "run")
-    # Until version 0.3 the option was called `task.report`.
-    path = noisy / "meta" / "bhd.json"
-    identity = json.loads(path.read_text())
-    identity["recording"]["task"]["report"] = identity["recording"]["task"].pop("sensing")
-    path.write_text(json.dumps(identity))
-    with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = 0\.01"):
-        train(noisy, tmp_path / "run")
-    merge([looks, noisy], tmp_path / "merged_old")
-    with pytest.raises(DatasetError, match=r"recorded with task\.sensing\.noise_m = several values"):
-        train(tmp_path / "merged_old", tmp_path / "run")
 
 
 def test_without_held_out_episodes_the_checkpoint_refuses_to_see(looks: Path, tmp_path: Path) -> None:
