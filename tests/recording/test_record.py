@@ -327,30 +327,6 @@ def test_a_dataset_that_is_older_than_an_option_of_its_task_is_resumed_while_tha
     assert json.loads(path.read_text()) == identity
 
 
-def test_a_dataset_and_a_configuration_with_the_former_name_of_an_option_of_the_task_are_continued(
-    tmp_path: Path,
-) -> None:
-    """`task.sensing` was called `task.report` until version 0.3."""
-    root = tmp_path / "d"
-    arm = {"robot__type": "ur5", "robot__beams": None, "brain__type": "reach", "task__type": "reach"}
-    arm |= {"dataset__episode_time_s": 0.5, "task__sensing__dropout": 0.25}
-    run_record(root, **arm, dataset__num_episodes=1)
-    path = root / "meta" / "bhd.json"
-    identity = json.loads(path.read_text())
-    task = identity["recording"]["task"]
-    assert task["sensing"] == {"noise_m": 0.0, "delay_s": 0.0, "dropout": 0.25}
-    task["report"] = task.pop("sensing")
-    path.write_text(json.dumps(identity))
-    with pytest.raises(DatasetMismatchError, match=r"task\.sensing\.dropout: recorded 0\.25, requested 0\.5"):
-        run_record(root, **arm | {"task__sensing__dropout": 0.5}, resume="true", dataset__num_episodes=2)
-    (tmp_path / "run.yaml").write_text("task: {type: reach, report: {dropout: 0.25}}", encoding="utf-8")
-    del arm["task__type"], arm["task__sensing__dropout"]
-    resume = {"config_path": tmp_path / "run.yaml", "resume": "true", "task__type": None}
-    result, _ = run_record(root, **arm, **resume, dataset__num_episodes=2)
-    assert (result.recorded, result.episodes) == (1, 2)
-    assert dataset_info(root).recording["task"]["sensing"]["dropout"] == 0.25
-
-
 def test_a_policy_is_recorded_as_what_it_is_and_not_where_it_lies(tmp_path, monkeypatch):
     """Neither dataset nor card names a folder of this machine, and a policy that was moved is still the same."""
     run = tmp_path / "alice" / "run"

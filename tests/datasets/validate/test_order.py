@@ -172,7 +172,8 @@ def test_another_order_is_found_and_corrected(tmp_path: Path, case: str) -> None
             assert served(root) == truth(lengths_of(case))
             assert not repair(root)
             assert not fix(root, foreign.check(root).findings)
-            assert [one["episodes"] for one in edits_of(root)] == [[0, 1, 2]]
+            if name == "fix":
+                assert [one["episodes"] for one in edits_of(root)] == [[0, 1, 2]]
             RootLock(root).release()
 
 
