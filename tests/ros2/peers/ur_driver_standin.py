@@ -63,6 +63,7 @@ class Arm:
     def __init__(self, new_node: Callable[[str], Node]) -> None:
         self.random = np.random.default_rng(0)
         self.start = self.now = time.monotonic()
+        self.wall = time.time() - self.start  # of the wall clock's zero [s]
         self.q = np.array(HOME)
         self.v = np.zeros(6)
         self.wanted = self.q.copy()
@@ -135,7 +136,7 @@ class Arm:
         message.position = [float(positions[index]) for index in SHOWN]
         message.velocity = [float(velocities[index]) for index in SHOWN]
         message.effort = [float(efforts[index]) for index in SHOWN]
-        stamp = time.time_ns()
+        stamp = round((self.wall + self.now) * 1e9)  # when it was there, however late this runs
         self.joint_states.publish(message, message.header, stamp)
         record("state", stamp=stamp, position=self.q.tolist(), wanted=self.wanted.tolist())
 
