@@ -271,6 +271,20 @@ def test_efforts_that_drift_move_an_arm_no_further_than_its_positions_confirm(ra
     assert np.ptp(np.array(lied.true)[-HZ:], axis=0).max() < 1e-3
 
 
+@pytest.mark.parametrize("period", [0.8, 1.5])
+def test_efforts_that_come_and_go_move_an_arm_no_further_than_those_that_stay(period: float) -> None:
+    """While they are right, they agree with the positions: that nothing presses confirms no push."""
+
+    def come_and_go(out: PlantReading, seconds: float) -> None:
+        out.effort[:, 0] += np.array([90.0, -60.0]) * (seconds % period < period / 2)
+
+    lied = Lied([0, 1], come_and_go)
+    lied.turn(0.6)
+    lied.cerebellum.estop.press()
+    lied.turn(8.0)
+    assert (lied.moved(Mode.ESTOP) < 0.25).all()
+
+
 @pytest.mark.parametrize("value", [0.0, np.nan])
 @pytest.mark.parametrize("stop", [Mode.ESTOP, Mode.FAULT])
 def test_an_arm_that_is_stopped_takes_efforts_of_zero_for_none(value: float, stop: Mode) -> None:

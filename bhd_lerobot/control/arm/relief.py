@@ -137,6 +137,7 @@ class ContactRelief:
         # What is read is a tick ahead of a moving reference, and behind it by the servos' latency.
         now = off + velocity[ids, : self._dof] * (1.0 / self._hz - self.late_s[ids, None])
         confirmed = (kind == 1) & ((now * stretch).sum(axis=1) > _CONFIRMS * (stretch * stretch).sum(axis=1))
+        confirmed &= sensed.force[ids] > _LIGHT_N  # where nothing is felt, the two agree for no reason
         stands = self._stood[ids] >= _STANDS  # in motion an inertia seems to confirm, too
         room = np.where((confirmed & stands) | ((kind == 2) & (self._kind[ids] < 2)), bound, room)
         self._kind[ids], self._room[ids] = kind, room
