@@ -282,6 +282,20 @@ def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
     assert all(arm.cerebellum.request(one).accepted.all() for one in (Request.RESET, Request.ACTIVATE))
 
 
+def test_a_hard_push_that_stays_as_it_is_while_it_is_followed_is_no_load() -> None:
+    """In a direction that the joints hardly feel; taken for a load, it became twice as hard."""
+    arm = UR5Simulation(UR5Config(), 1, threads=1)
+    posture = (0.6186, -1.6973, -0.6542, -0.4595, 0.942, 2.2784, 0.085)
+    arm.reset(FIRST, [TableScene("empty", (), posture)], [0])
+    arm.cerebellum.estop.press()
+    arm.step(None)
+    wall, most = Wall(arm, np.array((0.651, 0.103, 0.752)), 0.05, 2.0), 0.0
+    for _ in range(50):
+        arm.step(None)
+        most = max(most, float(wall.force[0]))
+    assert 150.0 < most < 650.0
+
+
 def test_an_arm_in_hold_is_watched_after_reset_and_activate_before_any_command() -> None:
     for direction in (UP, DOWN, ASIDE, ASKEW):
         arm = UR5Simulation(UR5Config(), 1, threads=1)

@@ -20,6 +20,8 @@ _VAIN_RAD = 0.05  # [rad] of all joints, by which an arm gives way though the fo
 _CREEP = 0.01  # [rad/s] an arm that is slower, and presses on nothing, stands still
 _CHANGE_N = 5.0  # [N] a force that changed by less has stayed as it is; of what may be a load's weight twice as much,
 _WEIGHT_N, _GENTLE = 60.0, 0.25  # because it is lighter or heavier by that when it speeds up by this share of a stop's
+# A larger force [N] of which positions confirm this share is no load, nor an error: it is followed, however even it is.
+_HEAVY_N, _SURELY = 150.0, 0.5
 _STANDS = 2  # decisions after which an arm that has stopped giving way is known to stand
 _AGAIN_RAD, _AGAIN_S, _TRIES = 0.02, 0.25, 3  # so far, after this time, and so often it is tried again
 _PUSHED_RAD = 0.01  # [rad] ahead of its reference, in the direction in which it gives way, a joint is pushed
@@ -125,18 +127,19 @@ class ContactRelief:
         off = command[ids, : self._dof] - sensed.position[ids]
         by_position = np.clip(off, -self._largest, self._largest)
         stretch: Array = np.where(measured[:, None], sensed.torque[ids] / self._stiffness, by_position)
+        # What is read is a tick ahead of a moving reference, and behind it by the servos' latency.
+        now = off + velocity[ids, : self._dof] * (1.0 / self._hz - self.late_s[ids, None])
+        agrees, whole = (now * stretch).sum(axis=1), (stretch * stretch).sum(axis=1)
         presses = np.where(
             measured,
-            self._presses(ids, off, stretch, sensed, velocity),
+            self._presses(ids, off, stretch, sensed, velocity, sure=agrees > _SURELY * whole),
             (np.abs(off) > _SLACK_RAD).any(axis=1),
         )
         kind = np.where(measured, np.where(sensed.doubtful[ids], 2, 1), 3)
         bound = np.choose(kind - 1, [_ALONE_RAD, _DOUBTFUL_RAD, np.abs(off).sum(axis=1) + _SPRINGS_RAD])
         same = kind == self._kind[ids]
         room = np.where(same, self._room[ids], np.fmin(self._room[ids], bound))
-        # What is read is a tick ahead of a moving reference, and behind it by the servos' latency.
-        now = off + velocity[ids, : self._dof] * (1.0 / self._hz - self.late_s[ids, None])
-        confirmed = (kind == 1) & ((now * stretch).sum(axis=1) > _CONFIRMS * (stretch * stretch).sum(axis=1))
+        confirmed = (kind == 1) & (agrees > _CONFIRMS * whole)
         confirmed &= sensed.force[ids] > _LIGHT_N  # where nothing is felt, the two agree for no reason
         stands = self._stood[ids] >= _STANDS  # in motion an inertia seems to confirm, too
         room = np.where((confirmed & stands) | ((kind == 2) & (self._kind[ids] < 2)), bound, room)
@@ -159,7 +162,9 @@ class ContactRelief:
         self._vain[ids] += way
         self._room[ids] = np.minimum(self._room[ids] + np.where(confirmed, way, -way), bound)
 
-    def _presses(self, ids: NDArray[np.intp], off: Array, stretch: Array, sensed: Sensed, velocity: Array) -> Mask:
+    def _presses(
+        self, ids: NDArray[np.intp], off: Array, stretch: Array, sensed: Sensed, velocity: Array, *, sure: Mask
+    ) -> Mask:
         """Return the arms on which something presses by their efforts, and is not followed in vain."""
         force = sensed.force[ids]
         most = np.where(self._level[ids] < _WEIGHT_N, 2.0, 1.0) * _CHANGE_N
@@ -169,7 +174,7 @@ class ContactRelief:
         same = np.abs(force - self._level[ids]) < most
         self._stood[ids] = (self._stood[ids] + 1) * ~velocity[ids, : self._dof].any(axis=1)
         same |= (self._vain[ids] >= _VAIN_RAD) & (self._stood[ids] <= _STANDS)  # what braked made it heavier
-        same &= presses & ~ahead.any(axis=1)
+        same &= presses & ~ahead.any(axis=1) & ~(sure & (force > _HEAVY_N))
         self._level[ids] = np.where(same, self._level[ids], force)
         self._vain[ids] *= same
         waits = self._vain[ids] >= _VAIN_RAD
