@@ -3,7 +3,7 @@
 
 PYTHON_IN_VENV := .venv/bin/python
 # Three test processes by default, for two processors: a quarter of their time they wait. `make test WORKERS=0` runs
-# everything in one, for a debugger. Tests by the wall clock follow, by themselves.
+# everything in one, for a debugger. Tests by the wall clock follow, apart from those that keep processors busy.
 WORKERS ?= 3
 PYTEST_ARGS ?=
 BENCH ?=

@@ -1,4 +1,4 @@
-"""Runs the tests: in several processes those that may share the machine, then by themselves those of the wall clock.
+"""Runs the tests: those that keep the processors busy, then, apart from them, those of the wall clock, which wait.
 
     python -m tests [--workers=N] [ARGUMENTS OF PYTEST...]
 
@@ -15,18 +15,18 @@ import pytest
 
 from tests.requirements import REASONS
 
-BESIDE, ALONE = "not wall_clock", "wall_clock"
+BUSY, WAITING = "not wall_clock", "wall_clock"
 
 
 def main(arguments: list[str]) -> int:
     workers = "0"
     if arguments and arguments[0].startswith("--workers="):
         workers = arguments.pop(0).partition("=")[2]
+    shared = ("--numprocesses", workers, "--dist=worksteal") if workers != "0" else ()
     with tempfile.NamedTemporaryFile("r") as reasons:
         environment = {**os.environ, REASONS: reasons.name}
         statuses = []
-        for part in (BESIDE, ALONE):
-            shared = ("--numprocesses", workers, "--dist=worksteal") if part == BESIDE and workers != "0" else ()
+        for part in (BUSY, WAITING):
             command = (sys.executable, "-m", "pytest", *shared, "-m", part, *arguments)
             statuses.append(subprocess.run(command, env=environment, check=False).returncode)
             if statuses[-1] == pytest.ExitCode.INTERRUPTED:

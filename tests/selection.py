@@ -1,7 +1,7 @@
 """Which tests run: by `--quick`, by `--thorough`, and by the mark `wall_clock`.
 
-Real-time processes, ROS, terminals and robots of others cannot wait for a busy machine. Their tests run one after the
-other with nothing beside them (`python -m tests`), and none asserts how long something took.
+Tests of real-time processes, ROS, terminals and robots of others mostly wait. They run apart from those that keep the
+processors busy (`python -m tests`), and none asserts how long something took.
 """
 
 import subprocess
