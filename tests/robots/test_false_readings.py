@@ -271,6 +271,21 @@ def test_efforts_that_drift_move_an_arm_no_further_than_its_positions_confirm(ra
     assert np.ptp(np.array(lied.true)[-HZ:], axis=0).max() < 1e-3
 
 
+def test_an_emergency_stop_in_a_fault_lets_an_arm_with_wrong_encoders_give_way_no_further() -> None:
+    """By efforts that change all the time, as of something that pushes on and on."""
+
+    def lie(out: PlantReading, seconds: float) -> None:
+        out.position[:, 1] += [0.5, -0.5]
+        out.effort[:, 0] += np.array([60.0, -60.0]) * (1.0 + 0.5 * np.sin(3.0 * seconds)) * (seconds > 0.5)
+
+    lied = Lied([0, 1], lie)
+    lied.turn(6.0)
+    assert (lied.moved() > 0.5).all()
+    lied.cerebellum.estop.press()
+    lied.turn(8.0)
+    assert (lied.moved(Mode.ESTOP) < 1.0 + BRAKES + 0.1).all()
+
+
 @pytest.mark.parametrize("period", [0.8, 1.5])
 def test_efforts_that_come_and_go_move_an_arm_no_further_than_those_that_stay(period: float) -> None:
     """While they are right, they agree with the positions: that nothing presses confirms no push."""

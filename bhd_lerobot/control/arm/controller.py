@@ -187,6 +187,7 @@ class ArmController(Controller):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             self._stopped &= ~mask
+            self._relief.restart(mask)
             self._wrong &= ~mask[:, None]
             self._driven[mask] = cause == Mode.HOLD
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
@@ -417,6 +418,7 @@ class ArmController(Controller):
         self._off_ticks[ids] = 0
         self._yields[ids] = self._stopped[ids] = self._wrong[ids] = self._driven[ids] = False
         self._rest_ticks[ids] = 0
+        self._relief.restart(ids)
         self.protective_stop[ids] = 0
         if self.force is not None:
             self.force.restart(ids)

@@ -1,5 +1,6 @@
 """Stopped arms that give way to what they press on, or what presses on them, for as long as it does."""
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,15 @@ _SPRINGS_RAD = 0.05  # [rad] farther than to where it was read an arm without ef
 _ALONE_RAD, _CONFIRMS = 0.15, 0.25  # [rad] of all joints by efforts alone; the share of them that positions confirm
 _DOUBTFUL_RAD = 1.0  # [rad] of all joints, by which an arm whose encoders are wrong gives way
 _MARGIN_RAD = 0.005  # [rad] so far from the end of its range a joint stays
+
+
+class _Told(IntEnum):
+    """What tells that something presses on an arm, by which its way is bounded."""
+
+    NOTHING = 0
+    EFFORTS = 1
+    DOUBTFUL_EFFORTS = 2  # in a posture of which an encoder is wrong
+    POSITIONS = 3
 
 
 class Sensed(NamedTuple):
@@ -86,12 +96,16 @@ class ContactRelief:
         self._stood: NDArray[np.int64] = np.zeros(n, np.int64)  # decisions since it moved last
         self._waited, self._tries = np.zeros(n), np.zeros(n, np.int64)  # for how long [s], and how often tried again
         self.late_s = np.zeros(n)
-        self._kind = np.zeros(n, np.int64)  # what the way of each arm was bounded for: 1 efforts, 2 doubtful, 3 none
+        self._told = np.zeros(n, np.int64)  # by what, when it was decided last
         self._room = np.full(n, np.nan)  # so far an arm may still give way of which something is not known [rad]
 
     def active(self) -> Mask:
         """Return whether each arm gives way, shape (n,)."""
         return np.asarray(self._wanted.any(axis=1))
+
+    def restart(self, chosen: Mask | NDArray[np.intp]) -> None:
+        """Let arms that are no longer stopped give way anew at their next stop, by a mask or by their numbers."""
+        self._room[chosen], self._told[chosen] = np.nan, _Told.NOTHING
 
     def run(self, mask: Mask, known: Mask, sensed: Sensed, command: Array, velocity: Array) -> None:
         """Advance the references of some arms by one tick, in place.
@@ -106,7 +120,6 @@ class ContactRelief:
         self._ticks[~trusted] = 0
         self._tries[~trusted] = 0
         self._wanted[~trusted] = self._level[~trusted] = self._vain[~trusted] = 0.0
-        self._room[~mask], self._kind[~mask] = np.nan, 0
         self._ticks[trusted] += 1
         due = trusted & (self._ticks % self._period == 0)
         if due.any():
@@ -135,19 +148,20 @@ class ContactRelief:
             self._presses(ids, off, stretch, sensed, velocity, sure=agrees > _SURELY * whole),
             (np.abs(off) > _SLACK_RAD).any(axis=1),
         )
-        kind = np.where(measured, np.where(sensed.doubtful[ids], 2, 1), 3)
-        bound = np.choose(kind - 1, [_ALONE_RAD, _DOUBTFUL_RAD, np.abs(off).sum(axis=1) + _SPRINGS_RAD])
-        same = kind == self._kind[ids]
-        room = np.where(same, self._room[ids], np.fmin(self._room[ids], bound))
-        confirmed = (kind == 1) & (agrees > _CONFIRMS * whole)
+        efforts = np.where(sensed.doubtful[ids], _Told.DOUBTFUL_EFFORTS, _Told.EFFORTS)
+        told, before = np.where(measured, efforts, _Told.POSITIONS), self._told[ids]
+        springs = np.abs(off).sum(axis=1) + _SPRINGS_RAD
+        bound = np.select([told == _Told.EFFORTS, told == _Told.POSITIONS], [_ALONE_RAD, springs], _DOUBTFUL_RAD)
+        room = np.where(told == before, self._room[ids], np.fmin(self._room[ids], bound))
+        confirmed = (told == _Told.EFFORTS) & (agrees > _CONFIRMS * whole)
         confirmed &= sensed.force[ids] > _LIGHT_N  # where nothing is felt, the two agree for no reason
         stands = self._stood[ids] >= _STANDS  # in motion an inertia seems to confirm, too
-        room = np.where((confirmed & stands) | ((kind == 2) & (self._kind[ids] < 2)), bound, room)
-        self._kind[ids], self._room[ids] = kind, room
+        found = (told == _Told.DOUBTFUL_EFFORTS) & (before < _Told.DOUBTFUL_EFFORTS)
+        room = np.where((confirmed & stands) | found, bound, room)
+        self._told[ids], self._room[ids] = told, room
         presses &= room > 0.0
         moving = self._wanted[ids].any(axis=1, keepdims=True)
-        before = np.where(moving, self._stretch[ids], stretch)
-        push = _FOLLOW * stretch + _EASE * (stretch - before)
+        push = _FOLLOW * stretch + _EASE * np.where(moving, stretch - self._stretch[ids], 0.0)
         wanted = self._wanted[ids] - push * (self._hz / self._period)
         wanted *= wanted * stretch < 0.0  # never against the push
         tools = self._forward.tool_speed(command[ids, : self._dof], wanted) / _TOOL_SPEED
