@@ -39,6 +39,7 @@ def _parser() -> Parser:
     parser = Parser(prog="bhd-ros2", description=__doc__.split(": ", 1)[1])
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
     commands.add_parser("serve", help="a simulated robot as a ROS 2 robot; `bhd-ros2 serve --help` has its options")
+    commands.add_parser("bridge", help="the cerebellum in front of a real robot; `bhd-ros2 bridge --help` likewise")
     help_text = "what is on the network"
     topics_parser(commands.add_parser("topics", help=help_text, description=help_text))
     return parser
@@ -136,10 +137,10 @@ def _echo(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-ros2`; return the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if given[:1] == ["serve"]:
+    if given[:1] in (["serve"], ["bridge"]):
         with leaving_on_interrupt():
             serve = importlib.import_module("bhd_lerobot.cli.serve").main
-        return int(serve(given[1:]))
+        return int(serve(given))
 
     def run() -> int:
         options = _parser().parse(given)

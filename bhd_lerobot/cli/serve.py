@@ -1,4 +1,4 @@
-"""`bhd-ros2 serve`: a simulated robot as a ROS 2 robot."""
+"""`bhd-ros2 serve` and `bhd-ros2 bridge`: a simulated robot on a ROS 2 network, and a real one behind a bridge."""
 
 import sys
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from rich.console import Console
 
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.registry import ROBOTS
+from bhd_lerobot.ros2.serve.bridge import BridgeConfig, bridge
 from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
 
 
@@ -14,9 +15,17 @@ def _serve(config: ServeConfig) -> None:
     serve(config, ROBOTS.of(config.robot), Console(stderr=True))
 
 
+def _bridge(config: BridgeConfig) -> None:
+    bridge(config, ROBOTS.of(config.robot), Console(stderr=True))
+
+
+PROGRAMS = {"serve": Program(ServeConfig, _serve), "bridge": Program(BridgeConfig, _bridge)}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-ros2 serve`; return the exit status."""
-    return run(Program(ServeConfig, _serve), arguments)
+    """Run the command that the first argument names; return the exit status."""
+    name, *options = sys.argv[1:] if arguments is None else arguments
+    return run(PROGRAMS[name], options)
 
 
 if __name__ == "__main__":

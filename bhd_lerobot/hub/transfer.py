@@ -114,9 +114,12 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
         return
     former = signal.getsignal(signal.SIGINT)
     timer: threading.Timer | None = None
+    is_caught = False
 
     def leave() -> None:
-        print(f"\nStopped; {stopped}.", file=sys.stderr, flush=True)
+        if not is_caught:
+            print(f"\nStopped; {stopped}.", file=sys.stderr)
+        sys.stderr.flush()
         os._exit(130)
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -132,8 +135,15 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
-        if timer is not None:
-            timer.cancel()  # all threads have ended
+        is_caught = True
+        # A thread that still waits for the network would keep the interpreter from ending.
+        if timer is not None and not _working_threads():
+            timer.cancel()
+
+
+def _working_threads() -> list[threading.Thread]:
+    """Return the threads that the interpreter waits for at its end."""
+    return [one for one in threading.enumerate() if not one.daemon and one is not threading.main_thread()]
 
 
 def quiet_bars() -> None:

@@ -55,6 +55,11 @@ class Program:
             error.add_note(f"{self._arguments} printed {self.text[-3000:]}")
         self.process.kill()
 
+    def pid_of(self, part: str) -> int:
+        """Return the number of one of its processes, by a part of its command line."""
+        [found] = [pid for pid in _descendants(self.pid) if part in _command_line(pid)]
+        return found
+
     @property
     def text(self) -> str:
         """What it has printed, on one line."""
@@ -81,7 +86,7 @@ class Served(Program):
     """`bhd-ros2 serve`."""
 
     def __init__(self, robot: str, *options: str, domain: int, log: Path) -> None:
-        given = [f"--robot.type={robot}", f"--network.domain={domain}", *RELAXED, *options]
+        given = ["serve", f"--robot.type={robot}", f"--network.domain={domain}", *RELAXED, *options]
         super().__init__(serve.main, given, log=log)
 
     def __enter__(self) -> Self:
@@ -97,10 +102,25 @@ class Served(Program):
         return int(found[1]), int(found[2])
 
 
+class Bridged(Program):
+    """`bhd-ros2 bridge`, in front of a robot on the network."""
+
+    def __init__(self, robot: str, *options: str, domain: int, log: Path, silence_s: float = 5) -> None:
+        plant = ("--robot.plant=ros2", f"--robot.ros2.domain={domain}", f"--robot.ros2.silence_s={silence_s}")
+        # However late the commands come, as on a loaded machine, a robot that follows is not blocked.
+        given = ["bridge", f"--robot.type={robot}", *plant, "--robot.ros2.latency_s=1", *RELAXED, *options]
+        super().__init__(serve.main, given, log=log)
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        self.wait_for("is behind a bridge")
+        return self
+
+
 class Side:
     """Another node, and the robot that it commands."""
 
-    def __init__(self, served: Served, node: Node) -> None:
+    def __init__(self, served: Program, node: Node) -> None:
         self.served, self.node = served, node
         self.states = node.subscription("/cerebellum/state", STATE)
         self.results = node.subscription(RESULT_TOPIC, RESULT, EVERY)
@@ -204,11 +224,6 @@ class Recording(Program):
         until(lambda: len(self.starts) >= number or self.process.poll() is not None, f"episode {number} begins")
         assert self.process.poll() is None, self.text
         time.sleep(1.0)
-
-    def pid_of(self, part: str) -> int:
-        """Return the number of one of its processes, by a part of its command line."""
-        [found] = [pid for pid in _descendants(self.pid) if part in _command_line(pid)]
-        return found
 
 
 def _descendants(pid: int) -> list[int]:

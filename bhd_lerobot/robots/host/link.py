@@ -44,7 +44,6 @@ class LiveLink:
     Attributes:
         bridge_side: this process's ends of the queues for requests and goals.
         grants: what the real-time process was granted or refused, as plain values.
-        problem: what was wrong with a plant in FAULT when the loop last stood still, as text.
 
     Args:
         mirror: a host like the one that is to run; this process's image of the robot.
@@ -86,7 +85,6 @@ class LiveLink:
         }
         self.grants: list[dict[str, Any]] = []
         self._plant: str = config.plant
-        self.problem = ""
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._pipes: dict[str, Connection] = {}
         self._stop = threading.Event()
@@ -185,7 +183,7 @@ class LiveLink:
         """Let the loop stand; the simulated world stands still with it."""
         if self._running:
             self.block.words[Word.PAUSE] = 1
-            *_, self.problem = self._answer("run", _ANSWER_S)
+            self._answer("run", _ANSWER_S)
             if "plant" in self._pipes:
                 self._answer("stood", _ANSWER_S, "plant")
             self._running = False

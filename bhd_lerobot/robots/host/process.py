@@ -112,7 +112,7 @@ class LiveProcess:
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
-        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns, age_ns)
+        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns, age_ns, self._problem)
         # A tick is for the time that it was due at. How far stamps are ahead of now is checked where they are read.
         cerebellum.readings.oldest_ns = cerebellum.readings.ahead_ns = spec.oldest_ns
         period = NANOSECONDS // spec.rates.control_hz
@@ -184,7 +184,7 @@ class LiveProcess:
             self._plant.is_muted = False
         self._warm = True
 
-    def _run(self, start_ns: int) -> tuple[int, int, str]:
+    def _run(self, start_ns: int) -> tuple[int, int]:
         """Run a segment that begins at a monotonic time [ns]."""
         self._statistics.reset()
         self._publisher.restart(int(self._words[Word.SEGMENT]) + 1)
@@ -193,12 +193,10 @@ class LiveProcess:
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
         self._standing_ticks = 0
         grid = self._loop.run(start_ns)
-        return grid.executed, grid.skipped, self._problem()
+        return grid.executed, grid.skipped
 
     def _problem(self) -> str:
         plant, cerebellum = self._plant, self._host.cerebellum
-        if cerebellum.mode[0] != Mode.FAULT:
-            return ""
         named = cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
         cause = cerebellum.controller.cause
         return named or cerebellum.readings.silence or f"{cause} {plant.hint if cause and plant else ''}".rstrip(" .")

@@ -31,7 +31,7 @@ from bhd_lerobot.robots.host.link import LiveLink
 from bhd_lerobot.robots.host.robots import Acted, Deliver, Frame, FrameReport, Receipt
 from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.robots.host.state import raised
+from bhd_lerobot.robots.host.state import problem_of, raised
 
 _SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck
 
@@ -163,7 +163,7 @@ class LiveHost:
             results = self.bridge.take_results()
         self.link.pause()
         if not results[0].success:
-            why = self.link.problem or f"{results[0].code.name}, {results[0].message.removesuffix('.')}"
+            why = problem_of(self.bridge.latest) or f"{results[0].code.name}, {results[0].message.removesuffix('.')}"
             raise RealtimeError(
                 f"The robot did not get to the start of the episode: {why}. Episodes that were saved are intact."
             )
@@ -319,7 +319,7 @@ class LiveHost:
     def problem(self) -> str:
         """What was wrong with the plant in its last fault, or which watchdog noticed something, as text."""
         noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._watchdog)
-        return self.link.problem or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
+        return problem_of(self.bridge.latest) or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
 
     @property
     def modes(self) -> NDArray[np.int8]:

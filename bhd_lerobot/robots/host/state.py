@@ -16,7 +16,7 @@ from bhd_lerobot.robots.host.host import Host
 
 LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
 
-
+_PROBLEM_BYTES = 400
 # The numbers that a state begins with, in the order in which they are written.
 _NUMBERS = (
     *("tick", "segment", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
@@ -38,6 +38,7 @@ def state_dtype(host: Host) -> np.dtype:
     - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
       `Reason`, and of the kinds of touches of the simulation. Limits are counted once a frame.
     - ``feedback``: how far the goal is that is followed, once a frame.
+    - ``problem``: what is wrong in FAULT, in UTF-8, see `problem_of`.
     - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
       older the oldest reading in them was.
     - ``physics``: the simulator's generalised positions and velocities; of no width without one.
@@ -57,8 +58,14 @@ def state_dtype(host: Host) -> np.dtype:
             ("observation", np.float64, (1, len(host.observation_names))),
             ("physics", np.float64, (1, physics)),
             ("feedback", FEEDBACK_DTYPE),
+            ("problem", f"S{_PROBLEM_BYTES}"),
         ]
     )
+
+
+def problem_of(state: Any) -> str:
+    """Return what is wrong with a robot by its state, as text; empty if nothing is."""
+    return bytes(state["problem"]).decode(errors="ignore")
 
 
 class StatePublisher:
@@ -68,6 +75,7 @@ class StatePublisher:
         ring: where they go, of dtype `state_dtype(host)`.
         clock: monotonic time [ns].
         age_ns: how much older than the tick its newest reading is [ns]; not older if None.
+        problem: what is wrong with the robot now, as text; called in FAULT.
     """
 
     def __init__(
@@ -76,8 +84,9 @@ class StatePublisher:
         ring: StateRing,
         clock: Callable[[], int] = time.monotonic_ns,
         age_ns: Callable[[], int] | None = None,
+        problem: Callable[[], str] = str,
     ) -> None:
-        self._clock, self._age_ns = clock, age_ns
+        self._clock, self._age_ns, self._problem = clock, age_ns, problem
         self._host, self._cerebellum, self._ring = host, host.cerebellum, ring
         self._record = np.zeros(1, state_dtype(host))
         # The one robot's values, as views: an index costs as much as a write.
@@ -92,6 +101,7 @@ class StatePublisher:
         self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
         self._frame = host.rates.ticks_per_frame
         self._next_frame = 0
+        self._was_faulty = False
         self.segment = 0
 
     def restart(self, segment: int) -> None:
@@ -108,7 +118,11 @@ class StatePublisher:
             ended_ns: when its predecessor ended [ns].
         """
         host, cerebellum, field = self._host, self._cerebellum, self._field
-        self._count(slot)
+        is_new = self._count(slot)
+        is_faulty = cerebellum.mode[0] == Mode.FAULT
+        if is_faulty != self._was_faulty or (is_faulty and is_new):
+            self._was_faulty = is_faulty
+            self._record["problem"] = self._problem().encode()[:_PROBLEM_BYTES] if is_faulty else b""
         controller, reading = cerebellum.controller, cerebellum.reading
         field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
         field["joint_efforts"][:] = cerebellum.efforts()
@@ -140,8 +154,12 @@ class StatePublisher:
         self._physics[0][:], self._physics[1][:] = host.physics
         self._ring.publish(self._state)
 
-    def _count(self, slot: Slot) -> None:
-        """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame."""
+    def _count(self, slot: Slot) -> bool:
+        """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame.
+
+        Returns:
+            Whether it was the last tick of a frame.
+        """
         field = self._field
         flags = [flag[0] for flag in self._host.touches]
         if any(flags):
@@ -152,7 +170,7 @@ class StatePublisher:
         # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
         frame = (slot.index + 1) // self._frame
         if frame < self._next_frame:
-            return
+            return False
         self._next_frame = frame + 1
         write_feedback(self._feedback, self._cerebellum.controller.feedback(0))
         limits, watchdog = self._cerebellum.take_flags()
@@ -164,6 +182,7 @@ class StatePublisher:
         if raised:
             self._watchdogs += [bool(raised & watchdog) for watchdog in WATCHDOGS]
             field["watchdogs"][:] = self._watchdogs
+        return True
 
 
 def raised(before: Any, after: Any) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Which nodes, publishers and subscriptions are on the network, and what does not fit together."""
 
 import threading
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -166,6 +167,18 @@ class Graph:
             found = found or [_mismatches(one, [other]) for one in own]
             texts += [f"{text} Give it the same type and QoS." for text in found[0]] if found and all(found) else []
         return texts
+
+    def rivals(self, topics: Collection[str]) -> list[str]:
+        """Return which of some topics several publishers of others send on, in sentences."""
+        senders: dict[str, list[str]] = {}
+        for one in self.endpoints():
+            if one.topic in topics and one.is_publisher and not one.is_own:
+                senders.setdefault(one.topic, []).append(one.node.lstrip("/") or "an unnamed node")
+        return [
+            f"{topic} has {len(nodes)} publishers, {' and '.join(sorted(nodes))}: the newest message counts."
+            for topic, nodes in sorted(senders.items())
+            if len(nodes) > 1
+        ]
 
     def doubles(self) -> list[str]:
         """Return which other nodes are the same robot as this one, in sentences.

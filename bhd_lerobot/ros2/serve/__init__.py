@@ -3,6 +3,7 @@
 __all__ = [
     "arm",
     "base",
+    "bridge",
     "description",
     "extras",
     "foxglove",
@@ -11,5 +12,6 @@ __all__ = [
     "paths",
     "serve",
     "server",
+    "service",
     "trajectory",
 ]

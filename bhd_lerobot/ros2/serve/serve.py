@@ -1,20 +1,17 @@
-"""`bhd-ros2 serve`: which robot, on which network, and until when."""
+"""`bhd-ros2 serve`: a simulated robot with the topics of a real one."""
 
-import signal
 import threading
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import numpy as np
-from lerobot.robots.config import RobotConfig
 from rich.console import Console
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.realtime import LiveHost, make_live
+from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
+from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
@@ -25,12 +22,13 @@ from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
-from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
+from bhd_lerobot.ros2.serve.server import Counts, Topics
+from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
 from bhd_lerobot.sim.description import parts_of
 
 
 @dataclass
-class ServeConfig:
+class ServeConfig(ServiceConfig):
     """A simulated robot as a ROS 2 robot, on the wall clock. Ctrl-C ends it.
 
     Attributes:
@@ -38,25 +36,20 @@ class ServeConfig:
         network: where other nodes are.
         namespace: of the robot's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
+        duration_s: end after this time [s]; 0: run until Ctrl-C.
         joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
         clock: publish ``/clock`` as well.
         foxglove_port: serve all topics to the Foxglove app on this TCP port of this machine; 0: off.
-        duration_s: end after this time [s]; 0: run until Ctrl-C.
     """
 
-    robot: RobotConfig
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    namespace: str = "/"
-    state_hz: float = 50.0
     joint_states_hz: float = float(JOINT_STATES_HZ)
     clock: bool = False
     foxglove_port: int = 0
-    duration_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("state_hz", "joint_states_hz"):
-            if not 0 < getattr(self, name) <= 1000:
-                raise ConfigError(f"{name} is {getattr(self, name)}; it is above 0 and at most 1000 Hz.")
+        super().__post_init__()
+        if not 0 < self.joint_states_hz <= 1000:
+            raise ConfigError(f"joint_states_hz is {self.joint_states_hz}; it is above 0 and at most 1000 Hz.")
         if not 0 <= self.foxglove_port <= 65535:
             raise ConfigError(f"foxglove_port is {self.foxglove_port}; it is from 1 to 65535, or 0 for no Foxglove.")
         robot: Any = self.robot
@@ -88,45 +81,25 @@ def serve(
     """
     require_cyclonedds()
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
-    end, running = ended or threading.Event(), ExitStack()
-    before = {number: signal.signal(number, lambda *_: end.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    robot: Any = config.robot
+    node = partial(MirroredNode, server=foxglove) if foxglove else Node
+
+    def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
+        made = _parts(config, host, node, counts)
+        if foxglove:
+            foxglove.start()
+            console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
+        return made
+
     try:
-        host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
-        host.reset(np.zeros(1, np.intp), [simulation.start_scene(robot)], [robot.seed])
-        host.begin()
-        for line in host.notes:
-            console.print(line)
-        named = config.robot.type, config.network, config.namespace
-        with MirroredNode(*named, foxglove) if foxglove else Node(*named) as node:
-            counts = Counts()
-            server = Server(host, node, _parts(config, host, node, counts), counts)
-            if foxglove:
-                foxglove.start()
-            where = "this machine" if config.network.is_local else config.network.interface
-            console.print(
-                f"{config.robot.type} is a ROS 2 robot: domain {config.network.domain_number}, {where}. Ctrl-C ends it."
-            )
-            if foxglove:
-                console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
-            if config.duration_s:
-                timer = threading.Timer(config.duration_s, end.set)
-                timer.daemon = True
-                timer.start()
-            server.run(end.is_set, lambda line: console.print(line, markup=False))
-            console.print(_summary(host, counts))
+        scene = simulation.start_scene(config.robot)
+        state = run_service(
+            config, simulation, scene, parts, console=console, ended=ended, node=node, title="is a ROS 2 robot"
+        )
+        touched, ticks = int(state["touches"].sum()), int(state["executed"])
+        console.print(f"Contact in {touched} of {ticks} control ticks.")
     finally:
         if foxglove:
             foxglove.close()
-        running.close()
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _summary(host: LiveHost, counts: Counts) -> str:
-    state = host.bridge.latest
-    touched, ticks = int(state["touches"].sum()), int(state["executed"])
-    return f"Ended. Contact in {touched} of {ticks} control ticks; commands refused: {sum(counts.refused.values())}."
 
 
 def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:

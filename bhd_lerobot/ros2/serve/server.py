@@ -149,6 +149,10 @@ class Server:
         self._host, self._node, self._parts, self.counts = host, node, list(parts), counts
         self._outputs = [output for part in self._parts for output in part.outputs()]
         self._inputs = [one for part in self._parts for one in part.inputs()]
+        # Any number of nodes may press the emergency stop.
+        self._commands = {
+            one.subscription.topic for one in self._inputs if "/emergency_stop" not in one.subscription.topic
+        }
 
     def run(self, stop: Callable[[], bool], report: Callable[[str], None]) -> None:
         """Serve until `stop` returns true.
@@ -180,7 +184,8 @@ class Server:
                     if more := count - reported.get((what, reason), 0):
                         report(f"{what} {more}: {reason}")
                 reported = found
-                apart = {*self._node.graph.all_mismatches(), *self._node.graph.doubles()}
+                graph = self._node.graph
+                apart = {*graph.all_mismatches(), *graph.doubles(), *graph.rivals(self._commands)}
                 for text in sorted(apart - mismatches):
                     report(text)
                 mismatches |= apart

@@ -75,7 +75,9 @@ def is_wrong(message: Any) -> bool:
 
 
 def shown_frames(page: Any) -> dict[str, set[int]]:
-    """Return the frame that each kind of view says that it shows."""
+    """Return the frame that each kind of view says that it shows, once all are drawn."""
+    drawn = "[...document.querySelectorAll('.view canvas, .playhead')].every((one) => 'frame' in one.dataset)"
+    wait_until(page, drawn)
     found = page.evaluate(
         """() => Object.entries({video: 'video, .video img', drawing: '.view canvas', timeline: '#track',
              plot: '.playhead'}).map(([kind, query]) =>

@@ -1,0 +1,167 @@
+"""`bhd-ros2 bridge`: the cerebellum between a brain on a ROS 2 network and a robot that is driven by a plant."""
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.control.messages import Mode, Reason, Watchdog
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.state import problem_of, raised
+from bhd_lerobot.ros2.live.network import NetworkConfig
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages import ur
+from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
+from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
+from bhd_lerobot.ros2.serve.interface import RESET_TOPIC, InterfaceTopics
+from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
+from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
+
+TWIST_TOPIC, POSITION_TOPIC = "/brain/cmd_vel", "/brain/commands"
+
+
+@dataclass
+class BridgeConfig(ServiceConfig):
+    """The cerebellum in front of a robot, between it and a brain on a ROS 2 network. Ctrl-C stops the robot.
+
+    Attributes:
+        robot: the robot; `robot.plant` says how it is driven.
+        network: where brains are; by default the network of `robot.ros2`.
+        namespace: of the bridge's node; topics keep their names, which begin with a slash.
+        state_hz: how often ``/cerebellum/state`` is published [Hz].
+        duration_s: end after this time [s]; 0: run until Ctrl-C.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        robot: Any = self.robot
+        if not getattr(robot, "plant", ""):
+            raise ConfigError(
+                f"robot.plant of the {robot.type!r} is not given; a bridge is in front of a robot that a plant drives: "
+                "turtlebot3 or ur5 with --robot.plant=ros2, or with a class, package.module:Class. "
+                "`bhd-ros2 serve` serves a simulated robot."
+            )
+        if isinstance(robot.body(), MobileBase):
+            robot.odometry = True  # a goal is reached by it
+        elif robot.action_space != "joint":
+            raise ConfigError(f"robot.action_space is {robot.action_space!r}; a bridge takes joint positions: 'joint'.")
+        if self.network == NetworkConfig():
+            ros2 = robot.ros2
+            self.network = NetworkConfig(ros2.domain, ros2.interface, ros2.peers, ros2.distro)
+
+
+class Setpoints:
+    """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm.
+
+    Args:
+        host: the robot.
+        node: the node.
+        counts: what is refused.
+        taken: called when a setpoint was taken.
+        topic: of the setpoints.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
+        self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
+        is_arm = isinstance(host.body, Arm)
+        types = (ur.FLOATS,) if is_arm else (TwistPart.msgtype, BareTwistPart.msgtype)
+        take = self._move if is_arm else self._drive
+        self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
+
+    def outputs(self) -> Iterable[Output]:
+        """Return that nothing is published."""
+        return []
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+        return self._inputs
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing is due."""
+        return NEVER_NS
+
+    def _drive(self, message: Any) -> bool:
+        twist = getattr(message, "twist", message)
+        return self._send([twist.linear.x, twist.angular.z])
+
+    def _move(self, message: Any) -> bool:
+        names = self._host.action_names
+        if len(message.data) != len(names):
+            self._counts.add(f"{self._topic}: {len(message.data)} values; there are {len(names)}: {', '.join(names)}")
+            return False
+        return self._send(message.data)
+
+    def _send(self, values: Any) -> bool:
+        sent = self._host.bridge.send(np.array([values], np.float64))
+        self._counts.add_result(self._topic, sent)
+        if Reason(int(sent.reasons[0])) != Reason.ACCEPTED:
+            return False
+        self._taken()
+        return True
+
+
+class Faults:
+    """Reports each fault of the robot once, with its cause and the remedy.
+
+    Args:
+        host: the robot.
+        report: takes a line.
+    """
+
+    def __init__(self, host: LiveHost, report: Callable[[str], None]) -> None:
+        self._report, self._before = report, host.bridge.latest.copy()
+
+    def outputs(self) -> Iterable[Output]:
+        """Return a look at the mode, which publishes nothing."""
+        return [Output(10.0, self._look)]
+
+    def inputs(self) -> Iterable[Input]:
+        """Return that nothing commands the robot."""
+        return []
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing else is due."""
+        return NEVER_NS
+
+    def _look(self, state: State) -> None:
+        before, self._before = self._before, state.record.copy()
+        mode = Mode(int(state.record["mode"][0]))
+        if mode == before["mode"][0] or mode not in (Mode.FAULT, Mode.ESTOP):
+            return
+        _, flags = raised(before, state.record)
+        noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in Watchdog(flags))
+        why = "the emergency stop was pressed" if mode == Mode.ESTOP else problem_of(state.record) or noticed
+        self._report(f"{mode.name}: {why.removesuffix('.')}. A message on {RESET_TOPIC} lets the robot go on.")
+
+
+def bridge(
+    config: BridgeConfig, simulation: type[Simulation], console: Console, ended: threading.Event | None = None
+) -> None:
+    """Stand between brains and a robot until SIGINT or SIGTERM. The robot starts where it is, and holds.
+
+    Args:
+        simulation: of the robot's type, which names what drives the plant.
+        console: takes lines about the state.
+        ended: ends it as well, once it is set.
+
+    Raises:
+        ConfigError: Cyclone DDS is not installed, or there is no such plant.
+        RealtimeError: the robot is not there, another program commands it, or a process of it has ended.
+    """
+
+    def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
+        goals: Goals = ArmGoals(host) if isinstance(host.body, Arm) else BaseGoals(host)
+        topic = POSITION_TOPIC if isinstance(host.body, Arm) else TWIST_TOPIC
+        return [
+            InterfaceTopics(host, node, counts, config.state_hz, goals),
+            Setpoints(host, node, counts, goals.interrupt, topic),
+            Faults(host, lambda line: console.print(line, markup=False, soft_wrap=True)),
+        ]
+
+    run_service(config, simulation, None, parts, console=console, ended=ended, title="is behind a bridge")

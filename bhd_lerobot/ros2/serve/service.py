@@ -1,0 +1,95 @@
+"""A robot's processes and its node, from the start to a clean stop: what `bhd-ros2 serve` and `bridge` share."""
+
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from lerobot.robots.config import RobotConfig
+from rich.console import Console
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.host.realtime import LiveHost, make_live
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
+
+
+@dataclass
+class ServiceConfig:
+    """A robot on the wall clock with a node, until it is ended.
+
+    Attributes:
+        robot: the robot.
+        network: where other nodes are.
+        namespace: of the robot's node; topics keep their names, which begin with a slash.
+        state_hz: how often ``/cerebellum/state`` is published [Hz].
+        duration_s: end after this time [s]; 0: run until Ctrl-C.
+    """
+
+    robot: RobotConfig
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    namespace: str = "/"
+    state_hz: float = 50.0
+    duration_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.state_hz <= 1000:
+            raise ConfigError(f"state_hz is {self.state_hz}; it is above 0 and at most 1000 Hz.")
+        if not 0 <= self.duration_s < float("inf"):
+            raise ConfigError(f"duration_s is {self.duration_s}; it is a time in s, or 0 for no end.")
+
+
+def run_service(
+    config: ServiceConfig,
+    simulation: type[Simulation],
+    scene: Any,
+    parts: Callable[[LiveHost, Node, Counts], list[Topics]],
+    *,
+    console: Console,
+    ended: threading.Event | None = None,
+    title: str,
+    node: Callable[..., Node] = Node,
+) -> Any:
+    """Run a robot and its topics until SIGINT or SIGTERM; return the robot's last state.
+
+    Args:
+        simulation: of the robot's type.
+        scene: in which it starts; None: where it is.
+        parts: makes the topics.
+        console: takes lines about the state.
+        ended: ends it as well, once it is set.
+        title: what the robot is from now on, as the first line says.
+        node: makes the node of a name, a network and a namespace.
+
+    Raises:
+        ConfigError: Cyclone DDS is not installed, or the configuration does not fit.
+        RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
+    """
+    require_cyclonedds()
+    end, robot = ended or threading.Event(), config.robot
+    with ExitStack() as running:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            running.callback(signal.signal, number, signal.signal(number, lambda *_: end.set()))
+        host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
+        host.reset(np.zeros(1, np.intp), [scene], [getattr(robot, "seed", 0)])
+        host.begin()
+        for line in host.notes:
+            console.print(line)
+        made = running.enter_context(node(robot.type, config.network, config.namespace))
+        counts = Counts()
+        server = Server(host, made, parts(host, made, counts), counts)
+        where = "this machine" if config.network.is_local else config.network.interface
+        console.print(f"{robot.type} {title}: domain {config.network.domain_number}, {where}. Ctrl-C ends it.")
+        if config.duration_s:
+            timer = threading.Timer(config.duration_s, end.set)
+            timer.daemon = True
+            timer.start()
+            running.callback(timer.cancel)
+        server.run(end.is_set, lambda line: console.print(line, markup=False))
+        console.print(f"Ended. Commands refused: {sum(counts.refused.values())}.")
+        return host.bridge.latest.copy()

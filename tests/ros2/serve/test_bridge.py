@@ -1,0 +1,184 @@
+"""A bridge between brains and robots on real `rclpy`: one result a goal, limits, a stop whatever ends, and causes."""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli import ros2, serve
+from bhd_lerobot.ros2.live.network import NetworkConfig
+from bhd_lerobot.ros2.live.node import Node
+from tests.ros2.peer_env import Peer, environment
+from tests.ros2.programs import Bridged, Program, Side, log_of
+from tests.waiting import until
+
+TWIST, FLOATS = "geometry_msgs/msg/Twist", "std_msgs/msg/Float64MultiArray"
+NEAR = ("--goal=0.5,0.1,0.4,0,1,0,0", "--goal=0.5,-0.1,0.4,0,1,0,0")  # of the UR5's tool
+FORWARD, STAND = {"linear": {"x": 0.15}}, [0.0, 0.0]
+
+
+@contextmanager
+def base(domain: int, folder: Path, *options: str, **settings: Any) -> Iterator[tuple[Side, Peer, Path]]:
+    """A TurtleBot3 on an open floor, its bridge, and a brain's node."""
+    log = folder / "robot.jsonl"
+    with (
+        Peer("standin_turtlebot3.py", "--open", "--log", log, domain=domain) as robot,
+        Bridged("turtlebot3", *options, domain=domain, log=folder / "log", **settings) as bridge,
+        Node("brain", NetworkConfig(domain=domain)) as node,
+    ):
+        yield Side(bridge, node), robot, log
+
+
+@contextmanager
+def arm(domain: int, folder: Path, *options: str, **settings: Any) -> Iterator[tuple[Bridged, Peer, Path]]:
+    """A UR5 behind its driver, and its bridge."""
+    environment(messages=True)
+    log = folder / "robot.jsonl"
+    with Peer("ur_driver_standin.py", *options, "--log", log, domain=domain) as robot:
+        robot.wait_event("ready")
+        with Bridged("ur5", domain=domain, log=folder / "log", **settings) as bridge:
+            yield bridge, robot, log
+
+
+def twist(log: Path) -> list[float]:
+    twist: list[float] = log_of(log, "pose")[-1]["twist"]
+    return twist
+
+
+def drives(side: Side, log: Path) -> bool:
+    side.send("/brain/cmd_vel", TWIST, FORWARD)
+    return twist(log)[0] > 0.1
+
+
+def test_goals_of_a_brain_move_an_arm_behind_its_driver_again_and_again(domain: int, tmp_path: Path) -> None:
+    with arm(domain, tmp_path) as (bridge, _, log):
+        start = log_of(log, "state")[-1]["position"]
+        for _ in range(2):  # with the same task ids
+            with Peer("brain_node.py", "--name=test_move", *NEAR, domain=domain) as brain:
+                summary = brain.wait_event("summary")
+            assert (summary["sent"], summary["once"], summary["unknown"]) == (2, 2, 0)
+            assert all(line["success"] for line in brain.events("result")), brain.events("result")
+        assert np.abs(np.array(log_of(log, "state")[-1]["position"]) - start).max() > 0.1
+        assert bridge.stop() == 0
+    lines = log_of(log, "positions")
+    sent, times = (np.array([line[key] for line in lines]) for key in ("given", "monotonic"))
+    assert np.abs(sent[0] - start).max() < 0.01  # it starts where it is
+    # Twelve commands a tenth of a second, however late one comes.
+    steps = np.abs(sent[12:] - sent[:-12]) / np.maximum(times[12:] - times[:-12], 0.096)[:, None]
+    assert (steps < 1.3 * np.array(ur5().limits.velocity[:6])).all()
+
+
+def test_setpoints_of_a_brain_move_an_arm(domain: int, tmp_path: Path) -> None:
+    with arm(domain, tmp_path) as (bridge, _, log), Node("brain", NetworkConfig(domain=domain)) as node:
+        side, start = Side(bridge, node), np.array(log_of(log, "state")[-1]["position"])
+        target = [*(start + 0.05), 0.02]
+        side.send("/brain/commands", FLOATS, {"data": np.array([target[:6]])})
+        bridge.wait_for("/brain/commands: 6 values; there are 7: shoulder_pan.pos, shoulder_lift.pos")
+
+        def arrives() -> bool:
+            side.send("/brain/commands", FLOATS, {"data": np.array([target])})
+            return bool(np.abs(log_of(log, "state")[-1]["position"] - np.array(target[:6])).max() < 0.01)
+
+        until(arrives, "the arm is where it was sent")
+
+
+def test_a_base_is_driven_within_limits_and_stands_when_twists_cease_or_it_is_stopped(
+    domain: int, tmp_path: Path
+) -> None:
+    with base(domain, tmp_path) as (side, _, log):
+        until(lambda: drives(side, log), "it drives")
+        until(lambda: twist(log) == STAND, "it stands without twists")
+        side.send("/brain/cmd_vel", TWIST, {"linear": {"x": float("nan")}})
+        until(lambda: drives(side, log), "it drives again")
+        side.press()
+        until(lambda: twist(log) == STAND, "it is stopped")
+        side.send("/brain/cmd_vel", TWIST, FORWARD)
+        side.served.wait_for("ESTOP: the emergency stop was pressed. A message on /emergency_stop/reset")
+        side.reset()
+        until(lambda: drives(side, log), "it drives after the reset")
+        assert side.served.stop() == 0
+        until(lambda: twist(log) == STAND, "it stands after the bridge")
+    given = np.array([line["given"] for line in log_of(log, "command")])
+    assert np.isfinite(given).all()
+    assert given[:, 0].max() <= 0.15 + 1e-9
+
+
+def test_what_commands_a_robot_twice_is_named(domain: int, tmp_path: Path) -> None:
+    with base(domain, tmp_path) as (side, _, log):
+        second = ["bridge", "--robot.type=turtlebot3", "--robot.plant=ros2", f"--robot.ros2.domain={domain}"]
+        with Program(serve.main, second, log=tmp_path / "second") as bridge:
+            assert bridge.process.wait() == 2
+            assert "commands /cmd_vel in ROS domain" in bridge.text
+        until(lambda: drives(side, log), "the first drives")
+        with Node("another", NetworkConfig(domain=domain)) as node:
+            node.publisher("/brain/cmd_vel", TWIST)
+            side.served.wait_for("/brain/cmd_vel has 2 publishers, another and brain: the newest message counts")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+@pytest.mark.parametrize("part", ["", "robots.host.process", "ros2.live.process node"], ids=["bridge", "loop", "node"])
+def test_a_base_stands_whichever_process_ends(part: str, number: signal.Signals, domain: int, tmp_path: Path) -> None:
+    with base(domain, tmp_path, "--robot.realtime.brain_timeout_s=0.5") as (side, _, log):
+        until(lambda: drives(side, log), "it drives")
+        pid = side.served.pid_of(part) if part else side.served.pid
+        os.kill(pid, number)
+        try:
+            until(lambda: twist(log) == STAND, "it stands")
+            if part and number == signal.SIGKILL:
+                assert side.served.process.wait() == 2
+        finally:
+            if number == signal.SIGSTOP:
+                os.kill(pid, signal.SIGCONT)
+
+
+def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_is_back(
+    domain: int, tmp_path: Path
+) -> None:
+    with arm(domain, tmp_path, silence_s=0.5) as (bridge, robot, _):
+        robot.signal(signal.SIGKILL)
+        bridge.wait_for("FAULT: ")
+        assert "/joint_states has sent no message for" in bridge.text or "newest reading is" in bridge.text
+        with (
+            Peer("ur_driver_standin.py", domain=domain) as back,
+            Node("brain", NetworkConfig(domain=domain)) as node,
+        ):
+            back.wait_event("ready")
+            side = Side(bridge, node)
+
+            def goes_on() -> bool:
+                side.send("/emergency_stop/reset", "std_msgs/msg/Empty", {})
+                goal = {"task_id": "after", "target_pose": {"position": {"x": 9.0}, "orientation": {"w": 1.0}}}
+                side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
+                return "fault" not in side.ended(1)[-1].message.lower()
+
+            until(goes_on, "goals are taken again")
+
+
+def test_a_robot_that_is_not_there_is_named(domain: int, tmp_path: Path) -> None:
+    given = ["bridge", "--robot.type=ur5", "--robot.plant=ros2", f"--robot.ros2.domain={domain}"]
+    with Program(serve.main, given, log=tmp_path / "log") as bridge:
+        assert bridge.process.wait() == 2
+        assert "/joint_states" in bridge.text
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--robot.type=ur5"], "robot.plant of the 'ur5' is not given; a bridge is in front of a robot"),
+        (["--robot.type=ur5", "--robot.plant=ros2", "--robot.action_space=tool"], "robot.action_space is 'tool'"),
+        (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant of the 'so101_follower' is not given"),
+        (["--robot.type=ur5", "--robot.plant=ros2", "--state_hz=0"], "state_hz is 0"),
+        (["--robot.type=ur5", "--robot.plant=ros2", "--duration_s=-1"], "duration_s is -1"),
+    ],
+)
+def test_a_bridge_in_front_of_nothing_is_refused(
+    options: list[str], error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ros2.main(["bridge", *options]) == 2
+    assert error in " ".join(capsys.readouterr().err.split())
