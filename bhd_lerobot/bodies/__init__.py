@@ -5,6 +5,7 @@ __all__ = [
     "body",
     "differential_base",
     "registry",
+    "scenes",
     "tabletop",
     "truth",
     "turtlebot3",

@@ -58,8 +58,8 @@ def _camera(_: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
 def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
     if keys.PHYSICS_STATE not in summary.features or "robot" not in summary.recording:
         return None
+    from bhd_lerobot.bodies.scenes import scene_from_json
     from bhd_lerobot.rollout.plots import Trajectory, draw_trajectories
-    from bhd_lerobot.rollout.provenance import scene_from_json
     from bhd_lerobot.rollout.replay import Replay
 
     simulation = Replay(state.root, 0).simulation

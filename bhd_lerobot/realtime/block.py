@@ -17,6 +17,7 @@ from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.realtime.shared_memory import SharedBlock
 
 WORDS = 64
+_SCENE = np.dtype([("text", "S32768")])
 
 
 class Word(IntEnum):
@@ -99,6 +100,7 @@ class LiveLayout:
             "words": 8 * WORDS,
             "fifo": CommandFifo.nbytes(1, self.width, self.fifo_capacity),
             "ring": StateRing.nbytes(self.state, self.ring_capacity),
+            "scenes": StateRing.nbytes(_SCENE, 2),
             **self.extra,
         }
         described = {
@@ -133,6 +135,7 @@ class LiveBlock:
         self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_LATCHED + 1])
         self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))
         self.ring = StateRing(self.state_dtype, layout["ring_capacity"], block.section("ring"))
+        self._scenes = StateRing(_SCENE, 2, block.section("scenes"))
 
     @classmethod
     def attach(cls, name: str) -> Self:
@@ -160,6 +163,17 @@ class LiveBlock:
     def set_estop(self) -> None:
         """Press the emergency stop of a robot that is watched."""
         self._block.write("words", 8 * Word.ESTOP, np.int64(time.monotonic_ns()).tobytes())
+
+    def publish_scene(self, text: str) -> None:
+        """Tell who watches in which scene the robot is, as JSON; one that is too long is left out."""
+        content = text.encode()
+        self._scenes.publish(np.array((content if len(content) <= _SCENE.itemsize else b"null",), _SCENE))
+
+    @property
+    def scene(self) -> tuple[int, str]:
+        """The scene that the robot is in, as JSON, and how many there have been."""
+        count, newest = len(self._scenes), self._scenes.latest()
+        return (0, "null") if newest is None else (count, newest["text"].item().decode())
 
     def section(self, name: str) -> memoryview:
         """Return the memory of a further section."""

@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot import __version__
-from bhd_lerobot.bodies.arenas import Arena
-from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.tabletop import TableObject, TableScene, Variation
+from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json, tuples
 from bhd_lerobot.control.commands import BrainCommand, Pose
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.errors import DatasetError
@@ -109,49 +107,10 @@ def _interventions(episode: Episode) -> dict[str, Any]:
     }
 
 
-def scene_to_json(scene: Any) -> str:
-    """Return a scene as JSON: a replay needs no generator that may have changed since."""
-    if isinstance(scene, Arena):
-        return _json(
-            {
-                "name": scene.name,
-                "extent": scene.extent,
-                "start": scene.start,
-                "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in scene.shapes],
-                **({} if scene.goal is None else {"goal": scene.goal}),
-                **({"report_seed": scene.report_seed} if scene.report_seed else {}),
-            }
-        )
-    return "null" if scene is None else _json(asdict(scene))
-
-
-def scene_from_json(text: str) -> Any:
-    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`; None if it is not known."""
-    try:
-        scene = json.loads(text)
-        if scene is None:
-            return None
-        if "shapes" in scene:
-            shapes = tuple(Shape(*row) for row in scene["shapes"])
-            goal = tuple(scene["goal"]) if "goal" in scene else None
-            ends, start, seed = tuple(scene["extent"]), tuple(scene["start"]), int(scene.get("report_seed", 0))
-            return Arena(scene["name"], shapes, ends, start, goal, report_seed=seed)
-        objects = tuple(TableObject(**_tuples(one)) for one in scene.pop("objects"))
-        variation = Variation(**_tuples(scene.pop("variation")))
-        return TableScene(objects=objects, variation=variation, **_tuples(scene))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"The recorded scene cannot be read: {error!r}.") from error
-
-
 def command_from_json(fields: dict[str, Any]) -> BrainCommand:
     """Return the goal whose fields were recorded."""
     pose = fields["target_pose"]
-    return BrainCommand(**{**_tuples(fields), "target_pose": None if pose is None else Pose(**_tuples(pose))})
-
-
-def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    """Turn the lists of JSON into tuples."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
+    return BrainCommand(**{**tuples(fields), "target_pose": None if pose is None else Pose(**tuples(pose))})
 
 
 def _json(value: Any) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.control.commands import BrainCommand, Goals
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
@@ -24,7 +25,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
+from bhd_lerobot.rollout.provenance import command_from_json, versions
 
 MODES = ("open_loop", "state", "both")
 

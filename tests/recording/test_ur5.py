@@ -6,9 +6,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import RenderingError
-from bhd_lerobot.rollout.provenance import scene_from_json
 from bhd_lerobot.rollout.replay import Replay
 from tests.recording.support import data_columns, episode_rows, run_record, start
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask

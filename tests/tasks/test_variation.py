@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json
 from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, MAX_OBJECTS, Variation
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
@@ -24,7 +25,6 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask

@@ -13,8 +13,7 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
-import numpy as np
-
+from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -27,7 +26,6 @@ from bhd_lerobot.robots.host.process import LiveSpec
 from bhd_lerobot.robots.host.remote_plant import plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import state_dtype
-from bhd_lerobot.ros2.live.network import NetworkConfig
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
@@ -93,22 +91,13 @@ class LiveLink:
         self.log = FrameLog(dtype, frames, self.block.section("frames"))
         self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
         try:
-            self._start(mirror, config, realtime)
+            self._start(mirror, realtime)
         except BaseException:
             self.close()
             raise
 
-    def _start(self, mirror: Host, config: Any, realtime: RealtimeConfig) -> None:
-        spec = LiveSpec(
-            host=f"{type(mirror).__module__}:{type(mirror).__qualname__}",
-            plant=config.plant,
-            values=_plain(config),
-            rates=mirror.rates,
-            body=mirror.body,
-            block=self.block.name,
-            privileges=realtime.privileges(config.require_realtime),
-            limits=realtime.limits(),
-        )
+    def _start(self, mirror: Host, realtime: RealtimeConfig) -> None:
+        spec = LiveSpec.of(mirror, self.block.name)
         pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
         self._spawn_piped("cerebellum", "bhd_lerobot.robots.host.process")
         if realtime.plant_process:
@@ -158,6 +147,7 @@ class LiveLink:
             self._answer("place", _ANSWER_S, "plant")
         self._ask("place", scene, seed)
         self._answer("place", _ANSWER_S)
+        self.block.publish_scene(scene_to_json(scene))
 
     def run(self) -> int:
         """Start the loop; return when its tick 0 is due, monotonic [ns]."""
@@ -282,9 +272,3 @@ class LiveLink:
         if kind != wanted:
             raise RealtimeError(f"The {name}'s process answered {kind!r} where {wanted!r} was expected.")
         return value
-
-
-def _plain(config: Any) -> dict[str, Any]:
-    """Return the values of a configuration that a simulation or a plant reads: those that need no class of LeRobot."""
-    kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating, NetworkConfig)
-    return {key: value for key, value in vars(config).items() if isinstance(value, kinds)}

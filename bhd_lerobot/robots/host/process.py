@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.state import StatePublisher
+from bhd_lerobot.ros2.live.network import NetworkConfig
 
 if TYPE_CHECKING:  # it takes 100 MB, and a base plans nothing
     from bhd_lerobot.control.motion.planning import Planning
@@ -65,6 +66,23 @@ class LiveSpec:
     block: str
     privileges: RealtimeSettings
     limits: LoopLimits
+
+    @classmethod
+    def of(cls, host: Host, block: str) -> Self:
+        """Return what runs a host like one of this process, with the block that its robot publishes in."""
+        config: Any = host.config
+        kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating, NetworkConfig)
+        return cls(
+            host=f"{type(host).__module__}:{type(host).__qualname__}",
+            plant=config.plant,
+            # Those that a simulation or a plant reads, and that need no class of LeRobot.
+            values={key: value for key, value in vars(config).items() if isinstance(value, kinds)},
+            rates=host.rates,
+            body=host.body,
+            block=block,
+            privileges=config.realtime.privileges(config.require_realtime),
+            limits=config.realtime.limits(),
+        )
 
     @property
     def _config(self) -> Any:

@@ -4,16 +4,15 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from bhd_lerobot.realtime.loop import LoopLimits
-from bhd_lerobot.realtime.privileges import RealtimeSettings
 from bhd_lerobot.robots.arm_host import ArmHost
 from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.config import BhdRobotConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.checked_plant import Unconnected
 from bhd_lerobot.robots.host.host import Host
-from bhd_lerobot.robots.host.link import _plain
 from bhd_lerobot.robots.host.process import LiveSpec
 
 PLANT = """
@@ -40,25 +39,19 @@ print({"torch", "lerobot"} & set(sys.modules))
 """
 
 
+STANDING: Any = {"plant": "standing:Standing", "clock": "realtime"}
+
+
 def spec_of(config: BhdRobotConfig, host: type[Host]) -> LiveSpec:
-    return LiveSpec(
-        host=f"{host.__module__}:{host.__qualname__}",
-        plant="standing:Standing",
-        values=_plain(config),
-        rates=config.rates,
-        body=config.body(),
-        block="",
-        privileges=RealtimeSettings(),
-        limits=LoopLimits(),
-    )
+    return LiveSpec.of(host(config, Unconnected()), block="")
 
 
 def test_processes_need_neither_torch_nor_lerobot_and_that_of_a_real_robot_no_mujoco(tmp_path: Path) -> None:
     (tmp_path / "standing.py").write_text(PLANT, encoding="utf-8")
     specs = [
-        spec_of(UR5Config(), ArmHost),
-        spec_of(UR5Config(control="impedance", action_space="tool"), ArmHost),
-        spec_of(TurtleBot3Config(imu=True), BaseHost),
+        spec_of(UR5Config(**STANDING), ArmHost),
+        spec_of(UR5Config(control="impedance", action_space="tool", **STANDING), ArmHost),
+        spec_of(TurtleBot3Config(imu=True, **STANDING), BaseHost),
     ]
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(tmp_path)], input=pickle.dumps(specs), capture_output=True, check=False
