@@ -24,7 +24,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "control.arm": ("bodies.body", "control", "control.geometry", "control.motion"),
     "realtime": ("bodies.body", "control.*"),
     "tasks": _TASKS,
-    "robots.host": ("bodies.body", "bodies.scenes", "sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
+    "robots.host": (
+        *("bodies.body", "bodies.scenes", "sim", "control.*", "realtime", "datasets.format"),
+        "ros2.live.network",
+    ),
     "robots.external": ("options", "bodies.body", "control", "datasets.format", "robots.host"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host", "ros2.live.network"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
@@ -118,7 +121,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "datasets.assembly",
         "datasets.edit",
     ),
-    "apps.monitor": ("control", "control.motion", "realtime"),
+    "apps.monitor": ("control", "control.motion", "realtime", "datasets.format", "apps.view"),
     "apps.doctor": (
         "options",
         "versions",

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from bhd_lerobot.apps.monitor.monitor import monitor
+from bhd_lerobot.apps.monitor.monitor import PORT, monitor
 from bhd_lerobot.options.command import Parser, exit_status
 
 
@@ -18,6 +18,11 @@ def _parser() -> Parser:
     parser.add_argument("--once", action="store_true", help="print one snapshot and exit")
     parser.add_argument("--json", action="store_true", help="as JSON: one snapshot, or one a second with --seconds")
     parser.add_argument("--seconds", type=float, help="exit after this time [s]")
+    parser.add_argument(
+        "--3d", dest="in_3d", action="store_true", help="also show robot, scene and scan in 3-D, on a page in a browser"
+    )
+    parser.add_argument("--port", type=int, default=PORT, help=f"of the page; 0 for any free one; default {PORT}")
+    parser.add_argument("--no-browser", action="store_true", help="with --3d, print the page's address only")
     return parser
 
 

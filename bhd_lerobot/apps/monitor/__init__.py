@@ -1,3 +1,3 @@
 """`bhd-monitor`: a run as it continues, in the terminal."""
 
-__all__ = ["monitor", "state", "view"]
+__all__ = ["monitor", "page", "state", "view"]

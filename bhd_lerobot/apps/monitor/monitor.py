@@ -6,7 +6,8 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import Self
 
@@ -21,6 +22,8 @@ from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
 
+PORT = 8767
+"""Of the page, by default."""
 _REFRESH_S = 0.125
 _SNAPSHOT_S = 0.5  # that a single snapshot measures rates over
 _LINE_S = 1.0  # between two lines where there is no terminal
@@ -132,9 +135,10 @@ def watch(
             return None
 
 
-def _live(block: LiveBlock, sampler: Sampler, console: Console, end: float) -> str | None:
+def _live(block: LiveBlock, sampler: Sampler, console: Console, end: float, address: str) -> str | None:
     with Keys(block.set_estop, key_source()) as keys:
         offered = KEYS if keys.there else "No keys: standard input is no terminal. Ctrl-C: quit"
+        offered += f"   3-D: {address}" if address else ""
         with Live(console=console, screen=True, auto_refresh=False) as live:
 
             def show(state: MonitorState) -> None:
@@ -167,21 +171,35 @@ def _end(seconds: float | None) -> float:
     return time.monotonic() + seconds if seconds is not None else math.inf
 
 
+@contextmanager
+def _page(block: LiveBlock, options: argparse.Namespace) -> Iterator[str]:
+    from bhd_lerobot.apps.monitor.page import served  # with kinematics and a web server
+    from bhd_lerobot.apps.view.server import open_browser
+
+    with served(block, options.port) as address:
+        print(f"{block.name} in 3-D: {address}", file=sys.stderr, flush=True)
+        if not options.no_browser:
+            open_browser(address)
+        yield address
+
+
 def monitor(options: argparse.Namespace) -> int:
     """Watch a robot as the options ask; return the exit status."""
     console = Console(highlight=False)
     if options.seconds is not None and not 0 < options.seconds < math.inf:
         raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
-    block = find(options.id)
-    try:
+    if options.in_3d and (options.once or (options.json and options.seconds is None)):
+        raise ConfigError("--3d serves a page for as long as the robot is watched; leave --once and --json out.")
+    with ExitStack() as opened:
+        block = find(options.id)
+        opened.callback(block.close)
+        address = opened.enter_context(_page(block, options)) if options.in_3d else ""
         sampler = Sampler(block)
         if console.is_terminal and not (options.once or options.json):
-            ended = _live(block, sampler, console, _end(options.seconds))
+            ended = _live(block, sampler, console, _end(options.seconds), address)
         else:
             console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
             ended = _print(block, sampler, options, console)
-    finally:
-        block.close()
     if ended is None:
         return 0
     print(f"The robot {block.name!r} {'has ended.' if ended == 'ended' else f'{ended}.'}", file=sys.stderr)

@@ -1,13 +1,21 @@
-"""The web server of `bhd-data view`: the page, the dataset as the page wants it, and the videos."""
+"""The web server of `bhd-data view`: the page, the dataset as the page wants it, and the videos.
+
+`bare_application`, `page` and `listening` serve other pages of the same parts, see `bhd-monitor --3d`.
+"""
 
 import asyncio
+import os
 import re
 import signal
-from collections.abc import Callable
+import sys
+import webbrowser
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 from aiohttp import web
+from aiohttp.typedefs import Handler
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset, stamp_of
 from bhd_lerobot.apps.view.guard import add_headers, guard, new_token
@@ -21,14 +29,22 @@ _TOKEN: web.AppKey[str] = web.AppKey("token", str)
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
-def application(dataset: ViewedDataset) -> web.Application:
-    """Return the server's application."""
+def bare_application() -> web.Application:
+    """Return a server of the parts that pages are made of, and of no page."""
     token = new_token()
     app = web.Application(middlewares=[guard(token), _respond_to_errors], client_max_size=64 * 1024)
-    app[_DATASET], app[_TOKEN] = dataset, token
+    app[_TOKEN] = token
     app.on_response_prepare.append(add_headers)
-    app.router.add_get("/", _page)
     app.router.add_get("/favicon.ico", _no_icon)
+    app.router.add_static("/static", STATIC)
+    return app
+
+
+def application(dataset: ViewedDataset) -> web.Application:
+    """Return the server of a dataset."""
+    app = bare_application()
+    app[_DATASET] = dataset
+    app.router.add_get("/", page("index.html"))
     app.router.add_get("/api/dataset", _dataset)
     app.router.add_get("/api/stamp", _stamp)
     app.router.add_get("/api/episodes/{index}", _episode)
@@ -37,23 +53,47 @@ def application(dataset: ViewedDataset) -> web.Application:
     app.router.add_get("/api/episodes/{index}/videos/{key}.mp4", _download)
     app.router.add_get("/api/episodes/{index}/images/{key}/{frame}", _image)
     app.router.add_get("/videos/{key}/{chunk}/{file}.mp4", _video)
-    app.router.add_static("/static", STATIC)
     return app
 
 
+@asynccontextmanager
+async def listening(app: web.Application, port: int) -> AsyncIterator[str]:
+    """Serve an application on this machine alone; yield its address.
+
+    Args:
+        port: 0 for any free one.
+
+    Raises:
+        ConfigError: the port cannot be had.
+    """
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--port is {port}; it must be between 0 and 65535. 0 takes any that is free.")
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
+    await runner.setup()
+    try:
+        try:
+            await web.TCPSite(runner, HOST, port).start()
+        except OSError as error:
+            raise ConfigError(
+                f"--port {port}: nothing can be served there on {HOST} ({error.strerror or error}). "
+                "Choose another port, or --port 0 for any that is free."
+            ) from error
+        yield f"http://{HOST}:{runner.addresses[0][1]}/"
+    finally:
+        await runner.cleanup()
+
+
 async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None]) -> signal.Signals:
-    """Serve the page until SIGINT or SIGTERM; return which it was.
+    """Serve the page of a dataset until SIGINT or SIGTERM; return which it was.
 
     Args:
         dataset: what is shown.
-        port: on 127.0.0.1; 0 for any free one.
+        port: 0 for any free one.
         ready: is called with the page's address as soon as it can be opened.
 
     Raises:
         ConfigError: the port cannot be had.
     """
-    runner = web.AppRunner(application(dataset), access_log=None, shutdown_timeout=0.5)
-    await runner.setup()
     loop = asyncio.get_running_loop()
     stop: asyncio.Future[signal.Signals] = loop.create_future()
     signals = (signal.SIGINT, signal.SIGTERM)
@@ -65,19 +105,28 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
     try:
         for number in signals:
             loop.add_signal_handler(number, end, number)
-        try:
-            await web.TCPSite(runner, HOST, port).start()
-        except OSError as error:
-            raise ConfigError(
-                f"--port {port}: nothing can be served there on {HOST} ({error.strerror or error}). "
-                "Choose another port, or --port 0 for any that is free."
-            ) from error
-        ready(f"http://{HOST}:{runner.addresses[0][1]}/")
-        return await stop
+        async with listening(application(dataset), port) as address:
+            ready(address)
+            return await stop
     finally:
         for number in signals:
             loop.remove_signal_handler(number)
-        await runner.cleanup()
+
+
+def open_browser(address: str) -> None:
+    """Open a page where a browser comes up in a window; a text browser would take the terminal."""
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(address)
+
+
+def page(name: str) -> Handler:
+    """Return what answers with a page of the folder `static`."""
+
+    async def answer(request: web.Request) -> web.Response:
+        text = (STATIC / name).read_text(encoding="utf-8").replace("{{token}}", request.app[_TOKEN])
+        return web.Response(text=text, content_type="text/html", headers={"Cache-Control": "no-store"})
+
+    return answer
 
 
 @web.middleware
@@ -88,11 +137,6 @@ async def _respond_to_errors(request: web.Request, handler: Any) -> web.StreamRe
     except BhdError as error:
         return web.json_response({"error": str(error)}, status=409)
     return response
-
-
-async def _page(request: web.Request) -> web.Response:
-    text = (STATIC / "index.html").read_text(encoding="utf-8").replace("{{token}}", request.app[_TOKEN])
-    return web.Response(text=text, content_type="text/html", headers={"Cache-Control": "no-store"})
 
 
 async def _no_icon(request: web.Request) -> web.Response:

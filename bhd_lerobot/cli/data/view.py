@@ -2,9 +2,6 @@
 
 import argparse
 import asyncio
-import os
-import sys
-import webbrowser
 from pathlib import Path
 
 from rich.console import Console
@@ -32,10 +29,8 @@ def _run(options: argparse.Namespace) -> int:
 
 def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> int:
     """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that states which."""
-    if not 0 <= port <= 65535:
-        raise ConfigError(f"--port is {port}; it must be between 0 and 65535. 0 takes any that is free.")
     try:
-        from bhd_lerobot.apps.view.server import serve
+        from bhd_lerobot.apps.view import server
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "aiohttp":
             raise
@@ -49,16 +44,9 @@ def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool =
         told = counted(episodes, "episode") if episodes else "empty, no episodes yet,"
         console.print(f"{escape(str(root))}: {told} at {address}", soft_wrap=True, highlight=False)
         console.print("Ctrl-C ends it.")
-        if open_browser and _has_display():
-            webbrowser.open(address)
+        if open_browser:
+            server.open_browser(address)
 
-    ended_by = asyncio.run(serve(dataset, port, ready))
+    ended_by = asyncio.run(server.serve(dataset, port, ready))
     console.print("Ended.")
     return 128 + ended_by
-
-
-def _has_display() -> bool:
-    """Tell whether a browser would come up in a window; a text browser would take this terminal."""
-    if sys.platform in ("darwin", "win32"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
