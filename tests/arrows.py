@@ -28,6 +28,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("bodies.body", "bodies.scenes", "sim", "control.*", "realtime", "datasets.format"),
         "ros2.live.network",
     ),
+    "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("options", "bodies.body", "control", "datasets.format", "robots.host"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host", "ros2.live.network"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
@@ -67,7 +68,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "ros2.robots": ("bodies", "control", "ros2.live", "ros2.messages"),
     "ros2.serve": (
         *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
-        *("robots", "robots.host", "ros2.live", "ros2.messages"),
+        *("robots", "robots.host", "robots.viewer", "ros2.live", "ros2.messages"),
         "sim.description",
     ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
@@ -84,12 +85,12 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
     "recording": (
-        *("options", "registry", "tasks", "bodies", "control", "robots.host", "robots.external"),
+        *("options", "registry", "tasks", "bodies", "control", "robots.host", "robots.external", "robots.viewer"),
         *("policies", "policies.teleop", "policies.topic", *_DATASETS, "datasets.writer"),
         *("rollout", "teleoperators", "hub", "cluster"),
     ),
     "evaluation": (
-        *("tasks", "control", "robots.external", "robots.host"),
+        *("tasks", "control", "robots.external", "robots.host", "robots.viewer"),
         *("policies", "policies.learned", "policies.perception", "policies.teleop"),
         "envs",  # registers our environments with LeRobot, for `--env.type`
         *("datasets.format", "datasets.timing", "datasets.writer"),

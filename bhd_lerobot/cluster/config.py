@@ -80,11 +80,12 @@ def check_engine(config: Any) -> None:
             "robot.clock is 'realtime' and engine is 'ray': a robot on the wall clock runs where its real-time process "
             "was set up, not wherever a cluster has room. Use --engine=local, or --robot.clock=lockstep."
         )
-    if getattr(config, "display_data", False):
-        raise ConfigError(
-            "display_data is true and engine is 'ray': frames stay on the machines of the cluster. Leave one of them "
-            "out."
-        )
+    for name in ("display_data", "view"):
+        if getattr(config, name, False):
+            raise ConfigError(
+                f"{name} is true and engine is 'ray': frames stay on the machines of the cluster. Leave one of them "
+                "out."
+            )
     if getattr(config, "estop_key", None):
         raise ConfigError(
             "estop_key is true and engine is 'ray': simulations on other machines have no key. Ctrl-C ends the run."

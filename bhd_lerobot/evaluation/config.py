@@ -10,6 +10,7 @@ from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
+from bhd_lerobot.robots.viewer.viewer import check_view
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
@@ -111,6 +112,8 @@ class EvalConfig(Comparison):
         ray: the cluster, and the share of it that is used.
         videos: number of failures of each brain with a video, earliest first; a brain without failures gets one of its
             first episode. By default 2 if images can be rendered, otherwise none.
+        view: show the simulation in MuJoCo's viewer, a window on this machine; of parallel simulations, the first. On
+            the lockstep clock it moves as fast as it is simulated. Closing the window does not end the evaluation.
         gate: limits of what is sent to a robot of another package.
         fps: frames a second of a robot of another package [Hz]; 30 if 0. Ours have `robot.fps`.
         plan: print how many episodes show a difference of `plan_points`, and run none.
@@ -139,6 +142,7 @@ class EvalConfig(Comparison):
     engine: str = "local"
     ray: RayConfig = field(default_factory=RayConfig)
     videos: int | None = None
+    view: bool = False
     gate: GateConfig = field(default_factory=GateConfig)
     fps: int = 0
     plan: bool = False
@@ -155,6 +159,7 @@ class EvalConfig(Comparison):
         for label, brain in self.brains.items():
             check_brain(f"brains.{label}", brain, self.robot)
         check_engine(self)
+        check_view(self.view, self.robot)
         if isinstance(self.task, FreeConfig) and not self.is_live:
             raise ConfigError(
                 "task.type is 'free', which a person judges, and robot.clock is 'lockstep', on which nobody can watch. "

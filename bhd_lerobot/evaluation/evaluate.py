@@ -36,6 +36,7 @@ from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots
+from bhd_lerobot.robots.viewer.viewer import prepare_view, viewed
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS, print_notes, progress_bars
 from bhd_lerobot.rollout.provenance import versions
@@ -161,6 +162,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     printed = console or Console()
     console = console or Console(stderr=True)
     refuse_results(config)
+    prepare_view(config.view)
     n = 1 if config.is_live else min(config.n_envs, len(config.indices))
     robots = make_robot(config.robot, n, config.threads, fps=config.fps, gate=config.gate)
     person = Operator(
@@ -168,6 +170,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     )
     pressed = EstopInputs(robots.estop, *([person.on_key] if config.by_person else []))
     with closing(robots), stop_on_signals() as stop, pressed, ExitStack() as opened:
+        opened.enter_context(viewed(robots, config.view))
         pool = None if config.engine == "local" else opened.enter_context(open_pool(config.ray, console))
         runs = []
         for label in config.chosen:

@@ -16,6 +16,7 @@ from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.recording.live_view import check_options
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
+from bhd_lerobot.robots.viewer.viewer import check_view
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
@@ -107,6 +108,8 @@ class RecordConfig:
             ours); by default if there is a terminal and the robot runs on the wall clock.
         estop_signal: signal that also triggers an emergency stop: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
         bell: ring the terminal's bell when a take on the wall clock begins and when it ends.
+        view: show the simulation in MuJoCo's viewer, a window on this machine; of parallel simulations, the first. On
+            the lockstep clock it moves as fast as it is simulated. Closing the window does not end the recording.
         display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
             these options are those of `lerobot-record`.
         display_mode: viewer: `rerun` or `foxglove`.
@@ -144,6 +147,7 @@ class RecordConfig:
     estop_key: bool | None = None
     estop_signal: str = "SIGUSR1"
     bell: bool = True
+    view: bool = False
     display_data: bool = False
     display_mode: str = "rerun"
     display_ip: str | None = None
@@ -172,6 +176,7 @@ class RecordConfig:
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)
+        check_view(self.view, self.robot)
         check_engine(self)
         estop_signal(self.estop_signal)
         if self.split not in SPLITS:

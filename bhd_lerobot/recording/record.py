@@ -36,6 +36,7 @@ from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.recording.takes import Takes
 from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
+from bhd_lerobot.robots.viewer.viewer import prepare_view, viewed
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import Marks, key_help
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
@@ -64,6 +65,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     """Record the episodes that a configuration describes; those that were saved before an error are intact."""
     if config.dataset.push_to_hub:
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
+    prepare_view(config.view)
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
     is_here = config.engine == "local"  # otherwise one simulation, which only states what is recorded
@@ -81,6 +83,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             _add_estop_inputs(config, pressed, console)
         robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
         outer.enter_context(closing(robots))
+        outer.enter_context(viewed(robots, config.view))
         pressed.attach(robots.estop)
         if not is_main:  # no signal can be handled: an error, of which a robot that cannot be made comes first
             _add_estop_inputs(config, pressed, console)

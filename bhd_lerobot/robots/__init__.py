@@ -16,4 +16,5 @@ __all__ = [
     "turtlebot3",
     "ur5",
     "ur5_simulation",
+    "viewer",
 ]

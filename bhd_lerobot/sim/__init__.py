@@ -12,5 +12,6 @@ __all__ = [
     "scene",
     "table_stage",
     "tabletop",
+    "window",
     "world",
 ]

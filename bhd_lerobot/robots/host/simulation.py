@@ -1,7 +1,7 @@
 """n simulated robots: a host with a world."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, ClassVar
 
@@ -18,6 +18,7 @@ from bhd_lerobot.sim.world import Snapshot, World
 
 # Streams of random numbers of one episode: what one draws more of must not shift the others.
 SENSOR_STREAM = 1
+_NONE = np.zeros(0, np.intp)
 
 
 class Simulation(Host):
@@ -36,6 +37,8 @@ class Simulation(Host):
         host_class: the class of its host without a world, for a plant of its own.
         view: the camera outside of the robot, for videos.
         video_speed: how much faster than the robot was a video of it is shown.
+        on_change: is called at the start of episodes, with robots and scenes, and with none of them at the end of a
+            frame.
     """
 
     host_class: ClassVar[type[Host]]
@@ -43,6 +46,7 @@ class Simulation(Host):
     video_speed = 1
     knows = None
     world: World
+    on_change: Callable[[NDArray[np.intp], Sequence[Any]], None] | None = None
 
     def __init__(self, config: Any, cerebellum: Cerebellum, *, world: World, **options: Any) -> None:
         self.world = world
@@ -88,6 +92,8 @@ class Simulation(Host):
         super().reset(ids, scenes, seeds)
         self._active = None if self.running.all() else np.flatnonzero(self.running)
         self._started(np.asarray(ids, np.intp), seeds)
+        if self.on_change is not None:
+            self.on_change(np.asarray(ids, np.intp), scenes)
         return self.snapshot(ids).state
 
     def stop(self, ids: NDArray[np.intp]) -> None:
@@ -98,6 +104,8 @@ class Simulation(Host):
     def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
         report = super()._frame(receipt, command)
         self.world.check()
+        if self.on_change is not None:
+            self.on_change(_NONE, ())
         return report
 
     def render(self, sim: int, camera: str) -> NDArray[np.uint8]:

@@ -11,6 +11,7 @@ from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.viewer.viewer import prepare_view
 from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
@@ -39,11 +40,14 @@ class ServeConfig(ServiceConfig):
         duration_s: end after this time [s]; 0: run until Ctrl-C.
         joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
         clock: publish ``/clock`` as well.
+        view: show the simulation in MuJoCo's viewer, a window on this machine. Closing the window does not end the
+            robot.
         foxglove_port: serve all topics to the Foxglove app on this TCP port of this machine; 0: off.
     """
 
     joint_states_hz: float = float(JOINT_STATES_HZ)
     clock: bool = False
+    view: bool = False
     foxglove_port: int = 0
 
     def __post_init__(self) -> None:
@@ -80,6 +84,7 @@ def serve(
         RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
     """
     require_cyclonedds()
+    prepare_view(config.view)
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
     node = partial(MirroredNode, server=foxglove) if foxglove else Node
 
@@ -93,7 +98,15 @@ def serve(
     try:
         scene = simulation.start_scene(config.robot)
         state = run_service(
-            config, simulation, scene, parts, console=console, ended=ended, node=node, title="is a ROS 2 robot"
+            config,
+            simulation,
+            scene,
+            parts,
+            console=console,
+            ended=ended,
+            node=node,
+            view=config.view,
+            title="is a ROS 2 robot",
         )
         touched, ticks = int(state["touches"].sum()), int(state["executed"])
         console.print(f"Contact in {touched} of {ticks} control ticks.")

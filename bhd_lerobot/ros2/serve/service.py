@@ -14,6 +14,7 @@ from rich.console import Console
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.viewer.viewer import viewed
 from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
@@ -54,6 +55,7 @@ def run_service(
     ended: threading.Event | None = None,
     title: str,
     node: Callable[..., Node] = Node,
+    view: bool = False,
 ) -> Any:
     """Run a robot and its topics until SIGINT or SIGTERM; return the robot's last state.
 
@@ -65,6 +67,7 @@ def run_service(
         ended: ends it as well, once it is set.
         title: what the robot is from now on, as the first line says.
         node: makes the node of a name, a network and a namespace.
+        view: show the simulation in MuJoCo's viewer.
 
     Raises:
         ConfigError: Cyclone DDS is not installed, or the configuration does not fit.
@@ -76,6 +79,7 @@ def run_service(
         for number in (signal.SIGINT, signal.SIGTERM):
             running.callback(signal.signal, number, signal.signal(number, lambda *_: end.set()))
         host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
+        running.enter_context(viewed(host, view))
         host.reset(np.zeros(1, np.intp), [scene], [getattr(robot, "seed", 0)])
         host.begin()
         for line in host.notes:

@@ -1,0 +1,3 @@
+"""MuJoCo's viewer of a simulated robot, in a process of its own."""
+
+__all__ = ["process", "viewer"]
