@@ -29,6 +29,7 @@ WALL_CLOCK = (
     "recording/test_reset.py",
     "robots/external/",
     "robots/host/",
+    "robots/viewer/",
     "rollout/test_episode.py",
     "rollout/test_marks.py",
     "ros2/live/",

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ def served(block: LiveBlock, port: int) -> Iterator[str]:
         end, live = asyncio.Event(), LivePage(block)
         app = bare_application()
         app.router.add_get("/", page("live.html"))
-        app.router.add_get("/api/live", lambda request: _stream(request, live, end))
+        app.router.add_get("/api/live", partial(_stream, live=live, end=end))
         try:
             async with listening(app, port) as address:
                 started.set_result((address, asyncio.get_running_loop(), end))

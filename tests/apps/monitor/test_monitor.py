@@ -10,6 +10,8 @@ import sys
 import termios
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -353,6 +355,8 @@ def test_the_only_robot_is_found_and_of_several_one_is_to_be_named(robot: Robot)
         (["nobody"], "'nobody'"),
         (["--seconds=0"], "--seconds is 0"),
         (["--seconds=nan"], "is nan"),
+        (["--3d", "--once"], "leave --once and --json out"),
+        (["--3d", "--json"], "leave --once and --json out"),
     ],
 )
 def test_bad_arguments_end_with_a_message_and_status_2(
@@ -376,6 +380,19 @@ def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixtu
     assert (shown["id"], shown["mode"], shown["control_hz"]) == (NAME, "HOLD", 200)
     assert main(["--json", "--seconds=0.01"]) == 0
     assert [json.loads(line)["id"] for line in capsys.readouterr().out.splitlines()] == [NAME, NAME]
+
+
+@pytest.mark.usefixtures("only")
+def test_a_page_is_served_for_as_long_as_it_watches(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([NAME, "--3d", "--no-browser", "--port=0", "--json", "--seconds=0.01"]) == 0
+    printed = capsys.readouterr()
+    assert [json.loads(line)["id"] for line in printed.out.splitlines()] == [NAME, NAME]
+    address = printed.err.split()[-1]
+    assert address.startswith("http://127.0.0.1:")
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(address)
+    assert main([NAME, "--3d", "--port=70000"]) == 2
+    assert "--port is 70000" in capsys.readouterr().err
 
 
 # It is to be its controlling terminal, in whose foreground it is.

@@ -3,75 +3,22 @@
 import json
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
 
 from bhd_lerobot.apps.view.packing import unpack
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from tests.apps.browser import ARGUMENTS, found_browser, opened, wait_until
 from tests.apps.view.support import Served, served
 from tests.datasets.loader.support import FRONT, PHOTO, WRIST, images, length, record_ours, record_stock
-from tests.requirements import not_tested
-
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-ARGUMENTS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--enable-unsafe-swiftshader",  # WebGL without a GPU
-)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=found_browser(), args=list(ARGUMENTS))
-        yield chromium
-        chromium.close()
-
-
-def found_browser() -> str:
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
-        not_tested(f"the page of bhd-data view; no browser is installed: install one of {', '.join(BROWSERS)}")
-    return found
 
 
 @pytest.fixture(scope="module")
 def video_dataset(tmp_path_factory) -> Path:
     return record_ours(tmp_path_factory.mktemp("page") / "video_dataset", 5, (FRONT, WRIST))
-
-
-@contextmanager
-def opened(
-    browser: Any, server: Served, place: str = "", *, width: int = 1600, height: int = 900, scheme: str = "light"
-) -> Iterator[Any]:
-    """Open the page; at the end nothing may have gone wrong in it, and nothing may have been requested of others."""
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    context.set_default_timeout(0)  # the test's own is enough
-    page = context.new_page()
-    wrong: list[str] = []
-    requested: list[str] = []
-    page.on("console", lambda message: wrong.append(message.text) if is_wrong(message) else None)
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("request", lambda request: requested.append(request.url))
-    page.goto(server.url + place)
-    page.wait_for_selector("body[data-ready=yes]")
-    page.wrong = wrong
-    yield page
-    assert [url for url in requested if not url.startswith((server.url, "data:"))] == []
-    assert requested
-    assert wrong == []
-    context.close()
-
-
-def is_wrong(message: Any) -> bool:
-    """Return whether a line of the console is about our page; drawing without a GPU makes the browser report stalls."""
-    return message.type in ("error", "warning") and "GPU stall" not in message.text
 
 
 def shown_frames(page: Any) -> dict[str, set[int]]:
@@ -84,12 +31,6 @@ def shown_frames(page: Any) -> dict[str, set[int]]:
                [kind, [...document.querySelectorAll(query)].map((one) => Number(one.dataset.frame))])"""
     )
     return {kind: set(frames) for kind, frames in found}
-
-
-def wait_until(page: Any, expression: str, argument: Any = None) -> None:
-    """Wait until an expression is true. Playwright's own way needs `eval`, which the page's policy forbids."""
-    while not page.evaluate(expression, argument):
-        page.wait_for_timeout(20)
 
 
 def wait_for_plots(page: Any, count: int) -> None:
@@ -111,7 +52,7 @@ def scrub(page: Any, share: float) -> None:
 
 
 def test_everything_moves_together(browser, base) -> None:
-    with served(base) as server, opened(browser, server) as page:
+    with served(base) as server, opened(browser, server.url) as page:
         assert page.title().startswith("base")
         assert numbers(page) == [0, 1, 2]
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
@@ -141,7 +82,7 @@ def test_everything_moves_together(browser, base) -> None:
 
 
 def test_playing_goes_on_to_the_end_and_stops(browser, base) -> None:
-    with served(base) as server, opened(browser, server) as page:
+    with served(base) as server, opened(browser, server.url) as page:
         page.keyboard.press("1")
         page.keyboard.press(" ")
         assert page.get_attribute("#play", "aria-label") == "Pause"
@@ -166,7 +107,7 @@ def test_the_video_shows_the_frame_that_is_chosen(browser, video_dataset) -> Non
       context.drawImage(video, 0, 0, 10, 8);
       return [...context.getImageData(0, 0, 10, 8).data];
     }"""
-    with served(video_dataset) as server, opened(browser, server) as page:
+    with served(video_dataset) as server, opened(browser, server.url) as page:
         for index, frame in ((0, 0), (3, 4), (1, 2)):
             select(page, index)
             scrub(page, (frame + 0.5) / length(index))
@@ -184,7 +125,7 @@ def test_the_video_shows_the_frame_that_is_chosen(browser, video_dataset) -> Non
 
 
 def test_filters_search_and_sorting(browser, video_dataset) -> None:
-    with served(video_dataset) as server, opened(browser, server) as page:
+    with served(video_dataset) as server, opened(browser, server.url) as page:
         chips = page.eval_on_selector_all(".chip", "chips => chips.map((one) => one.textContent)")
         assert chips == ["success3", "collision1", "timeout1"]
         page.click(".chip[data-outcome=success]")
@@ -226,7 +167,7 @@ def test_filters_search_and_sorting(browser, video_dataset) -> None:
 
 
 def test_two_episodes_side_by_side(browser, base) -> None:
-    with served(base) as server, opened(browser, server) as page:
+    with served(base) as server, opened(browser, server.url) as page:
         select(page, 2)
         page.keyboard.press("c")  # with the one before
         page.wait_for_selector(".card-b[data-episode='0']")
@@ -247,7 +188,7 @@ def test_two_episodes_side_by_side(browser, base) -> None:
         wait_until(page, "!document.querySelector('.card-b')")
         assert page.locator("video").count() == 1
         assert page.get_attribute("#track", "data-frame") == "5"  # where it was
-    with served(base) as server, opened(browser, server, "#episode=1&compare=2&t=1") as page:
+    with served(base) as server, opened(browser, server.url, "#episode=1&compare=2&t=1") as page:
         assert shown_frames(page)["drawing"] == {10}
         assert numbers(page, ".row.compared") == [2]
 
@@ -257,7 +198,7 @@ def server_videos(server: Served) -> list[float]:
 
 
 def test_an_arm_its_plan_and_the_requested_action(browser, arm) -> None:
-    with served(arm) as server, opened(browser, server, scheme="dark") as page:
+    with served(arm) as server, opened(browser, server.url, scheme="dark") as page:
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
         assert kinds == ["arm-above", "arm-side", "scene"]
         assert page.locator("[data-lane=subtask] .run").count() >= 4
@@ -295,7 +236,7 @@ def test_an_arm_its_plan_and_the_requested_action(browser, arm) -> None:
 
 def test_a_mark_is_shown_and_on_disk(browser, base, tmp_path) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
-    with served(root) as server, opened(browser, server) as page:
+    with served(root) as server, opened(browser, server.url) as page:
         select(page, 1)
         scrub(page, 0.525)
         page.click("#mark-success")
@@ -325,7 +266,7 @@ def test_a_mark_is_shown_and_on_disk(browser, base, tmp_path) -> None:
 
 def test_changes_on_disk_are_reported(browser, base, tmp_path) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
-    with served(root) as server, opened(browser, server) as page:
+    with served(root) as server, opened(browser, server.url) as page:
         select(page, 2)
         shutil.rmtree(root)
         page.wait_for_selector("#banner:has-text('has changed')")
@@ -342,7 +283,7 @@ def test_a_missing_video_is_reported_in_its_place(browser, base, tmp_path) -> No
     root = Path(shutil.copytree(base, tmp_path / "d"))
     with served(root) as server:
         next(root.rglob("*.mp4")).unlink()
-        with opened(browser, server) as page:
+        with opened(browser, server.url) as page:
             page.wait_for_selector(".video .problem:has-text('missing')")
             wait_for_plots(page, 7)
             scrub(page, 0.525)
@@ -355,7 +296,10 @@ def test_nothing_is_wider_than_the_window(browser, base, width, height) -> None:
     sizes = (
         "() => ['html', 'main'].map((name) => document.querySelector(name)).map((e) => e.scrollWidth - e.clientWidth)"
     )
-    with served(base) as server, opened(browser, server, "#episode=0&compare=1", width=width, height=height) as page:
+    with (
+        served(base) as server,
+        opened(browser, server.url, "#episode=0&compare=1", width=width, height=height) as page,
+    ):
         wait_for_plots(page, 7)
         assert page.evaluate(sizes) == [0, 0]
         boxes = [page.locator(".view").nth(number).bounding_box() for number in range(4)]
@@ -366,11 +310,11 @@ def test_nothing_is_wider_than_the_window(browser, base, width, height) -> None:
 def test_three_dimensions(browser, base, arm) -> None:
     """What is seen follows the time and the mouse; a browser without WebGL says so."""
     flat = browser.browser_type.launch(executable_path=found_browser(), args=[*ARGUMENTS, "--disable-3d-apis"])
-    with served(base) as server, opened(flat, server) as page:
+    with served(base) as server, opened(flat, server.url) as page:
         assert "has no WebGL" in page.text_content("[data-view=scene]")
     flat.close()
     for root in (base, arm):
-        with served(root) as server, opened(browser, server) as page:
+        with served(root) as server, opened(browser, server.url) as page:
             canvas = page.locator("[data-view=scene] canvas")
             at = "(frame) => document.querySelector('[data-view=scene] canvas').dataset.frame === frame"
             wait_until(page, at, "0")
@@ -391,7 +335,10 @@ def test_three_dimensions(browser, base, arm) -> None:
 
 
 def test_a_phone(browser, base) -> None:
-    with served(base) as server, opened(browser, server, "#episode=1", width=390, height=844, scheme="dark") as page:
+    with (
+        served(base) as server,
+        opened(browser, server.url, "#episode=1", width=390, height=844, scheme="dark") as page,
+    ):
         assert not page.locator("#list").is_visible()
         page.click("#episodes-button")
         assert numbers(page) == [0, 1, 2]
@@ -415,16 +362,16 @@ def test_an_address_that_names_no_episode_says_so(browser, base) -> None:
         ("#episode=0&compare=9", "There is no episode 9"),
         ("#episode=last", "The address names episode last, which is no number"),
     ):
-        with served(base) as server, opened(browser, server, place) as page:
+        with served(base) as server, opened(browser, server.url, place) as page:
             assert message in page.text_content("#toast")
             assert page.get_attribute(".card-a", "data-episode") == "0"
-    with served(base) as server, opened(browser, server) as page:  # an address that is changed by hand
+    with served(base) as server, opened(browser, server.url) as page:  # an address that is changed by hand
         page.evaluate("location.hash = '#episode=2'")
         page.wait_for_selector(".card-a[data-episode='2']")
 
 
 def test_an_episode_is_downloaded(browser, base) -> None:
-    with served(base) as server, opened(browser, server, "#episode=1") as page:
+    with served(base) as server, opened(browser, server.url, "#episode=1") as page:
         page.click(".card-a button:has-text('download')")
         names = page.eval_on_selector_all("dialog a", "links => links.map((one) => one.download)")
         assert names == ["base-episode-1.csv", "base-episode-1-front.mp4"]
@@ -435,7 +382,7 @@ def test_an_episode_is_downloaded(browser, base) -> None:
 
 
 def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:
-    with served(record_stock(tmp_path / "stock", cameras=True)) as server, opened(browser, server) as page:
+    with served(record_stock(tmp_path / "stock", cameras=True)) as server, opened(browser, server.url) as page:
         assert page.text_content(".card-a .badge") == "not judged"
         wait_until(page, "document.querySelector('video').readyState >= 2")  # AV1
         scrub(page, 0.59)
@@ -448,7 +395,7 @@ def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:
     features["control.age"] = {"dtype": "float32", "shape": (1,), "names": None}
     recorder = DatasetRecorder.create("t/one", 10, features, robot_type="toy", root=tmp_path / "one", recording={})
     recorder.finalize()
-    with served(tmp_path / "one") as server, opened(browser, server) as page:
+    with served(tmp_path / "one") as server, opened(browser, server.url) as page:
         assert "no episodes" in page.text_content("#nothing")
     recorder = DatasetRecorder.create("t/one", 10, features, robot_type="toy", root=tmp_path / "two", recording={})
     for frames in (1, 4):
@@ -457,7 +404,7 @@ def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:
         writer.set_columns({"action": np.zeros((frames, 2), np.float32), "control.age": ages})
         recorder.save(writer, task="<b>stand</b>", metadata={"outcome": "<img src=x>"})
     recorder.finalize()
-    with served(tmp_path / "two") as server, opened(browser, server) as page:
+    with served(tmp_path / "two") as server, opened(browser, server.url) as page:
         wait_for_plots(page, 3)
         assert page.text_content(".instruction") == "<b>stand</b>"  # what somebody wrote is text
         assert page.text_content(".card-a .badge") == "<img src=x>"

@@ -6,6 +6,7 @@ import { startTheme } from "./theme.js";
 import { startViews } from "./views.js";
 
 const SILENT_S = 0.5; // so old a state of a running robot is worth a word
+let newest = null; // what was sent and is not drawn yet
 let built = null; // where a base was when the views were made that show its surroundings
 
 function begin({ title, views, scene }, arrays) {
@@ -51,5 +52,14 @@ state.dataset = { cameras: [] };
 startTheme();
 startViews();
 const source = new EventSource("/api/live"); // connects again by itself, and is then sent everything anew
-source.onmessage = ({ data }) => show(JSON.parse(data));
+source.onmessage = ({ data }) => {
+  const message = JSON.parse(data);
+  const isFree = newest === null; // what cannot be drawn as fast as it comes is left out
+  newest = newest?.about ? { about: newest.about, ...message } : message;
+  if (isFree) requestAnimationFrame(() => {
+    const shown = newest;
+    newest = null;
+    show(shown);
+  });
+};
 source.onerror = () => say("The monitor does not answer: it was left, or the robot has ended. Start bhd-monitor --3d again.");
