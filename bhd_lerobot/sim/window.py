@@ -1,5 +1,7 @@
 """MuJoCo's own viewer, on a display."""
 
+import os
+
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.camera import Pose
@@ -20,8 +22,10 @@ def require_display() -> None:
     try:
         import glfw
 
-        glfw.set_error_callback(lambda code, text: causes.append(text.decode(errors="replace")))
-        if glfw.init():
+        before = glfw.set_error_callback(lambda code, text: causes.append(os.fsdecode(text)))
+        is_there = glfw.init()
+        glfw.set_error_callback(before)  # type: ignore[arg-type]  # None: its own
+        if is_there:
             glfw.terminate()
             return
     except ImportError as error:
