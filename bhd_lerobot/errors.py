@@ -55,6 +55,10 @@ class RealtimeError(BhdError):
     """The real-time process cannot be started as asked, has ended, or does not answer."""
 
 
+class PlantLostError(RealtimeError):
+    """What drives a robot has ended, and does not come back before the plant is opened again."""
+
+
 class RenderingError(BhdError):
     """No image can be rendered on this machine; the message names the remedy."""
 

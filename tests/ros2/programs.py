@@ -108,13 +108,21 @@ class Bridged(Program):
     def __init__(self, robot: str, *options: str, domain: int, log: Path, silence_s: float = 5) -> None:
         plant = ("--robot.plant=ros2", f"--robot.ros2.domain={domain}", f"--robot.ros2.silence_s={silence_s}")
         # However late the commands come, as on a loaded machine, a robot that follows is not blocked.
-        given = ["bridge", f"--robot.type={robot}", *plant, "--robot.ros2.latency_s=1", *RELAXED, *options]
+        names = {option.partition("=")[0] for option in options}
+        relaxed = [one for one in RELAXED if one.partition("=")[0] not in names]
+        given = ["bridge", f"--robot.type={robot}", *plant, "--robot.ros2.latency_s=1", *relaxed, *options]
         super().__init__(serve.main, given, log=log)
 
     def __enter__(self) -> Self:
         super().__enter__()
         self.wait_for("is behind a bridge")
         return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """End it in order, so that nothing of it commands the robot any more."""
+        if error is None and self.process.poll() is None:
+            assert self.stop() == 0, self.text
+        super().__exit__(kind, error, _)
 
 
 class Side:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.control.reading_check import ahead_of_time
-from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
+from bhd_lerobot.errors import ConfigError, PlantLostError, RealtimeError, as_text
 
 _READY_S = 10.0  # that a robot may take until it follows commands: brakes are released, a stop is left
 _AGAIN_S = 1.0  # after which a robot that is still stopped is asked again: a datagram is lost, or it asks for a pause
@@ -89,7 +89,7 @@ class CheckedPlant(Plant):
         self._plant, self._name, self._oldest_ns, self._clock, self._sleep = plant, name, oldest_ns, clock, sleep
         self._stamp_ns = np.zeros(1, np.int64)
         self.problem = ""
-        self.is_muted = False
+        self.is_muted = self.is_lost = False
 
     @classmethod
     def made(cls, name: str, config: Any, body: Any, oldest_ns: int) -> Self:
@@ -216,4 +216,5 @@ class CheckedPlant(Plant):
             return call(*arguments)
         except Exception as error:  # of another package's code: the loop continues, and stops the robot
             self.problem = self.problem or as_text(error)
+            self.is_lost |= isinstance(error, PlantLostError)
             return None

@@ -215,6 +215,7 @@ class LiveProcess:
 
     def _problem(self) -> str:
         plant, cerebellum = self._plant, self._host.cerebellum
+        self._words[Word.PLANT_LOST] = plant is not None and plant.is_lost
         named = cerebellum.readings.problem or (plant.not_ready(cerebellum.reading) if plant else "")
         cause = cerebellum.controller.cause
         return named or cerebellum.readings.silence or f"{cause} {plant.hint if cause and plant else ''}".rstrip(" .")

@@ -322,6 +322,11 @@ class LiveHost:
         return problem_of(self.bridge.latest) or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
 
     @property
+    def is_lost(self) -> bool:
+        """Whether what drives the robot has ended, so that no reset helps."""
+        return bool(self.link.block.words[Word.PLANT_LOST])
+
+    @property
     def modes(self) -> NDArray[np.int8]:
         """The newest `Mode`, shape (1,)."""
         mode: NDArray[np.int8] = self.bridge.latest["mode"].copy()

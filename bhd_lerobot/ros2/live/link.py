@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import PlantLostError, RealtimeError
 from bhd_lerobot.ros2.live.channel import Channel, Word
 from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.spec import NodeSpec
@@ -161,7 +161,7 @@ class NodeLink:
             if process is None:
                 continue
             if process.poll() is not None:
-                raise RealtimeError(f"The process of the ROS 2 {role} ended with status {process.returncode}.")
+                raise PlantLostError(f"The process of the ROS 2 {role} ended with status {process.returncode}.")
             if self.channel.silence_s(word) > silence_s:
                 raise RealtimeError(f"The process of the ROS 2 {role} is stopped.")
 

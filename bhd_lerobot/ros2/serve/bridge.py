@@ -10,7 +10,7 @@ from rich.console import Console
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.control.messages import Mode, Reason, Watchdog
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of, raised
@@ -43,9 +43,8 @@ class BridgeConfig(ServiceConfig):
         robot: Any = self.robot
         if not getattr(robot, "plant", ""):
             raise ConfigError(
-                f"robot.plant of the {robot.type!r} is not given; a bridge is in front of a robot that a plant drives: "
-                "turtlebot3 or ur5 with --robot.plant=ros2, or with a class, package.module:Class. "
-                "`bhd-ros2 serve` serves a simulated robot."
+                "robot.plant is not given; a bridge is in front of a robot that a plant drives: turtlebot3 or ur5 with "
+                "--robot.plant=ros2, or with a class, package.module:Class. `bhd-ros2 serve` serves a simulated robot."
             )
         if isinstance(robot.body(), MobileBase):
             robot.odometry = True  # a goal is reached by it
@@ -107,7 +106,7 @@ class Setpoints:
 
 
 class Faults:
-    """Reports each fault of the robot once, with its cause and the remedy.
+    """Reports each fault of the robot once, with its cause and the remedy; one that no reset ends is an error.
 
     Args:
         host: the robot.
@@ -115,7 +114,7 @@ class Faults:
     """
 
     def __init__(self, host: LiveHost, report: Callable[[str], None]) -> None:
-        self._report, self._before = report, host.bridge.latest.copy()
+        self._host, self._report, self._before = host, report, host.bridge.latest.copy()
 
     def outputs(self) -> Iterable[Output]:
         """Return a look at the mode, which publishes nothing."""
@@ -134,6 +133,8 @@ class Faults:
         mode = Mode(int(state.record["mode"][0]))
         if mode == before["mode"][0] or mode not in (Mode.FAULT, Mode.ESTOP):
             return
+        if mode == Mode.FAULT and self._host.is_lost:
+            raise RealtimeError(f"{problem_of(state.record).removesuffix('.')}. The robot is stopped; start again.")
         _, flags = raised(before, state.record)
         noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in Watchdog(flags))
         why = "the emergency stop was pressed" if mode == Mode.ESTOP else problem_of(state.record) or noticed

@@ -65,7 +65,6 @@ def test_goals_of_a_brain_move_an_arm_behind_its_driver_again_and_again(domain: 
             assert (summary["sent"], summary["once"], summary["unknown"]) == (2, 2, 0)
             assert all(line["success"] for line in brain.events("result")), brain.events("result")
         assert np.abs(np.array(log_of(log, "state")[-1]["position"]) - start).max() > 0.1
-        assert bridge.stop() == 0
     lines = log_of(log, "positions")
     sent, times = (np.array([line[key] for line in lines]) for key in ("given", "monotonic"))
     assert np.abs(sent[0] - start).max() < 0.01  # it starts where it is
@@ -116,9 +115,8 @@ def test_what_commands_a_robot_twice_is_named(domain: int, tmp_path: Path) -> No
             assert bridge.process.wait() == 2
             assert "commands /cmd_vel in ROS domain" in bridge.text
         until(lambda: drives(side, log), "the first drives")
-        with Node("another", NetworkConfig(domain=domain)) as node:
-            node.publisher("/brain/cmd_vel", TWIST)
-            side.served.wait_for("/brain/cmd_vel has 2 publishers, another and brain: the newest message counts")
+        with Peer("topic.py", "pub", "/brain/cmd_vel", TWIST, domain=domain):
+            side.served.wait_for("/brain/cmd_vel has 2 publishers, brain and topic_pub: the newest message counts")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
@@ -170,9 +168,9 @@ def test_a_robot_that_is_not_there_is_named(domain: int, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (["--robot.type=ur5"], "robot.plant of the 'ur5' is not given; a bridge is in front of a robot"),
+        (["--robot.type=ur5"], "robot.plant is not given; a bridge is in front of a robot"),
         (["--robot.type=ur5", "--robot.plant=ros2", "--robot.action_space=tool"], "robot.action_space is 'tool'"),
-        (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant of the 'so101_follower' is not given"),
+        (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant is not given"),
         (["--robot.type=ur5", "--robot.plant=ros2", "--state_hz=0"], "state_hz is 0"),
         (["--robot.type=ur5", "--robot.plant=ros2", "--duration_s=-1"], "duration_s is -1"),
     ],
