@@ -34,6 +34,7 @@ from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.ros2.serve.bridge import BridgeConfig
 from bhd_lerobot.ros2.serve.serve import ServeConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
@@ -109,6 +110,7 @@ def pages() -> dict[Path, str]:
         ]
     texts["ros2"] = [
         *("# `bhd-ros2`\n", "## `bhd-ros2 serve`\n", *_options(ServeConfig, "", "ros2.md", listed)),
+        *("## `bhd-ros2 bridge`\n", *_options(BridgeConfig, "", "ros2.md", listed)),
         *("## `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())),
     ]
     written = {FOLDER / "options.md": _index()}

@@ -22,6 +22,7 @@ from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.ros2.serve.bridge import BridgeConfig
 from bhd_lerobot.ros2.serve.serve import ServeConfig
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
@@ -153,6 +154,8 @@ def parse_command(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
         parse(ReplayConfig, arguments)
     elif program == "bhd-ros2" and arguments[:1] == ["serve"]:
         parse(ServeConfig, arguments[1:] or ["--robot.type=turtlebot3"])
+    elif program == "bhd-ros2" and arguments[:1] == ["bridge"]:
+        parse(BridgeConfig, arguments[1:] or ["--robot.type=turtlebot3", "--robot.plant=ros2"])
     elif program in ("bhd-data", "bhd-ros2"):
         # In running text a command is named without its arguments.
         named = ["--help"] if len(arguments) == 1 else []

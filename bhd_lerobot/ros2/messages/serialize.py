@@ -28,6 +28,12 @@ def encode(msgtype: str, fields: Tree, n: int) -> list[bytes]:
     return [bytes(store.serialize_cdr(_message(msgtype, fields, row), msgtype)) for row in range(n)]
 
 
+def encode_known(msgtype: str, fields: Tree) -> bytes:
+    """Return one serialised message of those fields that its type has; see `encode`."""
+    _, known = _definition(msgtype)
+    return encode(msgtype, {name: value for name, value in fields.items() if name in known}, 1)[0]
+
+
 def encode_one(msgtype: str, fields: Tree) -> bytes:
     """Return one serialised message.
 

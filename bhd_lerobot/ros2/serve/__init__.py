@@ -2,6 +2,7 @@
 
 __all__ = [
     "arm",
+    "articles",
     "base",
     "bridge",
     "description",
@@ -13,5 +14,6 @@ __all__ = [
     "serve",
     "server",
     "service",
+    "setpoints",
     "trajectory",
 ]

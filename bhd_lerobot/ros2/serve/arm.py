@@ -59,7 +59,7 @@ class ArmTopics:
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
         self._inputs = [
-            Input(node.subscription(ur.TRAJECTORY_TOPIC, ur.TRAJECTORY), self._follow),
+            Input(node.subscription(ur.TRAJECTORY_TOPIC, ur.TRAJECTORY), self.follow),
             Input(node.subscription(ur.POSITION_TOPIC, ur.FLOATS), self._move),
             Input(node.subscription(ur.GRIPPER_TOPIC, ur.FLOATS), self._grip),
         ]
@@ -107,7 +107,7 @@ class ArmTopics:
 
     # --- commands ----------------------------------------------------------------------------------------------------
 
-    def _follow(self, message: Any) -> bool:
+    def follow(self, message: Any) -> bool:
         """Take a trajectory. Its stamp is its start, 0 is at once; until then what is followed goes on."""
         now = time.monotonic_ns()
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec

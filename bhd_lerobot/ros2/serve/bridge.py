@@ -5,23 +5,23 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
-from bhd_lerobot.control.messages import Mode, Reason, Watchdog
+from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of, raised
 from bhd_lerobot.ros2.live.network import NetworkConfig
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages import ur
-from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
+from bhd_lerobot.ros2.serve import articles
+from bhd_lerobot.ros2.serve.articles import article_names
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import RESET_TOPIC, InterfaceTopics
 from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
 from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
+from bhd_lerobot.ros2.serve.setpoints import Setpoints
 
 TWIST_TOPIC, POSITION_TOPIC = "/brain/cmd_vel", "/brain/commands"
 
@@ -36,6 +36,8 @@ class BridgeConfig(ServiceConfig):
         namespace: of the bridge's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         duration_s: end after this time [s]; 0: run until Ctrl-C.
+        articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
+            messages (`package.xml` and `msg/`), whose fields are found by their names.
     """
 
     def __post_init__(self) -> None:
@@ -53,56 +55,6 @@ class BridgeConfig(ServiceConfig):
         if self.network == NetworkConfig():
             ros2 = robot.ros2
             self.network = NetworkConfig(ros2.domain, ros2.interface, ros2.peers, ros2.distro)
-
-
-class Setpoints:
-    """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm.
-
-    Args:
-        host: the robot.
-        node: the node.
-        counts: what is refused.
-        taken: called when a setpoint was taken.
-        topic: of the setpoints.
-    """
-
-    def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
-        self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
-        is_arm = isinstance(host.body, Arm)
-        types = (ur.FLOATS,) if is_arm else (TwistPart.msgtype, BareTwistPart.msgtype)
-        take = self._move if is_arm else self._drive
-        self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
-
-    def outputs(self) -> Iterable[Output]:
-        """Return that nothing is published."""
-        return []
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return self._inputs
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing is due."""
-        return NEVER_NS
-
-    def _drive(self, message: Any) -> bool:
-        twist = getattr(message, "twist", message)
-        return self._send([twist.linear.x, twist.angular.z])
-
-    def _move(self, message: Any) -> bool:
-        names = self._host.action_names
-        if len(message.data) != len(names):
-            self._counts.add(f"{self._topic}: {len(message.data)} values; there are {len(names)}: {', '.join(names)}")
-            return False
-        return self._send(message.data)
-
-    def _send(self, values: Any) -> bool:
-        sent = self._host.bridge.send(np.array([values], np.float64))
-        self._counts.add_result(self._topic, sent)
-        if Reason(int(sent.reasons[0])) != Reason.ACCEPTED:
-            return False
-        self._taken()
-        return True
 
 
 class Faults:
@@ -155,13 +107,15 @@ def bridge(
         ConfigError: Cyclone DDS is not installed, or there is no such plant.
         RealtimeError: the robot is not there, another program commands it, or a process of it has ended.
     """
+    names = article_names(config.articles)
+    extra = (articles.TWIST_TOPIC,) if config.articles else ()
 
     def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
         goals: Goals = ArmGoals(host) if isinstance(host.body, Arm) else BaseGoals(host)
-        topic = POSITION_TOPIC if isinstance(host.body, Arm) else TWIST_TOPIC
+        topics = (POSITION_TOPIC,) if isinstance(host.body, Arm) else (TWIST_TOPIC, *extra)
         return [
-            InterfaceTopics(host, node, counts, config.state_hz, goals),
-            Setpoints(host, node, counts, goals.interrupt, topic),
+            InterfaceTopics(host, node, counts, config.state_hz, goals, names=names),
+            *(Setpoints(host, node, counts, goals.interrupt, one) for one in topics),
             Faults(host, lambda line: console.print(line, markup=False, soft_wrap=True)),
         ]
 

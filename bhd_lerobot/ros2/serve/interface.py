@@ -1,7 +1,8 @@
 """What a brain in another process exchanges with the robot: commands, results, the state, the emergency stop."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
@@ -10,8 +11,8 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.state import LIMITS
 from bhd_lerobot.ros2.live.network import EVERY, Qos
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.parts import header
-from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.parts import header, stamp_tree
+from bhd_lerobot.ros2.messages.serialize import encode, encode_known
 from bhd_lerobot.ros2.messages.types import INTERFACES
 from bhd_lerobot.ros2.serve.goals import Goals
 from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
@@ -26,8 +27,27 @@ _CUTS = Limit.NON_FINITE | Limit.VELOCITY | Limit.POSITION | Limit.POSTURE | Lim
 _RESULTS_AT_ONCE = 5  # half of what a ROS 2 subscription keeps by default
 
 
+@dataclass(frozen=True)
+class Names:
+    """Under which topics, and as which messages, goals, their results and the state are exchanged.
+
+    Fields of a message are found by their names; a field that the other side does not have is left out.
+
+    Attributes:
+        command, result, state: the topics.
+        command_type, result_type, state_type: of their messages.
+    """
+
+    command: str = COMMAND_TOPIC
+    result: str = RESULT_TOPIC
+    state: str = STATE_TOPIC
+    command_type: str = COMMAND
+    result_type: str = RESULT
+    state_type: str = STATE
+
+
 class InterfaceTopics:
-    """The topics of `bhd_interfaces`.
+    """The topics of brain and cerebellum.
 
     Args:
         host: the robot.
@@ -36,6 +56,7 @@ class InterfaceTopics:
         state_hz: how often the state is published [Hz].
         goals: follows the commands.
         taken: called when a goal was taken.
+        names: under which they are there.
     """
 
     def __init__(
@@ -47,20 +68,22 @@ class InterfaceTopics:
         goals: Goals,
         *,
         taken: Callable[[], None] = lambda: None,
+        names: Sequence[Names] = (Names(),),
     ) -> None:
         self._host, self._counts, self._state_hz, self._goals, self._taken = host, counts, state_hz, goals, taken
         self._frame = goals.frames[0]
-        self._result = node.publisher(RESULT_TOPIC, RESULT, Qos(1000))
-        self._state = node.publisher(STATE_TOPIC, STATE)
+        self._results_out = [(node.publisher(one.result, one.result_type, Qos(1000)), one.result_type) for one in names]
+        self._states_out = [(node.publisher(one.state, one.state_type), one.state_type) for one in names]
         self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
         self._limits, self._reported = host.bridge.latest["limits"].copy(), counts.all()
         self._results: deque[CommandResult] = deque()
+        commands = dict.fromkeys((one.command, one.command_type) for one in names)
         # The stop comes after the reset: of two that arrive together the robot stays stopped. A publisher that is best
         # effort presses, too.
         self._inputs = [
             Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
             *(Input(node.subscription(ESTOP_TOPIC, BOOL, qos), self._stop, "different") for qos in (EVERY, LOSSY)),
-            Input(node.subscription(COMMAND_TOPIC, COMMAND, EVERY), self._submit, "each"),
+            *(Input(node.subscription(*command, EVERY), self._submit, "each") for command in commands),
         ]
 
     def outputs(self) -> Iterable[Output]:
@@ -88,18 +111,21 @@ class InterfaceTopics:
             self._counts.add_result(RESET_TOPIC, request())
 
     def _submit(self, message: Any) -> None:
-        frame = message.header.frame_id or self._frame
+        target = message.target_pose  # of geometry_msgs: a Pose, or a PoseStamped
+        stamped = target if hasattr(target, "header") else message
+        frame = (stamped.header.frame_id if hasattr(stamped, "header") else "") or self._frame
         if frame not in self._goals.frames:
             text = f"The frame is {frame!r}; a target pose is in {' or '.join(map(repr, self._goals.frames))}."
             self._results.append(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
             return
-        position, turn = message.target_pose.position, message.target_pose.orientation
+        target = getattr(target, "pose", target)
+        position, turn = target.position, target.orientation
         pose = Pose((position.x, position.y, position.z), (turn.w, turn.x, turn.y, turn.z))
         command = BrainCommand(
             message.task_id,
             target_pose=pose,
-            max_velocity=message.max_velocity or None,
-            max_acceleration=message.max_acceleration or None,
+            max_velocity=getattr(message, "max_velocity", 0.0) or None,
+            max_acceleration=getattr(message, "max_acceleration", 0.0) or None,
             timeout_s=self._goals.timeout_s,
         )
         refusal = self._goals.submit(command, frame)
@@ -135,22 +161,27 @@ class InterfaceTopics:
             self._send(self._results.popleft())
 
     def _send(self, result: CommandResult) -> None:
+        stamps = State.of(self._host).stamps
         fields = {
-            "header": header(State.of(self._host).stamps),
+            "header": header(stamps),
+            "stamp": stamp_tree(stamps),
             "task_id": result.task_id,
             "success": result.success,
             "message": result.message or result.code.name,
         }
-        self._result.send(encode(RESULT, fields, 1)[0])
+        for publisher, msgtype in self._results_out:
+            publisher.send(encode_known(msgtype, fields))
 
     def _publish(self, state: State) -> None:
         record = state.record
         fields = {
             "header": header(state.stamps, self._frame),
+            "stamp": stamp_tree(state.stamps),
             "joint_positions": record["joint_positions"],
             "joint_velocities": record["joint_velocities"],
             "joint_efforts": record["joint_efforts"],
             "is_moving": bool(record["is_moving"][0]),
             "emergency_stop": bool(record["emergency_stop"][0]),
         }
-        self._state.send(encode(STATE, fields, 1)[0])
+        for publisher, msgtype in self._states_out:
+            publisher.send(encode_known(msgtype, fields))

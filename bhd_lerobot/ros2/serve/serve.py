@@ -16,15 +16,17 @@ from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
+from bhd_lerobot.ros2.serve.articles import TWIST_TOPIC, TrajectoryController, article_names
 from bhd_lerobot.ros2.serve.base import BaseTopics
 from bhd_lerobot.ros2.serve.description import publish_description
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
-from bhd_lerobot.ros2.serve.interface import InterfaceTopics
+from bhd_lerobot.ros2.serve.interface import InterfaceTopics, Names
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
 from bhd_lerobot.ros2.serve.server import Counts, Topics
 from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
+from bhd_lerobot.ros2.serve.setpoints import Setpoints
 from bhd_lerobot.sim.description import parts_of
 
 
@@ -38,6 +40,8 @@ class ServeConfig(ServiceConfig):
         namespace: of the robot's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         duration_s: end after this time [s]; 0: run until Ctrl-C.
+        articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
+            messages (`package.xml` and `msg/`), whose fields are found by their names.
         joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
         clock: publish ``/clock`` as well.
         view: show the simulation in MuJoCo's viewer, a window on this machine. Closing the window does not end the
@@ -86,10 +90,11 @@ def serve(
     require_cyclonedds()
     prepare_view(config.view)
     foxglove = FoxgloveServer(config.robot.type, config.foxglove_port) if config.foxglove_port else None
+    names = article_names(config.articles)
     node = partial(MirroredNode, server=foxglove) if foxglove else Node
 
     def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
-        made = _parts(config, host, node, counts)
+        made = _parts(config, host, node, counts, names)
         if foxglove:
             foxglove.start()
             console.print(f"Foxglove: Open connection, ws://localhost:{config.foxglove_port}")
@@ -115,18 +120,22 @@ def serve(
             foxglove.close()
 
 
-def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
+def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts, names: tuple[Names, ...]) -> list[Topics]:
     view = robot_view(config.robot.type)
     is_arm = isinstance(host.body, Arm)
     goals: Goals = ArmGoals(host) if is_arm else BaseGoals(host)
     parts: list[Topics]
     if is_arm:
         arm = ArmTopics(host, node, counts, view, config.joint_states_hz)
-        interface = InterfaceTopics(host, node, counts, config.state_hz, goals, taken=arm.interrupt)
+        interface = InterfaceTopics(host, node, counts, config.state_hz, goals, taken=arm.interrupt, names=names)
         parts = [interface, arm, PlannedPath(host, node, arm.trajectory)]
+        if config.articles:
+            parts.append(TrajectoryController(host, node, arm.follow))
     else:
-        interface = InterfaceTopics(host, node, counts, config.state_hz, goals)
+        interface = InterfaceTopics(host, node, counts, config.state_hz, goals, names=names)
         parts = [interface, BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
+        if config.articles:
+            parts.append(Setpoints(host, node, counts, goals.interrupt, TWIST_TOPIC))
     if view.joints:
         publish_description(node, config.robot.type, view, parts_of(host.body))
     if host.camera_shapes:

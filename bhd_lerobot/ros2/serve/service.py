@@ -30,6 +30,8 @@ class ServiceConfig:
         namespace: of the robot's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         duration_s: end after this time [s]; 0: run until Ctrl-C.
+        articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
+            messages (`package.xml` and `msg/`), whose fields are found by their names.
     """
 
     robot: RobotConfig
@@ -37,6 +39,7 @@ class ServiceConfig:
     namespace: str = "/"
     state_hz: float = 50.0
     duration_s: float = 0.0
+    articles: bool | str = False
 
     def __post_init__(self) -> None:
         if not 0 < self.state_hz <= 1000:

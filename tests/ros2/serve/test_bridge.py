@@ -57,7 +57,7 @@ def drives(side: Side, log: Path) -> bool:
 
 
 def test_goals_of_a_brain_move_an_arm_behind_its_driver_again_and_again(domain: int, tmp_path: Path) -> None:
-    with arm(domain, tmp_path) as (bridge, _, log):
+    with arm(domain, tmp_path) as (_, _, log):
         start = log_of(log, "state")[-1]["position"]
         for _ in range(2):  # with the same task ids
             with Peer("brain_node.py", "--name=test_move", *NEAR, domain=domain) as brain:

@@ -1,0 +1,130 @@
+"""The names of the articles: topics and messages of their bridge, beside ours."""
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.errors import ConfigError, as_text
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.definitions import register_types
+from bhd_lerobot.ros2.messages.parts import header
+from bhd_lerobot.ros2.messages.serialize import encode_known
+from bhd_lerobot.ros2.messages.types import INTERFACES, type_store
+from bhd_lerobot.ros2.serve.interface import Names
+from bhd_lerobot.ros2.serve.server import NEVER_NS, Input, Output, State
+
+PACKAGE = "brain_bridge"
+COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/command_result", "/bridge/cerebellum_state"
+TWIST_TOPIC = "/high_level_cmd_vel"
+TRAJECTORY_TOPIC = "/joint_trajectory_controller/joint_trajectory"
+CONTROLLER_TOPIC = "/joint_trajectory_controller/state"
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+_STATE_HZ = 50.0  # `state_publish_rate` of joint_trajectory_controller
+# By which fields a message is found among those of a package.
+_FIELDS = {
+    "command": ("task_id", "target_pose"),
+    "result": ("task_id", "success"),
+    "state": ("joint_positions", "joint_velocities"),
+}
+
+
+def article_names(articles: bool | str) -> tuple[Names, ...]:
+    """Return the names under which the topics of brain and cerebellum are there: ours, and those of the articles.
+
+    Args:
+        articles: false for ours alone; true; or the folder of a package of messages, in the form of `colcon`.
+
+    Raises:
+        ConfigError: there is no such folder, or its messages are not those.
+    """
+    if not articles:
+        return (Names(),)
+    if articles is True:
+        package, names = PACKAGE, ("BrainCommand", "BrainResult", "CerebellumState")
+        texts = {name: _text_of(f"{INTERFACES}/msg/{name}") for name in names}
+    else:
+        package, texts = _package(Path(articles).expanduser())
+    register_types({f"{package}/msg/{name}": text for name, text in texts.items()})
+    types = {role: _find(role, package, texts, articles) for role in _FIELDS}
+    theirs = Names(COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC, types["command"], types["result"], types["state"])
+    return Names(), theirs
+
+
+def _text_of(name: str) -> str:
+    text, _ = type_store().generate_msgdef(name)
+    return str(re.split(r"^=+$", text, maxsplit=1, flags=re.MULTILINE)[0])  # without those of its parts
+
+
+def _package(folder: Path) -> tuple[str, dict[str, str]]:
+    try:
+        name = ElementTree.parse(folder / "package.xml").findtext("name") or ""
+        texts = {file.stem: file.read_text("utf-8") for file in sorted(folder.glob("msg/*.msg"))}
+    except (OSError, ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"articles is {str(folder)!r}, which is no package of messages ({as_text(error)}). Name the folder that "
+            "has package.xml and msg/, or true."
+        ) from error
+    if not re.fullmatch(r"[a-z]\w*", name):
+        raise ConfigError(f"{folder / 'package.xml'} names the package {name!r}; a name is of a-z, 0-9 and _.")
+    return name, texts
+
+
+def _find(role: str, package: str, texts: dict[str, str], articles: bool | str) -> str:
+    wanted = _FIELDS[role]
+    for name in texts:
+        known = {field for field, _ in type_store().fielddefs[f"{package}/msg/{name}"][1]}
+        if known.issuperset(wanted):
+            return f"{package}/msg/{name}"
+    raise ConfigError(
+        f"articles is {articles!r}; none of its messages ({', '.join(texts) or 'there are none'}) is the {role}, which "
+        f"has the fields {' and '.join(wanted)}."
+    )
+
+
+class TrajectoryController:
+    """The topics of a `joint_trajectory_controller` in front of a served arm.
+
+    Args:
+        host: the arm.
+        node: the node.
+        follow: takes a trajectory; returns False if it is refused.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, follow: Callable[[Any], bool]) -> None:
+        body = host.body
+        assert isinstance(body, Arm)
+        self._joints = [f"{joint}_joint" for joint in body.chain.joints]
+        self._publisher = node.publisher(CONTROLLER_TOPIC, CONTROLLER)
+        self._inputs = [Input(node.subscription(TRAJECTORY_TOPIC, "trajectory_msgs/msg/JointTrajectory"), follow)]
+
+    def outputs(self) -> Iterable[Output]:
+        """Return what is published."""
+        return [Output(_STATE_HZ, self._publish)]
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+        return self._inputs
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing else is due."""
+        return NEVER_NS
+
+    def _publish(self, state: State) -> None:
+        count, record = len(self._joints), state.record
+        wanted, measured = record["command"][:, :count], record["joint_positions"][:, :count]
+        speeds = record["joint_velocities"][:, :count]
+        points = {
+            "reference": {"positions": wanted},
+            "feedback": {"positions": measured, "velocities": speeds},
+            "error": {"positions": np.subtract(wanted, measured)},
+            "output": {"positions": wanted},
+        }
+        old = {"desired": points["reference"], "actual": points["feedback"]}  # of Humble
+        fields = {"header": header(state.stamps), "joint_names": self._joints, **points, **old}
+        self._publisher.send(encode_known(CONTROLLER, fields))

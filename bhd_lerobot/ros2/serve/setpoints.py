@@ -1,0 +1,64 @@
+"""Setpoints that a brain streams to a robot behind a bridge."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages import ur
+from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
+from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output
+
+
+class Setpoints:
+    """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm.
+
+    Args:
+        host: the robot.
+        node: the node.
+        counts: what is refused.
+        taken: called when a setpoint was taken.
+        topic: of the setpoints.
+    """
+
+    def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
+        self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
+        is_arm = isinstance(host.body, Arm)
+        types = (ur.FLOATS,) if is_arm else (TwistPart.msgtype, BareTwistPart.msgtype)
+        take = self._move if is_arm else self._drive
+        self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
+
+    def outputs(self) -> Iterable[Output]:
+        """Return that nothing is published."""
+        return []
+
+    def inputs(self) -> Iterable[Input]:
+        """Return what commands the robot."""
+        return self._inputs
+
+    def poll(self, now_ns: int) -> int:
+        """Return that nothing is due."""
+        return NEVER_NS
+
+    def _drive(self, message: Any) -> bool:
+        twist = getattr(message, "twist", message)
+        return self._send([twist.linear.x, twist.angular.z])
+
+    def _move(self, message: Any) -> bool:
+        names = self._host.action_names
+        if len(message.data) != len(names):
+            self._counts.add(f"{self._topic}: {len(message.data)} values; there are {len(names)}: {', '.join(names)}")
+            return False
+        return self._send(message.data)
+
+    def _send(self, values: Any) -> bool:
+        sent = self._host.bridge.send(np.array([values], np.float64))
+        self._counts.add_result(self._topic, sent)
+        if Reason(int(sent.reasons[0])) != Reason.ACCEPTED:
+            return False
+        self._taken()
+        return True
