@@ -98,6 +98,15 @@ class Device:
         if callable(begin := getattr(self.robot, "begin_episode", None)):
             begin()
 
+    def keep_torque(self) -> bool:
+        """Leave the motors on when the robot is disconnected; return whether they would have been switched off."""
+        parts = (self.robot, *vars(self.robot).values())  # the arms of a robot with two have options of their own
+        configs = [config for part in parts if (config := getattr(part, "config", None)) is not None]
+        off = [config for config in configs if getattr(config, "disable_torque_on_disconnect", False)]
+        for config in off:
+            config.disable_torque_on_disconnect = False
+        return bool(off)
+
     def observe(self) -> Reading:
         """Return what the robot observes now; it may take as long as the robot takes.
 

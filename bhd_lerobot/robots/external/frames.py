@@ -85,6 +85,7 @@ class FrameThread:
         self._active = self._ended = self._idle = False
         self._came_ns = 0  # when the brain's last action came
         self._is_stopped = False  # whether the action of the emergency stop was sent: it is the last
+        self._is_driven = gate.has_speeds  # whether there is anything to stop: an action was sent
         self._holds = False  # whether what holds a robot without a brain was sent, since the last action
         self._call = ("", 0)  # the call of the robot that is under way, and since when
         self._has_faulted = False
@@ -193,7 +194,7 @@ class FrameThread:
                 self._changed.notify_all()
                 while not (self._active or self._ended or self._is_to_stop):
                     self._changed.wait(_POLL_S)
-                if self._ended:
+                if self._ended and not self._is_to_stop:
                     return
                 self._idle = False
             try:
@@ -239,7 +240,10 @@ class FrameThread:
             worked = time.monotonic_ns()
             while (action := self._next(frame, due + self.period_ns)) is not None:
                 self._send(frame, action)
-                worked = time.monotonic_ns()
+                before, worked = worked, time.monotonic_ns()
+                self._is_stopped |= frame.mode == Mode.ESTOP
+                if self._is_to_stop and worked - before > self.period_ns:
+                    break  # pressed during a long call: where the robot is now is to be observed first
             now = frame.ended_ns = time.monotonic_ns()
             frame.worked_ns, frame.command_age_ns = worked, now - self._came_ns
             self.statistics.add(due, started, worked, skipped)
@@ -252,7 +256,7 @@ class FrameThread:
     @property
     def _is_to_stop(self) -> bool:
         """Whether the emergency stop is pressed and its action was not sent yet, to a robot that was driven."""
-        return self.is_estopped and not self._is_stopped and bool(self.origin_ns)
+        return self.is_estopped and not self._is_stopped and self._is_driven and bool(self.origin_ns)
 
     def _next(self, frame: DeviceFrame, end_ns: int) -> Vector | None:
         """Wait for what is to be sent next in a frame, shape (actions,); None when the frame is over."""
@@ -263,8 +267,8 @@ class FrameThread:
                 silent = (now - self._came_ns) / NANOSECONDS
                 if self.is_estopped:
                     self._command, frame.mode = None, Mode.ESTOP
-                    if not self._is_stopped:
-                        return self._stop(frame.reading)
+                    if self._is_to_stop:
+                        return self._gate.stop(self._device.measured(frame.reading.state))
                 elif self._command is not None and self._active:  # after a fault nothing more is sent
                     (requested, self._came_ns), self._command = self._command, None
                     frame.mode, self._holds = Mode.TRACKING, False
@@ -278,8 +282,8 @@ class FrameThread:
                 elif silent > config.brain_timeout_s and not frame.watchdog & Watchdog.COMMAND_AGE:
                     frame.mode = Mode.HOLD
                     frame.watchdog |= Watchdog.COMMAND_AGE
-                    if not self._holds:  # once: a robot that goes a bounded step to what it is sent would go on
-                        self._holds = True
+                    if self._is_driven and not self._holds:
+                        self._holds = True  # once: a robot that goes a bounded step to what it is sent would go on
                         return self._gate.hold()
                 if now >= end_ns or not self._active:
                     self._takes = False
@@ -291,21 +295,22 @@ class FrameThread:
     def _send(self, frame: DeviceFrame, action: Vector) -> None:
         if not np.isfinite(action).all():
             return  # it is not known where the robot is, so it gets nothing
+        self._is_driven = True
         frame.applied = self._called("send_action", lambda: self._device.send(action))
 
-    def _stop(self, reading: Reading) -> Vector:
-        """Return the action of the emergency stop, which is the last that the robot gets."""
-        self._is_stopped = True
-        return self._gate.stop(self._device.measured(reading.state))
-
     def _hold(self, reading: Reading | None = None) -> None:
-        """Send what the robot is left with: after an emergency stop where it was measured, and once."""
-        if self._is_stopped:
+        """Send what the robot is left with: after an emergency stop where it was measured, and once.
+
+        Without a reading a call has failed, that of the emergency stop's action perhaps: it is tried once more.
+        """
+        if self._is_stopped or not self._is_driven:
             return
-        self._is_stopped = self.is_estopped
-        action = self._gate.holding() if reading is None else self._stop(reading)
+        is_last = self.is_estopped
+        self._is_stopped = is_last and reading is None
+        action = self._gate.holding() if reading is None else self._gate.stop(self._device.measured(reading.state))
         if np.isfinite(action).all():
             self._called("send_action", lambda: self._device.send(action))
+        self._is_stopped |= is_last
 
     def _called[T](self, name: str, call: Callable[[], T]) -> T:
         self._call = (name, time.monotonic_ns())

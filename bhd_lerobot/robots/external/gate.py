@@ -14,8 +14,13 @@ from bhd_lerobot.robots.external.config import GateConfig
 
 Vector = NDArray[np.float64]
 
-# Speeds as LeRobot's robots and plug-ins name them: x.vel, linear_velocity, mobile_base.vx, mobile_base.vtheta.
-_SPEED = re.compile(r"(^|[._])(vel|velocity|speed|v[xyz]|vtheta|[xyz]_?vel)$")
+# What a robot goes on with, as LeRobot's robots and plug-ins name it: x.vel, linear_velocity, mobile_base.vx, linear.x,
+# delta_x, and the sticks of a remote control, remote.lx.
+_SPEED = re.compile(
+    r"(^|[._])(vel|velocity|speed|rate|rpm|omega|throttle|v[xyz]|vtheta|[xyz]_?vel)$"
+    r"|(^|[._])(linear|angular)[._][xyz]$|(^|[._])(twist|cmd_vel|delta|remote)([._]|$)",
+    re.IGNORECASE,
+)
 # What closes on things: gripper.pos, left_gripper, rightGripper, panda_finger_joint1, index_flexor, hand.pos.
 _GRIPS = re.compile(
     r"grip|(^|[._])(jaw|claw|clamp|hand|finger|thumb|index|middle|ring|pinky|suction|vacuum)s?\d*([._]|$)",
@@ -40,8 +45,8 @@ class Gate:
     """Makes actions finite, keeps them in range, and bounds their change from one frame to the next.
 
     Args:
-        names: the action's names, in order; those of speeds end in `vel`, `velocity`, `speed`, `vx` or the like; all
-            others are positions.
+        names: the action's names, in order; those of speeds end in `vel`, `velocity`, `speed`, `vx` or the like,
+            changes of position (`delta_x`) and sticks (`remote.lx`) count as speeds; all others are positions.
         config: the options.
         known: ranges that the robot's calibration or features say, by name.
 
@@ -79,8 +84,12 @@ class Gate:
         return bool(self._is_speed.any())
 
     def begin(self, measured: Vector) -> None:
-        """Begin an episode from what the robot measures, shape (actions,); NaN where it does not."""
-        self._last = np.where(self._is_speed & ~np.isfinite(measured), 0.0, measured)
+        """Begin an episode from what the robot measures, shape (actions,); NaN where it does not.
+
+        What grips still has its last position: measured is the thickness of what it holds.
+        """
+        first = np.where(self._is_speed & ~np.isfinite(measured), 0.0, measured)
+        self._last = first if self._last is None else np.where(self._grips & ~self._is_speed, self._last, first)
 
     def holding(self) -> Vector:
         """Return the action that holds the robot: the last positions, no speed; NaN where nothing is known yet."""
@@ -90,11 +99,12 @@ class Gate:
     def stop(self, measured: Vector) -> Vector:
         """Return the action of an emergency stop, and remember it as the last one.
 
-        Positions are those measured, or the last where none is; what grips keeps its last position, and with it what is
-        gripped; there is no speed.
+        Positions are those measured, within the range, or the last where none is; what grips keeps its last position,
+        and with it what is gripped; there is no speed.
         """
         last = self.holding()
-        self._last = np.where(self._is_speed | self._grips | ~np.isfinite(measured), last, measured)
+        inside = np.clip(measured, np.fmin(self.lower, last), np.fmax(self.upper, last))
+        self._last = np.where(self._is_speed | self._grips | ~np.isfinite(measured), last, inside)
         return self._last
 
     def hold(self) -> Vector:

@@ -240,9 +240,18 @@ class LeRobotHost:
         return made
 
     def close(self) -> None:
-        """Disconnect the robot. May be called twice; a call that does not return is not waited for."""
+        """Disconnect the robot. May be called twice; a call that does not return is not waited for.
+
+        After an emergency stop its motors keep their torque, so that nothing falls or is let go of.
+        """
         try:
             if self._frames.close() and self.robot.is_connected:
+                if self.estop_pressed and self.device.keep_torque():
+                    print(
+                        f"{self.device.name} was stopped: its motors stay on, so that nothing falls. Hold it before "
+                        "its power is switched off, or before it is connected again.",
+                        file=sys.stderr,
+                    )
                 self.robot.disconnect()
         except Exception as error:  # of another package's code: what was recorded is reported all the same
             words = as_text(error)

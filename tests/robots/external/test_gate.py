@@ -86,13 +86,35 @@ def test_wrong_options_are_named(options: dict, message: str) -> None:
         Gate(NAMES, GateConfig(**options), {})
 
 
-@each_case("name", ["x.vel", "linear_velocity", "mobile_base.vx", "mobile_base.vtheta", "wheel_speed"])
+SPEEDS = ("x.vel", "linear_velocity", "mobile_base.vx", "mobile_base.vtheta", "wheel_speed", "linear.x", "yaw_rate")
+GO_ON = (*SPEEDS, "cmd_vel.angular", "twist.linear.x", "delta_x", "ee.delta.z", "remote.lx")
+POSITIONS = (
+    "linear_rail.pos",
+    "ee.x",
+    "ee.wx",
+    "angular_joint.pos",
+    "level.pos",
+    "lx.pos",
+    "accelerate",
+    "deltoid.pos",
+)
+
+
+@each_case("name", GO_ON)
 def test_a_speed_holds_at_zero_however_its_robot_names_it(name: str) -> None:
     gate = Gate((name, "level.pos"), GateConfig(), {})
     gate.begin(np.array([0.4, 2.0]))
     gate.passed(np.array([0.5, 3.0]))
     assert gate.has_speeds
     assert gate.holding().tolist() == [0.0, 3.0]
+
+
+@each_case("name", POSITIONS)
+def test_what_is_a_position_is_held_where_it_is(name: str) -> None:
+    gate = Gate((name,), GateConfig(), {})
+    gate.begin(np.array([2.0]))
+    assert not gate.has_speeds
+    assert gate.stop(np.array([3.0])).tolist() == [3.0]
 
 
 def test_after_a_hold_a_speed_rises_from_zero() -> None:
@@ -114,3 +136,24 @@ def test_what_grips_keeps_its_position_in_an_emergency_stop(name: str) -> None:
     gate.passed(np.array([8.0, 1.0, 0.5]))
     assert gate.stop(np.array([5.0, 4.0, 0.3])).tolist() == [5.0, 1.0, 0.0]
     assert gate.stop(np.array([np.nan, 4.0, 0.3])).tolist() == [5.0, 1.0, 0.0]
+
+
+@each_case("name", GRIPS)
+def test_what_grips_still_has_its_position_when_an_episode_begins(name: str) -> None:
+    gate = Gate(("wrist.pos", name), GateConfig(max_change=5.0), {})
+    gate.begin(np.array([0.0, 60.0]))
+    gate.passed(np.array([1.0, 55.0]))
+    gate.begin(np.array([3.0, 58.0]))  # as thick as what it holds
+    assert gate.holding().tolist() == [3.0, 55.0]
+    assert gate.passed(np.array([3.0, 45.0])).action.tolist() == [3.0, 50.0]
+
+
+@each_case(
+    ("last", "measured", "stop"), [(40.0, 57.3, 50.0), (40.0, -57.3, -50.0), (40.0, 45.0, 45.0), (None, 57.0, 57.0)]
+)
+def test_an_emergency_stop_does_not_leave_the_range(last: float | None, measured: float, stop: float) -> None:
+    gate = Gate(("arm.pos",), GateConfig(range={"arm.pos": [-50.0, 50.0]}), {})
+    gate.begin(np.array([measured]))
+    if last is not None:
+        gate.passed(np.array([last]))
+    assert gate.stop(np.array([measured])).tolist() == [stop]

@@ -2,9 +2,11 @@
 
 import itertools
 import re
+import threading
 import time
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -290,7 +292,17 @@ class SaggingArm(MockArm):
         return {**seen, "shoulder.pos": seen["shoulder.pos"] - 3.0, "gripper.pos": 40.0}
 
 
-@pytest.mark.parametrize("moment", ["the brain thinks", "the brain is silent", "between episodes", "at the end"])
+MOMENTS = [
+    "the brain thinks",
+    "the brain is silent",
+    "between episodes",
+    "at the end",
+    "the next episode begins",
+    "as it is closed",
+]
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
 def test_an_emergency_stop_is_one_action_and_what_is_gripped_stays_gripped(tmp_path: Path, moment: str) -> None:
     robot = SaggingArm(MockArmConfig(id="sag", calibration_dir=tmp_path, log=str(tmp_path / "sent")))
     host = LeRobotHost(robot, FPS, GateConfig(brain_timeout_s=0.1))
@@ -301,19 +313,103 @@ def test_an_emergency_stop_is_one_action_and_what_is_gripped_stays_gripped(tmp_p
         host.step(np.array([[20.0, 20.0, 10.0]]))
         if moment == "the brain is silent":
             until(lambda: len(sent(tmp_path)) == 2, "it holds")
-        if moment == "between episodes":
+        if moment in ("between episodes", "as it is closed", "the next episode begins"):
             host.stop(ONLY)
+        if moment == "the next episode begins":
+            start(host)
         before = len(sent(tmp_path))
         host.estop()
         assert host.estop_pressed
-        until(lambda: len(sent(tmp_path)) > before, "it stops")
+        if moment != "as it is closed":
+            until(lambda: len(sent(tmp_path)) > before, "it stops")
         if moment == "at the end":
             host.stop(ONLY)
             start(host)  # an episode that begins all the same
-        if moment != "between episodes":
+        if moment not in ("between episodes", "as it is closed"):
             frames_pass(host, 20)
             assert host.step(action(50.0)).mode[0] == Mode.ESTOP
     assert sent(tmp_path)[before:] == [[17.0, 20.0, 10.0]]
+
+
+@pytest.mark.parametrize("presses", [0, 2])
+def test_a_robot_that_was_not_driven_gets_nothing_before_the_first_action(tmp_path: Path, presses: int) -> None:
+    """Where it is measured is not what its gripper was closed to, before."""
+    with closing(make(tmp_path, GateConfig(brain_timeout_s=0.05))) as host:
+        start(host)
+        for _ in range(presses):
+            host.estop()
+        frames_pass(host, 10)
+        assert host.step(None).mode[0] == (Mode.ESTOP if presses else Mode.HOLD)
+    assert sent(tmp_path) == []
+
+
+def test_an_emergency_stop_whose_call_raises_is_tried_once_more(tmp_path: Path) -> None:
+    class Lossy(MockBase):
+        loses = 0
+
+        def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+            if self.loses:
+                self.loses -= 1
+                raise ConnectionError("There is no status packet!")
+            return super().send_action(action)
+
+    robot = Lossy(MockArmConfig(id="lossy", calibration_dir=tmp_path))
+    robot.rows, robot.at = [], 7.0
+    host = LeRobotHost(robot, FPS, GateConfig())
+    robot.connect()
+    with closing(host):
+        start(host)
+        host.step(np.array([[0.2, 9.0]]))
+        robot.loses = 1
+        host.estop()
+        until(lambda: host.step(None).mode[0] == Mode.FAULT, "the call has raised")
+        host.stop(ONLY)
+    assert robot.rows == [(0.2, 9.0), (0.0, 7.0)]
+
+
+@pytest.mark.parametrize("timeout_s", [0.2, 5.0])
+def test_an_emergency_stop_during_a_long_call_stops_where_the_robot_is_after_it(
+    tmp_path: Path, timeout_s: float
+) -> None:
+    class Blocking(MockBase):
+        def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+            super().send_action(action)
+            if len(self.rows) == 1:
+                self._block()
+                self.at = 30.0
+            return dict(action)
+
+    robot = Blocking(MockArmConfig(id="blocking", calibration_dir=tmp_path))
+    robot.rows, robot.at = [], 0.0
+    host = LeRobotHost(robot, FPS, GateConfig(call_timeout_s=timeout_s))
+    robot.connect()
+    with closing(host):
+        start(host)
+        thread = threading.Thread(target=host.step, args=(np.array([[0.2, 50.0]]),))
+        thread.start()
+        until(lambda: robot.is_blocked, "the call blocks")
+        host.estop()
+        until(lambda: len(robot.rows) > 1, "it stops")
+        thread.join()
+    assert robot.rows == [(0.2, 50.0), (0.0, 30.0)]
+
+
+@pytest.mark.parametrize("is_pressed", [False, True])
+def test_motors_keep_their_torque_after_an_emergency_stop(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], is_pressed: bool
+) -> None:
+    """Of a robot with two arms each has options of its own."""
+    host = make(tmp_path)
+    robot = host.robot
+    robot.config.disable_torque_on_disconnect = True
+    robot.left_arm = SimpleNamespace(config=SimpleNamespace(disable_torque_on_disconnect=True))
+    if is_pressed:
+        host.estop()
+    host.close()
+    assert not robot.is_connected
+    switched_off = (robot.config.disable_torque_on_disconnect, robot.left_arm.config.disable_torque_on_disconnect)
+    assert switched_off == (not is_pressed, not is_pressed)
+    assert ("its motors stay on" in capsys.readouterr().err) == is_pressed
 
 
 def test_an_emergency_stop_after_a_fault_asks_a_dead_bus_once(tmp_path: Path) -> None:
