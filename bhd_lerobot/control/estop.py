@@ -198,7 +198,8 @@ class EstopInputs:
 
     # --- pressing ----------------------------------------------------------------------------------------------------
 
-    def _press(self, cause: str) -> None:
+    def press(self, cause: str) -> None:
+        """Press, for a cause. From any thread."""
         if self._stop.is_set():
             return
         if cause not in self.causes:
@@ -207,21 +208,21 @@ class EstopInputs:
             self._press_word()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        self._press(f"signal {signal.Signals(number).name}")
+        self.press(f"signal {signal.Signals(number).name}")
 
     def _on_signals(self, received: bytes) -> None:
         for number in received:
             if number in self._signals:
-                self._press(f"signal {signal.Signals(number).name}")
+                self.press(f"signal {signal.Signals(number).name}")
 
     def _on_terminal_keys(self, keys: bytes) -> None:
         if any(key in keys for key in KEYS):
-            self._press("key")
+            self.press("key")
         self._on_other_keys(bytes(key for key in keys if key not in KEYS))
 
     def _on_button(self, descriptor: int, name: str, received: bytes) -> None:
         if received:
-            self._press(name)
+            self.press(name)
         else:
             self._poll.unregister(descriptor)
             self._broken.append(f"{name} is closed or broken")
@@ -231,9 +232,9 @@ class EstopInputs:
         while not self._stop.wait(period_s):
             try:
                 if source():
-                    self._press(name)
+                    self.press(name)
             except Exception as error:  # whatever it is: an input that fails cannot be relied on
-                self._press(f"{name} failed: {type(error).__name__}: {error}")
+                self.press(f"{name} failed: {type(error).__name__}: {error}")
             self._silence[name] = rounds
 
     def _watch(self, descriptor: int, handler: Callable[[bytes], None]) -> None:
@@ -261,7 +262,7 @@ class EstopInputs:
                 else:
                     self._listen(descriptor)
             for cause in self._broken:
-                self._press(cause)
+                self.press(cause)
             if not events:  # rounds are counted, not time: if this thread gets no processor, neither do the others
                 self._count_silence()
 
@@ -278,7 +279,7 @@ class EstopInputs:
         for name in list(self._silence):
             self._silence[name] -= 1
             if self._silence[name] <= 0:
-                self._press(f"{name} does not answer")
+                self.press(f"{name} does not answer")
 
     # --- the end -----------------------------------------------------------------------------------------------------
 

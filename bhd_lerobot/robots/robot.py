@@ -106,19 +106,23 @@ class BhdRobot(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Start the robot, a simulated one at the start of the configured scene.
 
+        An emergency stop that is pressed meanwhile is kept for it.
+
         Raises:
             DeviceAlreadyConnectedError: it runs already.
         """
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         is_live = self.config.clock == "realtime"
-        self._host = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
+        inputs = self._estop_inputs = EstopInputs()
         try:
+            for source in self._estop_sources:
+                inputs.add(*source)
+            self._host = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
+            inputs.attach(self._host.estop)
             self.restart()
             for name in self.camera_shapes:
                 self._host.render(0, name)
-            for source in self._estop_sources:
-                self._listen(*source)
         except BaseException:
             self.disconnect()
             raise
@@ -266,9 +270,16 @@ class BhdRobot(Robot):
     def estop(self) -> None:
         """Latch the emergency stop: from the next tick the robot brakes as hard as it can, and refuses commands.
 
-        This is a software stop, not a certified safety function.
+        Also while `connect` starts it. This is a software stop, not a certified safety function.
+
+        Raises:
+            DeviceNotConnectedError: it neither runs nor starts.
         """
-        self.host.bridge.estop()
+        inputs = self._estop_inputs
+        if self._host is None and inputs is not None:
+            inputs.press("robot.estop()")
+        else:
+            self.host.estop()
 
     def add_estop_input(self, source: Source, name: str = "", period_s: float = POLL_S) -> None:
         """Let a physical button press the emergency stop while the robot is connected, now and at later times.
@@ -284,24 +295,21 @@ class BhdRobot(Robot):
             ConfigError: it is neither, the descriptor is not open, or the period is not positive.
         """
         check_source(source, period_s)
-        if self.is_connected:
-            self._listen(source, name, period_s)
+        if self._estop_inputs is not None:
+            self._estop_inputs.add(source, name, period_s)
         self._estop_sources.append((source, name, period_s))
 
     def remove_estop_inputs(self) -> None:
         """Forget all buttons. What they have pressed stays pressed until `reset`."""
         self._stop_listening()
         self._estop_sources.clear()
+        if self._host is not None:
+            self._estop_inputs = EstopInputs(self._host.estop)
 
     def _stop_listening(self) -> None:
         if self._estop_inputs is not None:
             self._estop_inputs.close()
             self._estop_inputs = None
-
-    def _listen(self, source: Source, name: str, period_s: float) -> None:
-        if self._estop_inputs is None:
-            self._estop_inputs = EstopInputs(self.host.bridge.estop)
-        self._estop_inputs.add(source, name, period_s)
 
     def reset(self) -> None:
         """Clear an emergency stop, a fault or a deactivation. The robot moves again only after `activate`.

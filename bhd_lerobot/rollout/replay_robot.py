@@ -1,7 +1,7 @@
 """Sends the recorded actions of an episode to a robot, and reports how its observations differ from the recording."""
 
 import os
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +67,11 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
     if keys.OBSERVATION_STATE in columns:
         values = np.asarray(columns[keys.OBSERVATION_STATE], np.float64)
         observed = dict(zip(keys.names_of(summary.features[keys.OBSERVATION_STATE]), values.T, strict=False))
-    robots: Any = make_robot(robot, fps=summary.fps, gate=gate)
-    pressed = EstopInputs(robots.estop)
-    with stop_on_signals() as stop, closing(robots), pressed:
+    with stop_on_signals() as stop, EstopInputs() as pressed, ExitStack() as opened:
+        pressed.add_signal(estop_signal("SIGUSR1"))  # it counts from the first moment on, while there is no robot yet
+        key = "space or e, or " if pressed.add_key() else ""
+        robots: Any = opened.enter_context(closing(make_robot(robot, fps=summary.fps, gate=gate)))
+        pressed.attach(robots.estop)
         if set(names) != set(robots.action_names):
             own = ", ".join(robots.action_names)
             raise DatasetError(f"The actions of {root} are {', '.join(names)}; those of {robot.type} are {own}.")
@@ -80,8 +82,6 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
                 "where the episode began. Set one number for all positions, or one for each."
             )
         print_notes(console, robots)
-        pressed.add_signal(estop_signal("SIGUSR1"))
-        key = "space or e, or " if pressed.add_key() else ""
         console.print(f"Emergency stop: {key}kill -USR1 {os.getpid()}")
         only = np.zeros(1, np.intp)
         robots.reset(only, [None], [0])

@@ -213,6 +213,27 @@ def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) ->
     assert len(np.loadtxt(tmp_path / "log")) == len(sent)
 
 
+def test_a_press_while_a_replay_connects_its_robot_moves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "d", dataset__num_episodes=1)
+    connect = MockArm.connect
+
+    def pressed(self: MockArm, calibrate: bool = True) -> None:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        connect(self)
+
+    before = signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # as a command that starts leaves it to nobody
+    try:
+        monkeypatch.setattr(MockArm, "connect", pressed)
+        robot = parse(RecordConfig, options(tmp_path / "other", robot__log=tmp_path / "log")).robot
+        with pytest.raises(RealtimeError, match=r"stopped after .* frames: signal SIGUSR1"):
+            replay_on_robot(tmp_path / "d", 0, robot, GateConfig(max_change=90.0), Console(file=io.StringIO()))
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert not (tmp_path / "log").exists()
+
+
 def rewrite(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path = root / "meta/info.json"
     info = json.loads(path.read_text())

@@ -143,6 +143,30 @@ def test_a_press_of_another_process_while_it_connects_stays_until_a_person_reset
     assert NAME in names()
 
 
+@pytest.mark.parametrize("how", ["a button that is let go of", "robot.estop()"])
+def test_a_press_in_this_process_while_it_connects_is_kept(how):
+    starting = turtlebot(unique("pressed"))
+    with pytest.raises(DeviceNotConnectedError):
+        starting.estop()
+
+    def button() -> bool:
+        is_starting = not starting.is_connected
+        if is_starting and how == "robot.estop()":
+            starting.estop()
+            return False
+        return is_starting
+
+    starting.add_estop_input(button, "button")
+    try:
+        starting.connect()
+        expect_stop(starting)
+        recover(starting)
+    finally:
+        starting.disconnect()
+    with pytest.raises(DeviceNotConnectedError):
+        starting.estop()
+
+
 def test_deactivation_ends_in_safe_off(driving):
     assert driving.host.bridge.deactivate().accepted.all()
     until(lambda: mode(driving) == Mode.SAFE_OFF, "the base is at rest")
