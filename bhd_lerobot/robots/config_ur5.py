@@ -29,9 +29,9 @@ class UR5Config(BhdRobotConfig):
             ``"pick"`` (objects). In a task the task decides.
         max_force: force [N] with which the tool may press on something, whatever moves it; more is a protective stop.
             It is estimated from the motors' efforts: with 150 N the arm is stopped at 160 N in the median, below 190 N
-            in 95 % and below 240 N in 99 % of postures and directions; the others are those that its joints hardly
-            feel. A force on another part of the arm counts with what the joints feel of it. Of a plant that measures no
-            efforts, such as a ROS 2 driver, nothing is limited.
+            in 95 % and below 240 N in 99 % of postures and directions at 0.02 m/s, and at 0.25 m/s at 270, 380 and 430
+            N; the others are those that its joints hardly feel. A force on another part of the arm counts with what the
+            joints feel of it. Of a plant that measures no efforts, such as a ROS 2 driver, nothing is limited.
         payload: mass of what the gripper is going to carry [kg]. Accelerations are planned so that the motors can move
             it; what it weighs beyond that, by 20 N, stops the arm when it is at rest.
         held_clearance: keep what the gripper holds away from table, arm and obstacles as well. It is taken to reach as
