@@ -69,6 +69,11 @@ class Robot:
             self.state[name] = value
         self.block.ring.publish(self.state)
 
+    def move(self) -> None:
+        """Be elsewhere: an arm by a joint, a base by some metres."""
+        self.simulation.world.qpos[0, 0] += 0.4
+        self.publish(**({} if self.has_world else {"odometry": self.state["odometry"] + [[3.0, 0.0, 0.0]]}))
+
     def close(self) -> None:
         self.block.close()
         self.simulation.close()
@@ -199,6 +204,12 @@ def test_who_does_not_read_holds_up_nobody(robot: Robot, watched: Any) -> None:
     assert robot.block.words[Word.PHASE] == Phase.RUNNING
 
 
+def test_a_scene_that_is_too_long_is_left_out(robot: Robot, watched: Any) -> None:
+    robot.block.publish_scene(json.dumps(["x" * 40_000]))
+    count, text = watched(robot).scene
+    assert (count, text) == (2, "null")
+
+
 def test_a_port_in_use_is_named(robot: Robot, watched: Any) -> None:
     with served(watched(robot), 0) as address:
         port = urlsplit(address).port or 0
@@ -213,7 +224,17 @@ def pixels(page: Any) -> bytes:
     return bytes(page.locator(".view[data-view=scene] canvas").screenshot())
 
 
-def test_the_browser_draws_the_scene_and_it_moves(browser: Any, robot: Robot, watched: Any) -> None:
+@pytest.mark.parametrize(("overrides", "has_world"), [(BASE, True), (BASE, False), (ARM, True)])
+def test_the_browser_draws_the_scene_and_it_moves(
+    browser: Any, overrides: dict[str, object], has_world: bool, watched: Any
+) -> None:
+    with closing(Robot(overrides, has_world=has_world)) as robot:
+        robot.place()
+        robot.publish()
+        see_it_move(browser, robot, watched)
+
+
+def see_it_move(browser: Any, robot: Robot, watched: Any) -> None:
     with served(watched(robot), 0) as address, opened(browser, address) as page:
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
         assert kinds in (["scan", "top", "scene"], ["arm-above", "arm-side", "scene"])
@@ -222,8 +243,7 @@ def test_the_browser_draws_the_scene_and_it_moves(browser: Any, robot: Robot, wa
         robot.publish()  # of now: one that is old has a line of its own, and takes its place
         wait_until(page, "document.getElementById('banner').hidden")
         before = pixels(page)
-        robot.simulation.world.qpos[0, :1] += 0.4
-        robot.publish()
+        robot.move()
         while pixels(page) == before:
             robot.publish()
         wait_until(page, "!document.getElementById('banner').hidden")  # nothing more comes

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.cli.evaluate import main as evaluate
 from bhd_lerobot.cli.record import main as record
 from bhd_lerobot.cli.ros2 import main as ros2
@@ -165,6 +166,7 @@ def test_a_robot_on_the_wall_clock_goes_on_without_it(stand_in: StandIn, fate: C
         with closing(Viewer(robot.host)) as viewer:
             drive(robot)
             until(stand_in.shown, "the robot is shown")
+            assert scene_from_json(link.block.scene[1]) == robot.make_scene()
             assert mapped_for_writing(viewer.pid, name) == []
             fate(viewer)
             ticks = len(link.block.ring)
