@@ -24,6 +24,7 @@ BOOL, LOSSY = "std_msgs/msg/Bool", Qos(0, reliable=False)
 DIAGNOSTICS_TOPIC, DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 _RESULTS_HZ, _DIAGNOSTICS_HZ = 50, 1
 _CUTS = Limit.NON_FINITE | Limit.VELOCITY | Limit.POSITION | Limit.POSTURE | Limit.CLEARANCE  # others are of every day
+_MOST_RESULTS = 1000  # that wait to be sent; commands wait until there are fewer
 _RESULTS_AT_ONCE = 5  # half of what a ROS 2 subscription keeps by default
 
 
@@ -83,7 +84,7 @@ class InterfaceTopics:
         self._inputs = [
             Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
             *(Input(node.subscription(ESTOP_TOPIC, BOOL, qos), self._stop, "different") for qos in (EVERY, LOSSY)),
-            *(Input(node.subscription(*command, EVERY), self._submit, "each") for command in commands),
+            *(Input(node.subscription(*one, EVERY), self._submit, "each", self._has_room) for one in commands),
         ]
 
     def outputs(self) -> Iterable[Output]:
@@ -101,6 +102,9 @@ class InterfaceTopics:
     def poll(self, now_ns: int) -> int:
         """Follow the goal; return when there is more to do [ns]."""
         return self._goals.poll(now_ns)
+
+    def _has_room(self) -> bool:
+        return len(self._results) < _MOST_RESULTS
 
     def _stop(self, message: Any) -> None:
         if message.data:

@@ -72,14 +72,18 @@ class Input:
         take: takes a message, deserialised; returns False if it is refused.
         which: of the messages that have arrived: the newest that is not refused; each, the oldest first, one in a turn
             of the loop, which goes on meanwhile; or those that differ, once each, to find one among any number.
+        ready: whether more can be taken now; what comes meanwhile waits.
     """
 
     subscription: Subscription
     take: Callable[[Any], bool | None]
     which: Literal["newest", "each", "different"] = "newest"
+    ready: Callable[[], bool] = lambda: True
 
     def run(self, count: "Counts") -> None:
         """Take what has arrived."""
+        if not self.ready():
+            return
         received = self.subscription.take(*((1,) if self.which == "each" else ()))
         if self.which == "different":
             received = list({one.data: one for one in received}.values())

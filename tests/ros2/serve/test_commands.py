@@ -74,6 +74,19 @@ def test_each_goal_of_a_burst_has_one_result(base: Side) -> None:
     assert sorted(one.task_id for one in base.ended(101)) == sorted(["", *names])
 
 
+def test_each_goal_of_a_flood_has_one_result_and_the_stop_is_not_behind_it(base: Side) -> None:
+    publisher, far = base.publisher(COMMAND_TOPIC, COMMAND), goal("", 0.0)
+    messages = [encode(COMMAND, far | {"task_id": f"flood {k}"}, 1)[0] for k in range(3000)]
+    for message in messages:
+        publisher.send(message)
+    before = len(base.results.take())
+    base.press()
+    assert before < 3000  # it is pressed while goals still wait
+    names = [one.task_id for one in base.ended(3000 - before)]
+    assert len(set(names)) == len(names) == 3000 - before
+    base.reset()
+
+
 def test_each_goal_of_a_burst_to_an_arm_has_one_result(arm: Side) -> None:
     # Near where the arm stands; the first is followed, eight wait, and the others are refused.
     pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
