@@ -23,6 +23,8 @@ from nbformat.v4 import new_output
 TUTORIALS = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
 _CELL = re.compile(r"^```(python|bash)\n(.*?)^```\n(?:\n```output\n.*?^```\n)?", re.MULTILINE | re.DOTALL)
 _OUTPUT = re.compile(r"```output\n(.*?)```\s*", re.DOTALL)
+# However few of a tutorial's cells are of Python: without it jupytext takes the language of most of them.
+_PYTHON = "---\njupyter:\n  kernelspec:\n    name: python3\n    display_name: Python 3\n    language: python\n---\n\n"
 # What differs from run to run, or between machines.
 _PROGRESS = re.compile(r"real time|it/s\]|━ +\d")
 _WHEN = re.compile(r"\d{4}-\d\d-\d\d/\d\d-\d\d-\d\d")
@@ -32,7 +34,7 @@ _FIRST, _LAST = 16, 4
 
 def notebook(tutorial: Path) -> str:
     """Return a tutorial as a notebook: a cell for each block of Python or bash, its output, and text between them."""
-    book = jupytext.reads(tutorial.read_text(encoding="utf-8"), fmt="md")
+    book = jupytext.reads(_PYTHON + tutorial.read_text(encoding="utf-8"), fmt="md")
     cells: list[Any] = []
     for cell in book.cells:
         if cells and cells[-1].cell_type == "code" and (found := _OUTPUT.match(cell.source)):

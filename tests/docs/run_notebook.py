@@ -20,6 +20,7 @@ def run(notebook: Path, folder: Path, shorter: dict[str, str]) -> int:
     """
     left = dict(shorter)
     os.chdir(folder)
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     names: dict[str, Any] = {"__name__": "__main__"}
     sys.modules["__main__"].__dict__.update(names)
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
