@@ -9,6 +9,7 @@ import pytest
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import CommandRefusedError, ConfigError
@@ -359,3 +360,34 @@ def test_the_limit_of_force_holds_in_random_postures_and_directions() -> None:
     assert stopped.mean() > 0.9
     assert np.median(most[stopped]) < 170.0
     assert np.quantile(most[stopped], 0.9) < 200.0
+
+
+BOUNCES = [
+    ((3.60, -2.17, 1.50, -2.29, -1.87, -0.55), (0.77, 0.46, -0.43)),
+    ((2.83, -2.40, 2.56, -0.33, -0.13, 0.94), (-0.52, 0.75, 0.40)),
+    ((2.96, -1.54, 0.49, -2.14, -1.65, -0.86), (0.48, 0.66, -0.58)),
+    ((4.19, -1.68, 0.57, -1.93, -1.12, -0.44), (-0.04, 0.52, 0.85)),
+    ((3.27, -1.15, 0.36, -0.55, -1.25, 0.96), (0.48, -0.10, -0.87)),
+]
+"""Postures [rad], and directions in which a stiff wall stands: a joint bounces back while the stop begins."""
+
+
+def test_the_stop_of_an_arm_that_drives_fast_into_a_wall_needs_no_guard() -> None:
+    postures, directions = (np.array(column) for column in zip(*BOUNCES, strict=True))
+    n, speed = len(BOUNCES), 0.25
+    watchdog = np.zeros(n, np.int64)
+    for start in np.linspace(-0.004, 0.004, 5):  # another phase of the contact each
+        arm = UR5Simulation(UR5Config(), n)
+        scenes = [TableScene("empty", (), (*posture, 0.085)) for posture in postures + start]
+        arm.reset(np.arange(n), scenes, range(n))
+        Wall(arm, directions, 0.0, 1e9)
+        forward, action = ForwardKinematics(arm.body.chain), arm.cerebellum.command.copy()  # type: ignore[union-attr]
+        twist = np.concatenate((-directions * speed / 25, np.zeros((n, 3))), axis=1)[..., None]
+        for _ in range(15):
+            jacobian = np.ascontiguousarray(forward.jacobian(action[:, :6]))
+            square = jacobian @ np.swapaxes(jacobian, 1, 2) + 0.02**2 * np.eye(6)
+            turn = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(square, twist)
+            action[:, :6] += np.clip(turn[..., 0], -0.08, 0.08)
+            watchdog |= np.asarray(arm.step(action).watchdog)
+    assert (watchdog & Watchdog.FORCE).all()
+    assert not (watchdog & Watchdog.GUARD).any()

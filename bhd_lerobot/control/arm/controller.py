@@ -140,7 +140,7 @@ class ArmController(Controller):
         self._largest_error = self._effort / self._stiffness
         self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
         self.limits = self.setpoints.limits  # the same array
-        self._work = np.zeros((n, width))
+        self._work, self._before = np.zeros((2, n, width))  # the latter: the servos' commands of the tick before
         state = self.command, self.velocity, self.actuators, self.limits
         self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
 
@@ -237,6 +237,7 @@ class ArmController(Controller):
             self._give_way(reading)
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
+        np.copyto(self._before, self.actuators)
         if self._lead_commands(reading.position, reading.velocity):
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
@@ -363,6 +364,10 @@ class ArmController(Controller):
         off = self._aim - self.actuators[:, :dof]
         step = largest_change(np.abs(off) / self._bend) * self._bend
         step = np.copysign(np.minimum(step, self._top * 2 * self._half_tick), off)
+        # Towards where a joint is it may go at once. A joint that bounces back is on the other side of its command.
+        rate, way = self.actuators[:, :dof] - self._before[:, :dof], reading.position[:, :dof] - self.actuators[:, :dof]
+        gradual = np.minimum(np.maximum(step, rate - self._bend), rate + self._bend)
+        step = np.where((step * way > 0.0) & (np.abs(step) <= np.abs(way)), step, gradual)
         np.copyto(self.command[:, :dof], self.actuators[:, :dof] + step, where=mask[:, None])
         np.copyto(self.velocity, 0.0, where=mask[:, None])
         np.copyto(self.acceleration, 0.0, where=mask[:, None])
