@@ -112,6 +112,7 @@ def pages() -> dict[Path, str]:
         *("# `bhd-ros2`\n", "## `bhd-ros2 serve`\n", *_options(ServeConfig, "", "ros2.md", listed)),
         *("## `bhd-ros2 bridge`\n", *_options(BridgeConfig, "", "ros2.md", listed)),
         *("## `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())),
+        *("## Bags\n", *_commands(bag.bag_parser())),
     ]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():

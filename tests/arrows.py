@@ -72,6 +72,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "sim.description",
     ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
+    "ros2.bag.recorder": ("datasets.storage", "ros2.live", "ros2.messages", "ros2.bag.storage"),
+    "ros2.bag.player": ("ros2.live", "ros2.messages", "ros2.bag.storage"),
     "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
     "ros2.bag.importer": (
         *("tasks", "bodies", "control", "datasets.format", "datasets.writer"),

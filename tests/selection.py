@@ -32,6 +32,8 @@ WALL_CLOCK = (
     "robots/viewer/",
     "rollout/test_episode.py",
     "rollout/test_marks.py",
+    "ros2/bag/player/",
+    "ros2/bag/recorder/",
     "ros2/live/",
     "ros2/robots/",
     "ros2/serve/",

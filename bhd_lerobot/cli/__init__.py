@@ -1,3 +1,17 @@
 """The command lines; nothing imports them."""
 
-__all__ = ["data", "demo", "doctor", "evaluate", "monitor", "record", "replay", "ros2", "serve", "start", "train"]
+__all__ = [
+    "bag",
+    "data",
+    "demo",
+    "doctor",
+    "evaluate",
+    "monitor",
+    "network",
+    "record",
+    "replay",
+    "ros2",
+    "serve",
+    "start",
+    "train",
+]

@@ -5,20 +5,15 @@ import importlib
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from bhd_lerobot.cli.data.command import Commands, Run, add_command
+from bhd_lerobot.cli import bag
+from bhd_lerobot.cli.network import add_network_command, node_of
 from bhd_lerobot.cli.start import leaving_on_interrupt
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.command import Parser, exit_status
-from bhd_lerobot.ros2.live.network import NetworkConfig
-from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.live.topics import Intervals, at_path, described, found_topics, is_hidden, plain, subscribed
-from bhd_lerobot.ros2.messages.definitions import register_types
-from bhd_lerobot.ros2.messages.mapping import MappingConfig
 
 _END = "...\n"  # which YAML puts after a value that is neither a mapping nor a list
 
@@ -37,7 +32,8 @@ _Dumper.add_representer(
 
 def _parser() -> Parser:
     parser = Parser(prog="bhd-ros2", description=__doc__.split(": ", 1)[1])
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
+    commands: Any = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
+    bag.add_to(commands)
     commands.add_parser("serve", help="a simulated robot as a ROS 2 robot; `bhd-ros2 serve --help` has its options")
     commands.add_parser("bridge", help="the cerebellum in front of a real robot; `bhd-ros2 bridge --help` likewise")
     help_text = "what is on the network"
@@ -49,51 +45,23 @@ def topics_parser(parser: argparse.ArgumentParser | None = None) -> argparse.Arg
     """Return the parser of `bhd-ros2 topics`, with its commands."""
     parser = Parser(prog="bhd-ros2 topics") if parser is None else parser
     kinds: Any = parser.add_subparsers(dest="kind", metavar="COMMAND", title="commands", required=True)
-    listed = _add(kinds, "list", "topics, their types, publishers and subscriptions, and what does not fit", _list)
+    listed = add_network_command(
+        kinds, "list", "topics, their types, publishers and subscriptions, and what does not fit", _list
+    )
     listed.add_argument("--all", action="store_true", help="topics of actions, too")
-    rate = _add(kinds, "hz", "the rate of a topic, each second; Ctrl-C ends with a summary", _hz, "TOPIC")
+    rate = add_network_command(
+        kinds, "hz", "the rate of a topic, each second; Ctrl-C ends with a summary", _hz, "TOPIC"
+    )
     rate.add_argument("--window", type=float, default=10.0, metavar="S", help="time that a line is about (default: 10)")
     rate.add_argument("--seconds", type=float, metavar="S", help="end after this time")
-    echo = _add(kinds, "echo", "messages of a topic, as YAML; long arrays are shortened", _echo, "TOPIC")
+    echo = add_network_command(kinds, "echo", "messages of a topic, as YAML; long arrays are shortened", _echo, "TOPIC")
     echo.add_argument("--field", default="", metavar="PATH", help="only this: pose.pose.position, or ranges.0")
     echo.add_argument("-n", type=int, metavar="N", help="end after so many messages")
     return parser
 
 
-def _add(commands: Commands, name: str, help_text: str, run: Run, positional: str = "") -> argparse.ArgumentParser:
-    command = add_command(commands, name, help_text, run, names_dataset=False)
-    if positional:
-        command.add_argument("topic", metavar=positional, help="name of the topic")
-        command.add_argument(
-            "--map", type=Path, metavar="FILE",
-            help="a YAML file, a mapping as of `bhd-data`, whose `types` define further message types",
-        )  # fmt: skip
-    command.add_argument("--domain", type=int, metavar="N", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
-    command.add_argument(
-        "--interface", default="lo", metavar="NAME",
-        help="network interface or address; lo (default) finds nodes of this machine, auto takes the usual one",
-    )  # fmt: skip
-    command.add_argument(
-        "--peers", action="append", default=[], metavar="ADDRESS", help="a machine to look on; may be given again"
-    )
-    command.add_argument("--distro", default="jazzy", help="jazzy (default) and later, or humble")
-    command.add_argument("--wait", type=float, default=3.0, metavar="S", help="time to find others (default: 3)")
-    return command
-
-
-def _node(options: argparse.Namespace) -> Node:
-    for name in ("wait", "window", "seconds", "n"):
-        if (value := getattr(options, name, None)) is not None and not value > 0:
-            raise ConfigError(f"{'-' if len(name) == 1 else '--'}{name} is {value}; it must be positive.")
-    network = NetworkConfig(options.domain, options.interface, list(options.peers), options.distro)
-    node = Node("bhd_ros2", network)
-    if getattr(options, "map", None) is not None:
-        register_types(MappingConfig.load(options.map.expanduser()).types)
-    return node
-
-
 def _list(options: argparse.Namespace) -> int:
-    with _node(options) as node:
+    with node_of(options) as node:
         found = [one for one in found_topics(node, options.wait) if options.all or not is_hidden(one.topic)]
     print("\n".join(described(found)) or "There are nodes, and no topics.")
     return 0
@@ -101,7 +69,7 @@ def _list(options: argparse.Namespace) -> int:
 
 def _hz(options: argparse.Namespace) -> int:
     intervals = Intervals(options.window)
-    with _node(options) as node:
+    with node_of(options) as node:
         subscription = subscribed(node, options.topic, options.wait)
         begun = time.monotonic()
         due = begun + 1.0
@@ -120,7 +88,7 @@ def _hz(options: argparse.Namespace) -> int:
 
 
 def _echo(options: argparse.Namespace) -> int:
-    with _node(options) as node:
+    with node_of(options) as node:
         subscription = subscribed(node, options.topic, options.wait)
         left = options.n
         while left is None or left > 0:

@@ -1,3 +1,3 @@
-"""ROS 2 bags: files, datasets as bags, bags as datasets."""
+"""ROS 2 bags: files, datasets as bags, bags as datasets, bags of a network and on a network."""
 
-__all__ = ["exporter", "importer", "storage"]
+__all__ = ["exporter", "importer", "player", "recorder", "storage"]

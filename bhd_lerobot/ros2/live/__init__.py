@@ -12,4 +12,5 @@ __all__ = [
     "spec",
     "topic_types",
     "topics",
+    "type_description",
 ]

@@ -1,5 +1,6 @@
 """Which nodes, publishers and subscriptions are on the network, and what does not fit together."""
 
+import re
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ class Endpoint:
         is_publisher: whether it is a publisher.
         node: name of its node with its namespace; empty while that is not known.
         is_own: whether it is of this process.
+        type_hash: of the type's definition, as ROS 2 states it since Iron; empty if it does not.
     """
 
     topic: str
@@ -34,6 +36,7 @@ class Endpoint:
     is_publisher: bool
     node: str
     is_own: bool
+    type_hash: str = ""
 
 
 class Graph:
@@ -85,6 +88,11 @@ class Graph:
         self._own[is_writer].append(guid)
         self._publish()
 
+    def remove(self, guid: UUID, *, is_writer: bool) -> None:
+        """Publish that an endpoint is this node's no longer."""
+        self._own[is_writer].remove(guid)
+        self._publish()
+
     def _publish(self) -> None:
         readers, writers = ([self._gid_of(guid) for guid in self._own[kind]] for kind in (False, True))
         node = self._node(self._namespace, self._name, readers, writers)
@@ -117,6 +125,7 @@ class Graph:
                             is_publisher,
                             owners.get(one.key.bytes, ""),
                             one.participant_key == self._participant_guid,
+                            _type_hash_of(one.qos),
                         )
                     )
         return sorted(found, key=lambda one: (one.topic, not one.is_publisher, one.node))
@@ -256,6 +265,15 @@ def _qos_of(qos: Any) -> Qos:
         any(isinstance(policy, Policy.Reliability.Reliable) for policy in qos),
         any(policy is Policy.Durability.TransientLocal for policy in qos),
     )
+
+
+def _type_hash_of(qos: Any) -> str:
+    from cyclonedds.qos import Policy
+
+    for policy in qos:
+        if isinstance(policy, Policy.Userdata) and (found := re.search(rb"typehash=(RIHS01_[0-9a-f]+);", policy.data)):
+            return found[1].decode()
+    return ""
 
 
 def _types(gid_bytes: int) -> tuple[Any, Any, Any]:

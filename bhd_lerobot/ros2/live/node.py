@@ -64,6 +64,15 @@ class Publisher:
         except DDSException as error:
             raise RealtimeError(f"A message for {self.topic} cannot be sent: {as_text(error)}.") from error
 
+    def wait_for_acks(self, timeout_s: float) -> bool:
+        """Wait until all reliable subscriptions have received everything, or a time is over [s]; return which."""
+        from cyclonedds.core import DDSException
+
+        try:
+            return bool(self._writer.wait_for_acks(round(timeout_s * 1e9)))
+        except (DDSException, AttributeError):  # the second at a time-out, which Cyclone DDS 11.0.1 looks up wrongly
+            return False
+
     @property
     def receivers(self) -> int:
         """How many subscriptions fit, of any node."""
@@ -155,6 +164,12 @@ class Node:
     def raw_subscription(self, name: str, msgtype: str, qos: Qos) -> Subscription:
         """Return a subscription by its name on the network, whose messages do not end `wait`."""
         return Subscription(self._reader(name, msgtype, qos, wakes=False), name, msgtype)
+
+    def remove(self, subscription: Subscription) -> None:
+        """End a raw subscription; it must not be used any more."""
+        self._entities.remove(subscription.reader)
+        self.graph.remove(subscription.reader.guid, is_writer=False)
+        subscription.reader = None
 
     def wait(self, timeout_s: float) -> None:
         """Return when a message has arrived on a subscription, or after a time [s]."""

@@ -1,7 +1,9 @@
 """Services, actions and further messages: those that clients here use, and those that a user adds."""
 
+import os
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError, as_text
@@ -43,6 +45,45 @@ builtin_interfaces/Duration timeout
 ---
 bool ok
 string message
+""",
+    "type_description_interfaces/msg/FieldType": """
+uint8 type_id
+uint64 capacity
+uint64 string_capacity
+string<=255 nested_type_name
+""",
+    "type_description_interfaces/msg/Field": """
+string name
+FieldType type
+string default_value
+""",
+    "type_description_interfaces/msg/IndividualTypeDescription": """
+string<=255 type_name
+Field[] fields
+""",
+    "type_description_interfaces/msg/TypeDescription": """
+IndividualTypeDescription type_description
+IndividualTypeDescription[] referenced_type_descriptions
+""",
+    "type_description_interfaces/msg/TypeSource": """
+string type_name
+string encoding
+string raw_file_contents
+""",
+    "type_description_interfaces/msg/KeyValue": """
+string key
+string value
+""",
+    "type_description_interfaces/srv/GetTypeDescription": """
+string type_name
+string type_hash
+bool include_type_sources
+---
+bool successful
+string failure_reason
+type_description_interfaces/TypeDescription type_description
+type_description_interfaces/TypeSource[] type_sources
+type_description_interfaces/KeyValue[] extra_information
 """,
     "ur_dashboard_msgs/msg/SafetyMode": "uint8 mode",
     "control_msgs/msg/JointTolerance": """
@@ -217,8 +258,46 @@ def find_type(name: str, distro: str = "jazzy") -> None:
     definitions = {**DEFINITIONS, **(HUMBLE if distro == "humble" else {})}
     register_types({one: text for one, text in definitions.items() if not _is_known(one)})
     if not _is_known(name):
+        register_types(_installed(name))
+    if not _is_known(name):
         kind = name.split("/")[1] if name.count("/") == 2 else ""
         raise ConfigError(unknown_type(name, DEFINITIONS if kind in _PARTS else type_store().fielddefs))
+
+
+def register_unknown(types: Mapping[str, str]) -> None:
+    """Make types known that are not yet, as they come together with one of them, which names the others.
+
+    Raises:
+        ConfigError: a definition cannot be read.
+    """
+    register_types({name: text for name, text in types.items() if not _is_known(name)})
+
+
+def _installed(name: str) -> dict[str, str]:
+    """Return the definitions of a message and of those that it names, as far as a ROS installation has them."""
+    folders = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    found: dict[str, str] = {}
+    wanted = [name]
+    while wanted:
+        one = wanted.pop()
+        package, _, rest = one.partition("/")
+        files = (folder / "share" / package / f"{rest}.msg" for folder in folders)
+        if one in found or _is_known(one) or (file := next(filter(Path.is_file, files), None)) is None:
+            continue
+        found[one] = file.read_text(encoding="utf-8", errors="replace")
+        wanted += _named_in(found[one], package)
+    return found
+
+
+def _named_in(text: str, package: str) -> list[str]:
+    """Return the types that the fields of a message may name, which is of a package."""
+    found = []
+    for line in text.splitlines():
+        kind = re.match(r"\s*([A-Za-z][\w/]*)", line)
+        if kind is not None:
+            named, _, short = kind[1].rpartition("/")
+            found.append(f"{named.split('/')[0] or package}/msg/{short}")
+    return found
 
 
 def _is_known(name: str) -> bool:

@@ -1,3 +1,3 @@
 """Files of bags, MCAP and SQLite."""
 
-__all__ = ["find", "mcap", "place", "read", "sqlite", "unpack", "write"]
+__all__ = ["crash_safe", "find", "mcap", "place", "read", "sqlite", "unpack", "write"]

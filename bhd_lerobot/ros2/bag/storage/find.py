@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text
-from bhd_lerobot.ros2.bag.storage.read import FILES, Bag, opened, publishers_in
+from bhd_lerobot.ros2.bag.storage.read import FILES, Bag, opened, profiles_in
 
 _UNREADABLE = (
     *(OSError, yaml.YAMLError, RecursionError),  # the file, its YAML, or how deep that is
@@ -185,7 +185,7 @@ def publishers_of(topics: Any) -> dict[str, int]:
     for topic in topics if isinstance(topics, list) else ():
         about = topic.get("topic_metadata") if isinstance(topic, dict) else None
         if isinstance(about, dict) and isinstance(name := about.get("name"), str):
-            found[name] = max(found.get(name, 0), publishers_in(about.get("offered_qos_profiles")))
+            found[name] = max(found.get(name, 0), len(profiles_in(about.get("offered_qos_profiles"))))
     return {name: count for name, count in found.items() if count}
 
 

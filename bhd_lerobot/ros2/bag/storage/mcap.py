@@ -35,6 +35,7 @@ class McapFile:
     Attributes:
         channels: number -> topic, type, serialisation; those read so far.
         profiles: number -> quality of service of the topic's publishers, as the recorder wrote it.
+        definitions: type -> its definition with those that it names; those read so far.
 
     Args:
         budget: how much it may unpack to; by its own size if None.
@@ -45,6 +46,7 @@ class McapFile:
         self.budget = budget or Budget(path)
         self.channels: dict[int, tuple[str, str, str]] = {}
         self.profiles: dict[int, Any] = {}
+        self.definitions: dict[str, str] = {}
         self.problems: list[str] = []
         self._schemas: dict[int, str] = {0: ""}
         with path.open("rb") as file:
@@ -152,6 +154,8 @@ class McapFile:
 
         if isinstance(record, Schema):
             self._schemas[record.id] = record.name
+            if record.encoding == "ros2msg":
+                self.definitions[record.name] = record.data.decode(errors="replace")
         elif isinstance(record, Channel):
             msgtype = self._schemas.get(record.schema_id, "")
             self.channels[record.id] = (record.topic, msgtype, record.message_encoding)

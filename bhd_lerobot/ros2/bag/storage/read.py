@@ -34,6 +34,7 @@ class Topic:
         connections: messages of each connection (of a publisher, if the recorder kept them apart) in one of the bag's
             files; empty if there is but one.
         publishers: how many offered it when the recorder subscribed; 0 if that is not known.
+        profiles: their quality of service, as the recorder wrote it.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Topic:
     serialisation: str = "cdr"
     connections: tuple[int, ...] = ()
     publishers: int = 0
+    profiles: tuple[Any, ...] = ()
 
 
 @dataclass
@@ -76,6 +78,7 @@ class Bag:
         problems: what is wrong with it and did not keep it from being read, in sentences.
         per_message: whether its metadata say that each message is compressed.
         publishers: topic -> how many offered it, by its metadata.
+        definitions: type -> its definition, as far as they are in the bag; known after `topics`.
     """
 
     path: Path
@@ -84,6 +87,7 @@ class Bag:
     problems: list[str] = field(default_factory=list)
     per_message: bool = False
     publishers: dict[str, int] = field(default_factory=dict)
+    definitions: dict[str, str] = field(default_factory=dict)
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
@@ -95,6 +99,7 @@ class Bag:
         types: dict[str, Counter[tuple[str, str]]] = {}  # messages by type and serialisation
         connections: dict[str, list[int]] = {}
         publishers = dict(self.publishers)
+        profiles: dict[str, tuple[Any, ...]] = {}
         for file in self._open():
             counts = file.summary()
             if counts is None:
@@ -105,7 +110,10 @@ class Bag:
                 count = counts.get(number, 0)
                 types.setdefault(name, Counter())[msgtype, serialisation] += count
                 here.setdefault(name, []).extend([count] * bool(count))
-                publishers[name] = max(publishers.get(name, 0), publishers_in(file.profiles.get(number)))
+                offered = profiles_in(file.profiles.get(number))
+                publishers[name] = max(publishers.get(name, 0), len(offered))
+                profiles[name] = max(profiles.get(name, ()), offered, key=len)
+            self.definitions |= file.definitions
             for name, several in here.items():
                 connections[name] = max(connections.get(name, []), several, key=len)
         found = {}
@@ -115,8 +123,9 @@ class Bag:
             each = tuple(connections[name]) if len(connections[name]) > 1 else ()
             total = sum(kinds.values())
             found[name] = Topic(
-                name, msgtype, total, tuple(others), serialisation or "cdr", each, publishers.get(name, 0)
-            )
+                name, msgtype, total, tuple(others), serialisation or "cdr", each, publishers.get(name, 0),
+                profiles[name],
+            )  # fmt: skip
         return found
 
     def read(self, topics: Collection[str], heads: Collection[str] = ()) -> dict[str, Messages]:
@@ -204,22 +213,22 @@ def opened(path: Path) -> Iterator[Any]:
         yield file
 
 
-def publishers_in(profiles: Any) -> int:
-    """Return how many publishers offered a topic when the recorder subscribed; 0 if that is not known.
+def profiles_in(profiles: Any) -> tuple[Any, ...]:
+    """Return the quality of service of each publisher that offered a topic when the recorder subscribed.
 
     Args:
-        profiles: ``offered_qos_profiles``, one quality of service for each publisher: a YAML text in versions 4 to 8 of
-            rosbag2's metadata, in SQLite files and in the channels of MCAP files; a list in version 9.
+        profiles: ``offered_qos_profiles``: a YAML text in versions 4 to 8 of rosbag2's metadata, in SQLite files and in
+            the channels of MCAP files; a list in version 9.
     """
     if isinstance(profiles, str):
-        return _profiles_in(profiles)
-    return len(profiles) if isinstance(profiles, list) else 0
+        return _parsed(profiles)
+    return tuple(profiles) if isinstance(profiles, list) else ()
 
 
 @lru_cache(maxsize=256)  # a bag has few that differ, and YAML is slow
-def _profiles_in(text: str) -> int:
+def _parsed(text: str) -> tuple[Any, ...]:
     try:
         profiles = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError):
-        return 0
-    return len(profiles) if isinstance(profiles, list) else 0
+        return ()
+    return tuple(profiles) if isinstance(profiles, list) else ()

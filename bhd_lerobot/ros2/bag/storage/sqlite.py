@@ -11,6 +11,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.storage.unpack import Budget, room, temporary_copy
 
 _STEPS = 10_000  # of SQLite's own machine, between two checks of their number
+_LOGS = ("-wal", "-journal")
 _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20
 
 
@@ -19,6 +20,7 @@ class SqliteFile:
 
     Attributes:
         profiles: number -> quality of service of the topic's publishers, where the recorder wrote it.
+        definitions: type -> its definition with those that it names, where the recorder wrote it.
 
     Args:
         budget: how much may be unpacked; by its own size if None.
@@ -37,15 +39,15 @@ class SqliteFile:
 
     def _open(self) -> None:
         whole = self._whole_pages()
-        # With a write-ahead log beside it, which a killed recorder leaves, the log is read, too.
-        log = Path(f"{self.path.resolve()}-wal")
-        has_log = log.exists() and log.stat().st_size > 0
-        if has_log:
-            whole = self._beside_log(whole, log)
-        self._bytes = whole.stat().st_size + (log.stat().st_size if has_log else 0)
+        # With a write-ahead log or a rollback journal beside it, which a killed recorder leaves, that is read, too.
+        logs = [Path(f"{self.path.resolve()}{ending}") for ending in _LOGS]
+        logs = [log for log in logs if log.exists() and log.stat().st_size]
+        if logs:
+            whole = self._beside_logs(whole, logs)
+        self._bytes = whole.stat().st_size + sum(log.stat().st_size for log in logs)
         try:
             connection = sqlite3.connect(
-                f"{whole.resolve().as_uri()}?mode=ro{'' if has_log else '&immutable=1'}", uri=True
+                f"{whole.resolve().as_uri()}?mode={'rw' if logs else 'ro&immutable=1'}", uri=True
             )
             self._connection = self._stack.enter_context(contextlib.closing(connection))
             self._bound()
@@ -62,6 +64,10 @@ class SqliteFile:
         self.profiles: dict[int, Any] = {}
         with contextlib.suppress(sqlite3.Error):  # rosbag2's first versions have no such column
             self.profiles = dict(self._rows("SELECT id, offered_qos_profiles FROM topics"))
+        self.definitions: dict[str, str] = {}
+        with contextlib.suppress(sqlite3.Error):  # nor has Humble's such a table
+            query = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
+            self.definitions = dict(self._rows(query))
 
     def close(self) -> None:
         """Close the file."""
@@ -120,14 +126,15 @@ class SqliteFile:
             return path
         return self._stack.enter_context(temporary_copy(path, path.name, _beginning(path, size - size % page)))
 
-    def _beside_log(self, whole: Path, log: Path) -> Path:
-        """Return a copy of the file with its log beside it: where SQLite reads a log, it writes an index of it."""
+    def _beside_logs(self, whole: Path, logs: list[Path]) -> Path:
+        """Return a copy of the file with its logs beside it: where SQLite reads one, it writes."""
         if whole == self.path:
             whole = self._stack.enter_context(
                 temporary_copy(whole, whole.name, _beginning(whole, whole.stat().st_size))
             )
-        with room(self.path):
-            shutil.copyfile(log, f"{whole}-wal")
+        for log in logs:
+            with room(self.path):
+                shutil.copyfile(log, f"{whole}{log.name.removeprefix(self.path.resolve().name)}")
         return whole
 
     def summary(self) -> dict[int, int] | None:

@@ -30,8 +30,22 @@ class Stream:
     latched: bool = False
 
 
+def profile(depth: int, *, reliable: bool = True, transient_local: bool = False) -> Any:
+    """Return a quality of service as a bag has it; all messages are kept with a depth of 0."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    forever = QosTime(*_FOREVER)
+    return Qos(
+        QosHistory.KEEP_LAST if depth else QosHistory.KEEP_ALL,
+        depth,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if transient_local else QosDurability.VOLATILE,
+        forever, forever, QosLiveliness.AUTOMATIC, forever, False,
+    )  # fmt: skip
+
+
 class BagWriter:
-    """Writes one bag; use it as a context manager. After an exception inside the bag is incomplete.
+    """Writes one bag; use it as a context manager. After an exception inside the bag is as at the last `flush`.
 
     Args:
         path: the folder to write; it must not exist.
@@ -41,9 +55,9 @@ class BagWriter:
         require_rosbags()
         if storage not in FORMATS:
             raise ConfigError(unknown_name("format", storage, FORMATS))
-        from rosbags.rosbag2 import StoragePlugin, Writer
+        from bhd_lerobot.ros2.bag.storage.crash_safe import CrashSafeWriter
 
-        self._writer = Writer(path, version=_VERSION, storage_plugin=StoragePlugin[storage.upper()])
+        self._writer = CrashSafeWriter(path, storage, _VERSION)
         for key, value in custom.items():
             self._writer.set_custom_data(key, value)
         self._connections: dict[str, Any] = {}
@@ -62,38 +76,44 @@ class BagWriter:
     def write(self, streams: Iterable[Stream]) -> int:
         """Write streams in the order of time; at the same time in the order given. Return how many messages."""
         count = 0
-        writer = self._writer
         for time_ns, _, connection, payload in heapq.merge(*map(self._timed, range(10**6), streams), key=_order):
-            writer.write(connection, time_ns, payload)
+            self.append(connection, time_ns, payload)
             count += 1
         return count
+
+    def append(self, connection: Any, time_ns: int, payload: bytes) -> None:
+        """Write a message of a topic, of which `connect` was called, after all that were written before."""
+        self._writer.write(connection, time_ns, payload)
+
+    def flush(self) -> None:
+        """Make the bag one that can be read with all that was written so far, also if this process is killed."""
+        self._writer.flush()
 
     def _timed(self, place: int, stream: Stream) -> Iterator[tuple[int, int, Any, bytes]]:
         connection = self._connections.get(stream.topic)
         if connection is None:
-            connection = self._connections[stream.topic] = self._connect(stream)
+            kept = profile(1 if stream.latched else 10, transient_local=stream.latched)
+            connection = self._connections[stream.topic] = self.connect(stream.topic, stream.msgtype, [kept])
         return ((time_ns, place, connection, payload) for time_ns, payload in stream.messages)
 
-    def _connect(self, stream: Stream) -> Any:
-        from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    def connect(self, topic: str, msgtype: str, profiles: Iterable[Any], type_hash: str = "") -> Any:
+        """Add a topic; once for each type that it has.
 
-        forever = QosTime(*_FOREVER)
-        durability = QosDurability.TRANSIENT_LOCAL if stream.latched else QosDurability.VOLATILE
-        profile = Qos(
-            QosHistory.KEEP_LAST, 1 if stream.latched else 10, QosReliability.RELIABLE, durability,
-            forever, forever, QosLiveliness.AUTOMATIC, forever, False,
-        )  # fmt: skip
+        Args:
+            profiles: what its publishers offer, as `profile` returns it.
+            type_hash: of the type's definition, as its publishers state it; computed if empty.
+        """
         store = type_store()
-        text, _ = store.generate_msgdef(stream.msgtype, ros_version=2)
-        if stream.msgtype in DEFINITIONS:  # with its comments
+        text, _ = store.generate_msgdef(msgtype, ros_version=2)
+        if msgtype in DEFINITIONS:  # with its comments
             _, separator, rest = text.partition("=" * 80)
-            text = DEFINITIONS[stream.msgtype].lstrip() + separator + rest
+            text = DEFINITIONS[msgtype].lstrip() + separator + rest
         return self._writer.add_connection(
-            stream.topic,
-            stream.msgtype,
+            topic,
+            msgtype,
             msgdef=text,
-            rihs01=store.hash_rihs01(stream.msgtype),
-            offered_qos_profiles=[profile],
+            rihs01=type_hash or store.hash_rihs01(msgtype),
+            offered_qos_profiles=list(profiles),
         )
 
 

@@ -7,7 +7,7 @@ import yaml
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.storage.find import find_bags, publishers_of
-from bhd_lerobot.ros2.bag.storage.read import publishers_in
+from bhd_lerobot.ros2.bag.storage.read import profiles_in
 from tests.cases import each_case
 from tests.ros2.bag.support import check, drive, write
 
@@ -138,7 +138,7 @@ NAMED = {**PROFILE, "history": "keep_last", "reliability": "reliable", "durabili
     ],
 )
 def test_profiles_of_every_version_give_the_number_of_publishers(profiles, count):
-    assert publishers_in(profiles) == count
+    assert len(profiles_in(profiles)) == count
     topics = [{"topic_metadata": {"name": "/cmd_vel", "offered_qos_profiles": profiles}, "message_count": 3}]
     assert publishers_of(topics) == ({"/cmd_vel": count} if count else {})
     for malformed in (None, "x", 3, [None, {}, {"topic_metadata": None}, {"topic_metadata": {}}]):
@@ -160,7 +160,7 @@ def test_every_version_of_metadata_is_read(split, messages):
         about["topics_with_message_count"] = [{"topic_metadata": topic, "message_count": 30}]
         (bag / "metadata.yaml").write_text(yaml.safe_dump(metadata))
         check(bag, messages)
-        assert find_bags(bag)[0].topics["/cmd_vel"].publishers == publishers_in(profiles)
+        assert find_bags(bag)[0].topics["/cmd_vel"].publishers == len(profiles_in(profiles))
 
 
 def test_files_beside_folders_of_bags_are_refused_and_not_forgotten(tmp_path, parts, split, messages):

@@ -1,0 +1,3 @@
+"""From a bag to a network."""
+
+__all__ = ["offer", "play"]

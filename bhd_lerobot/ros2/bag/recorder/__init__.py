@@ -1,0 +1,3 @@
+"""From a network to a bag."""
+
+__all__ = ["receive", "record"]

@@ -1,0 +1,224 @@
+"""`bhd-ros2 play`: what was recorded comes again, in its order and not too early, and is recorded again."""
+
+import re
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from bhd_lerobot.cli.ros2 import main
+from bhd_lerobot.ros2.bag.player.offer import recorded_qos
+from bhd_lerobot.ros2.bag.storage.find import find_bags
+from bhd_lerobot.ros2.bag.storage.read import Topic
+from bhd_lerobot.ros2.bag.storage.write import BagWriter, profile
+from bhd_lerobot.ros2.live.network import LATCHED, NetworkConfig, Qos
+from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.messages.serialize import decode, encode_one
+from tests.forks import Fork
+from tests.ros2.peer_env import Peer
+from tests.waiting import until
+
+TEXT, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+START, STEP = 1_700_000_000 * 10**9, 20_000_000
+COUNT = 60
+TOPICS = {
+    "/words": profile(10),
+    "/robot1/fast": profile(5, reliable=False),
+    "/robot1/latched": profile(1, transient_local=True),
+}
+
+type Messages = dict[str, list[tuple[int, bytes]]]
+
+
+def text(number: int) -> bytes:
+    return encode_one(TEXT, {"data": str(number)})
+
+
+def write(path: Path, storage: str = "mcap") -> Path:
+    """Write a bag of three topics, of which one is latched and has a message at the beginning alone."""
+    with BagWriter(path, storage, {}) as bag:
+        connections = {topic: bag.connect(topic, TEXT, [kept]) for topic, kept in TOPICS.items()}
+        bag.append(connections["/robot1/latched"], START, text(-1))
+        for number in range(COUNT):
+            for topic in ("/words", "/robot1/fast"):
+                bag.append(connections[topic], START + number * STEP, text(number))
+    return path
+
+
+def read(path: Path) -> Messages:
+    found: Messages = {}
+    with Reader(path) as reader:
+        for connection, received, data in reader.messages():
+            found.setdefault(connection.topic, []).append((received, bytes(data)))
+    return found
+
+
+def texts(messages: Messages) -> dict[str, list[str]]:
+    return {topic: [decode(TEXT, data).data for _, data in several] for topic, several in messages.items()}
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_what_is_played_is_recorded_again_with_its_quality_of_service(
+    storage: str, domain: int, tmp_path: Path
+) -> None:
+    first, second = write(tmp_path / "first", storage), tmp_path / "second"
+    recorder = Fork(main, ["record", "--all", f"--output={second}", f"--domain={domain}"])
+    player = Fork(main, ["play", str(first), f"--domain={domain}", "--wait=60"], output=tmp_path / "printed")
+    try:
+        assert player.wait() == 0
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait() == 0
+    finally:
+        player.kill()
+        recorder.kill()
+    assert texts(read(second)) == texts(read(first))  # the bytes are filled up to a multiple of four on the network
+    times = [received for received, _ in read(second)["/words"]]
+    assert times[-1] - times[0] > 0.9 * (COUNT - 1) * STEP  # later it may be, on a busy machine
+    before, after = (find_bags(bag)[0].topics for bag in (first, second))
+    for topic in TOPICS:
+        kinds = [
+            [(one["reliability"], one["durability"]) for one in found[topic].profiles] for found in (before, after)
+        ]
+        assert kinds[0] == kinds[1]
+    printed = (tmp_path / "printed").read_text()
+    assert re.search(rf"^/robot1/latched  {TEXT} +1 messages, reliable, transient local$", printed, re.MULTILINE)
+    assert f"{first}: {2 * COUNT + 1} messages published" in printed
+
+
+def test_a_real_node_receives_what_a_killed_recording_holds(domain: int, tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    (bag / "metadata.yaml").unlink()
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[:-300])  # without its end
+    with Peer("topic.py", "echo", "/words", TEXT, domain=domain) as peer:
+        peer.wait_event("ready")
+        fork = Fork(main, ["play", str(bag), f"--domain={domain}", "--topics", "words", "--loop", "--wait=60"])
+        try:
+            until(lambda: len(peer.events("message")) >= 2 * COUNT, "all messages come")
+        finally:
+            fork.kill()
+        numbers = [int(line["message"]["data"]) for line in peer.events("message")]
+    assert numbers == [number % COUNT for number in range(numbers[0], numbers[0] + len(numbers))]
+
+
+@pytest.fixture
+def listener(domain: int) -> Iterator[Any]:
+    with Node("listener", NetworkConfig(domain)) as node:
+        yield {
+            "/words": node.subscription("/words", TEXT, Qos(1000)),
+            "/robot1/latched": node.subscription("/robot1/latched", TEXT, LATCHED),
+            "/robot1/fast": node.subscription("/robot1/fast", TEXT, Qos(1000, reliable=False)),
+        }
+
+
+def numbers(listener: Any, topic: str) -> list[int]:
+    return [int(decode(TEXT, one.data).data) for one in listener[topic].take()]
+
+
+def play(*arguments: str, output: Path) -> Fork:
+    return Fork(main, ["play", *arguments, "--wait=60"], output=output)
+
+
+def test_a_late_start_begins_with_what_was_latched_before(listener: Any, domain: int, tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    fork = play(str(bag), f"--domain={domain}", "--start=0.59", output=tmp_path / "printed")
+    assert fork.wait() == 0
+    found: list[int] = []
+    until(lambda: found.extend(numbers(listener, "/words")) or len(found) >= COUNT // 2, "all messages")
+    assert found == list(range(COUNT // 2, COUNT))
+    assert numbers(listener, "/robot1/latched") == [-1]
+
+
+def test_a_loop_begins_anew_until_it_is_ended(listener: Any, domain: int, tmp_path: Path) -> None:
+    bag, printed = write(tmp_path / "bag"), tmp_path / "printed"
+    fork = play(str(bag), f"--domain={domain}", "--loop", "--rate=10", output=printed)
+    found: list[int] = []
+    until(lambda: found.extend(numbers(listener, "/words")) or found.count(5) >= 3, "the third round")
+    fork.send_signal(signal.SIGINT)
+    assert fork.wait() == 0
+    assert found[: 2 * COUNT] == [*range(COUNT), *range(COUNT)]
+    assert " messages published" in printed.read_text()
+
+
+def test_a_player_that_was_stopped_goes_on_at_its_pace(listener: Any, domain: int, tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    fork = play(str(bag), f"--domain={domain}", output=tmp_path / "printed")
+    found: list[Any] = []
+    until(lambda: found.extend(listener["/words"].take()) or len(found) > 5, "some messages")
+    fork.send_signal(signal.SIGSTOP)
+    time.sleep(1.0)
+    fork.send_signal(signal.SIGCONT)
+    until(lambda: found.extend(listener["/words"].take()) or len(found) == COUNT, "all messages")
+    assert fork.wait() == 0
+    sent = [one.sent_ns for one in found]
+    stopped = max(range(1, COUNT), key=lambda place: sent[place] - sent[place - 1])
+    assert sent[-1] - sent[stopped] > 0.9 * (COUNT - 1 - stopped) * STEP
+
+
+def test_commands_and_other_publishers_are_named_before(domain: int, tmp_path: Path) -> None:
+    bag, printed = tmp_path / "bag", tmp_path / "printed"
+    with BagWriter(bag, "mcap", {}) as writer:
+        writer.append(writer.connect("/cmd_vel", TWIST, []), START, encode_one(TWIST, {}))
+        writer.append(writer.connect("/odd", "std_msgs/msg/Bool", []), START, encode_one("std_msgs/msg/Bool", {}))
+    with Node("robot", NetworkConfig(domain)) as node:
+        kept = node.subscription("/cmd_vel", TWIST), node.publisher("/odd", TEXT), node.subscription("/odd", TEXT)
+        fork = Fork(main, ["play", str(bag), f"--domain={domain}", "--wait=3"], output=printed)
+        assert fork.wait() == 0
+        assert kept[0].take()
+    said = printed.read_text()
+    assert re.search(rf"/cmd_vel +{TWIST} +1 messages, reliable, commands a robot\n", said)
+    assert "warning: /cmd_vel commands a robot, and /robot subscribes to it." in said
+    assert "warning: /robot publishes /odd, too" in said
+    assert f"warning: The subscription of /odd in /robot is of type {TEXT}" in said
+
+
+@pytest.mark.law
+@pytest.mark.parametrize(
+    ("profiles", "count", "wanted"),
+    [
+        ([], 5, Qos()),
+        ([profile(10)], 5, Qos(200)),
+        ([profile(0)], 5, Qos(0)),
+        ([profile(5, reliable=False)] * 2, 5, Qos(200, reliable=False)),
+        ([profile(5, reliable=False), profile(500)], 5, Qos(500)),
+        ([profile(1, transient_local=True)] * 3, 1, Qos(3, transient_local=True)),
+        ([profile(1, transient_local=True)], 10_000, Qos(100, transient_local=True)),
+    ],
+)
+def test_one_publisher_serves_all_whom_the_recorded_ones_served(profiles: Any, count: int, wanted: Qos) -> None:
+    as_written = tuple(
+        {"history": one.history.value, "depth": one.depth, "reliability": one.reliability.value,
+         "durability": one.durability.value}
+        for one in profiles
+    )  # fmt: skip
+    as_named = tuple(
+        {**one, "reliability": kept.reliability.name.lower(), "durability": kept.durability.name.lower(),
+         "history": kept.history.name.lower()}
+        for one, kept in zip(as_written, profiles, strict=True)
+    )  # fmt: skip
+    for found in (as_written, as_named):
+        assert recorded_qos(Topic("/a", TEXT, count, profiles=found)) == wanted
+
+
+def test_what_cannot_be_played_is_an_error(domain: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, empty, several = write(tmp_path / "bag"), tmp_path / "empty", tmp_path / "several"
+    with BagWriter(empty, "mcap", {}):
+        pass
+    for name in ("a", "b"):
+        write(several / name)
+    for arguments, said in (
+        ([str(tmp_path / "none")], "does not exist"),
+        ([str(several)], "has 2 bags; name one"),
+        ([str(empty)], "has no message that can be published"),
+        ([str(bag), "--topics", "/word"], "Did you mean '/words'?"),
+        ([str(bag), "--rate=0"], "--rate is 0.0; it must be positive"),
+        ([str(bag), "--start=-1"], "--start is -1.0"),
+        ([str(bag), "--start=60", "--wait=0.1"], "--start is 60; the messages of "),
+        ([str(bag), "--distro=jazy"], "Did you mean 'jazzy'?"),
+    ):
+        assert main(["play", f"--domain={domain}", *arguments]) == 2
+        assert said in capsys.readouterr().err
