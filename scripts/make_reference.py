@@ -19,7 +19,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 import bhd_lerobot.plugin  # noqa: F401  registers the teleoperators
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
-from bhd_lerobot.cli import ros2
+from bhd_lerobot.cli import bag, ros2
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
