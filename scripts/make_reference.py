@@ -19,7 +19,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 import bhd_lerobot.plugin  # noqa: F401  registers the teleoperators
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
-from bhd_lerobot.cli import bag, ros2
+from bhd_lerobot.cli import ros2
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
@@ -111,8 +111,7 @@ def pages() -> dict[Path, str]:
     texts["ros2"] = [
         *("# `bhd-ros2`\n", "## `bhd-ros2 serve`\n", *_options(ServeConfig, "", "ros2.md", listed)),
         *("## `bhd-ros2 bridge`\n", *_options(BridgeConfig, "", "ros2.md", listed)),
-        *("## `bhd-ros2 topics`\n", *_commands(ros2.topics_parser())),
-        *("## Bags\n", *_commands(bag.bag_parser())),
+        *("## `bhd-ros2 topics`, `record` and `play`\n", *_commands(ros2.network_parser())),
     ]
     written = {FOLDER / "options.md": _index()}
     for name, parts in texts.items():

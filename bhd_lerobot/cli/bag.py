@@ -3,12 +3,10 @@
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 from bhd_lerobot.cli.data.command import Commands
 from bhd_lerobot.cli.network import add_map, add_network_command, node_of
 from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError, counted
-from bhd_lerobot.options.command import Parser
 from bhd_lerobot.rollout.signals import stop_on_signals
 from bhd_lerobot.ros2.bag.player.play import Player, PlayOptions
 from bhd_lerobot.ros2.bag.recorder.record import Recorder, RecordOptions, RecordReport
@@ -18,17 +16,10 @@ from bhd_lerobot.ros2.bag.storage.write import FORMATS
 from bhd_lerobot.ros2.messages.types import require_rosbags
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: Commands) -> None:
     """Add `record` and `play`."""
     add_record(commands)
     add_play(commands)
-
-
-def bag_parser() -> argparse.ArgumentParser:
-    """Return a parser of these two commands, for the reference."""
-    parser = Parser(prog="bhd-ros2")
-    add_to(parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True))
-    return parser
 
 
 def add_record(commands: Commands) -> None:

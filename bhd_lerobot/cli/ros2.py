@@ -37,27 +37,35 @@ def _parser() -> Parser:
     commands.add_parser("serve", help="a simulated robot as a ROS 2 robot; `bhd-ros2 serve --help` has its options")
     commands.add_parser("bridge", help="the cerebellum in front of a real robot; `bhd-ros2 bridge --help` likewise")
     help_text = "what is on the network"
-    topics_parser(commands.add_parser("topics", help=help_text, description=help_text))
+    topics = commands.add_parser("topics", help=help_text, description=help_text)
+    _add_topics(topics.add_subparsers(dest="kind", metavar="COMMAND", title="commands", required=True))
     return parser
 
 
-def topics_parser(parser: argparse.ArgumentParser | None = None) -> argparse.ArgumentParser:
-    """Return the parser of `bhd-ros2 topics`, with its commands."""
-    parser = Parser(prog="bhd-ros2 topics") if parser is None else parser
-    kinds: Any = parser.add_subparsers(dest="kind", metavar="COMMAND", title="commands", required=True)
+def network_parser() -> argparse.ArgumentParser:
+    """Return a parser of all commands that are a node of the network, by their names, for the reference."""
+    parser = Parser(prog="bhd-ros2")
+    commands: Any = parser.add_subparsers()
+    _add_topics(commands, "topics ")
+    bag.add_to(commands)
+    return parser
+
+
+def _add_topics(kinds: Any, before: str = "") -> None:
     listed = add_network_command(
-        kinds, "list", "topics, their types, publishers and subscriptions, and what does not fit", _list
+        kinds, f"{before}list", "topics, their types, publishers and subscriptions, and what does not fit", _list
     )
     listed.add_argument("--all", action="store_true", help="topics of actions, too")
     rate = add_network_command(
-        kinds, "hz", "the rate of a topic, each second; Ctrl-C ends with a summary", _hz, "TOPIC"
+        kinds, f"{before}hz", "the rate of a topic, each second; Ctrl-C ends with a summary", _hz, "TOPIC"
     )
     rate.add_argument("--window", type=float, default=10.0, metavar="S", help="time that a line is about (default: 10)")
     rate.add_argument("--seconds", type=float, metavar="S", help="end after this time")
-    echo = add_network_command(kinds, "echo", "messages of a topic, as YAML; long arrays are shortened", _echo, "TOPIC")
+    echo = add_network_command(
+        kinds, f"{before}echo", "messages of a topic, as YAML; long arrays are shortened", _echo, "TOPIC"
+    )
     echo.add_argument("--field", default="", metavar="PATH", help="only this: pose.pose.position, or ranges.0")
     echo.add_argument("-n", type=int, metavar="N", help="end after so many messages")
-    return parser
 
 
 def _list(options: argparse.Namespace) -> int:
