@@ -143,9 +143,9 @@ class Session:
     def _share(self, *pids: int) -> float:
         """Return the share of a processor that processes take."""
         time.sleep(WARM_UP_S)
-        start, before = time.monotonic(), sum(map(_processor_s, pids))
+        start, before = time.monotonic(), sum(map(processor_s, pids))
         time.sleep(self.measure_s)
-        return (sum(map(_processor_s, pids)) - before) / (time.monotonic() - start)
+        return (sum(map(processor_s, pids)) - before) / (time.monotonic() - start)
 
     def standstill(self, part: str, number: int) -> float:
         """Return how long a robot moved after one of the processes that drive it got a signal [s]."""
@@ -178,7 +178,8 @@ class Session:
             return max(0.0, max(moving) + 0.05 - then)  # the pose is noted every 0.05 s
 
 
-def _processor_s(pid: int) -> float:
+def processor_s(pid: int) -> float:
+    """Return the processor time that a process has taken [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -100,6 +100,7 @@ class Publisher:
         self.node = node
         self.window = Window()
         self.sent = dict.fromkeys(RATES, 0)
+        self.since, self.sent_since = 0, 0  # stamp of the first message with one after the warm-up; how many from it on
         for name, hz in RATES.items():
             qos = qos_profile_sensor_data if name == "scan" else 10
             publisher = node.create_publisher(TYPES[name], f"/{name}", qos)
@@ -112,11 +113,14 @@ class Publisher:
         if hasattr(message, "header"):
             now = time.time_ns()
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
+            if self.window.begin is not None:
+                self.since = self.since or now
+                self.sent_since += 1
         publisher.publish(message)
         self.sent[name] += 1
 
     def close(self) -> None:
-        peer.log("summary", half="publish", sent=self.sent)
+        peer.log("summary", half="publish", sent=self.sent, since=self.since, sent_since=self.sent_since)
 
 
 class Subscriber:
