@@ -243,6 +243,25 @@ def register_types(types: Mapping[str, str]) -> None:
             raise ConfigError(f"The definition of {name} cannot be read: {as_text(error)}.") from error
 
 
+def register_message(name: str, text: str) -> None:
+    """Make a message known as a bag defines it, together with those that it names.
+
+    Raises:
+        ConfigError: its definition cannot be read, or is another one than that known already.
+    """
+    from rosbags.typesys import get_types_from_msg
+
+    store = type_store()
+    try:
+        (_, own), *others = get_types_from_msg(text, name).items()
+        if any(one.count("/") != 2 for one, _ in others):
+            raise ValueError("it names parts of services or actions")
+        store.register({name: own} | {one: fields for one, fields in others if one not in store.fielddefs})
+        store.hash_rihs01(name)  # whatever it names is known, too
+    except Exception as error:  # whatever rosbags' parser raises
+        raise ConfigError(f"The definition of {name} cannot be read: {as_text(error)}.") from error
+
+
 def find_type(name: str, distro: str = "jazzy") -> None:
     """Make sure that the definition of a type is known.
 

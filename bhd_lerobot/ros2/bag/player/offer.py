@@ -8,7 +8,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.ros2.bag.storage.read import Bag, Topic
 from bhd_lerobot.ros2.live.network import Qos
-from bhd_lerobot.ros2.messages.definitions import find_type, register_types
+from bhd_lerobot.ros2.messages.definitions import find_type, register_message
 
 _ALL, _BEST_EFFORT, _LATCHED = (2, "keep_all"), (2, "best_effort"), (1, "transient_local")  # as bags have it
 _LEAST_DEPTH, _MOST_DEPTH, _MOST_LATCHED = 200, 10_000, 100
@@ -81,8 +81,7 @@ def _define(msgtype: str, definitions: Mapping[str, str], distro: str) -> None:
     except ConfigError:
         if msgtype not in definitions:
             raise
-        register_types({msgtype: definitions[msgtype]})
-        find_type(msgtype, distro)
+        register_message(msgtype, definitions[msgtype])
 
 
 def recorded_qos(topic: Topic) -> Qos:

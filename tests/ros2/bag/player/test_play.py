@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bhd_lerobot.cli.ros2 import main
 from bhd_lerobot.ros2.bag.player.offer import recorded_qos
@@ -174,6 +174,19 @@ def test_commands_and_other_publishers_are_named_before(domain: int, tmp_path: P
     assert "warning: /cmd_vel commands a robot, and /robot subscribes to it." in said
     assert "warning: /robot publishes /odd, too" in said
     assert f"warning: The subscription of /odd in /robot is of type {TEXT}" in said
+
+
+def test_types_are_those_that_the_bag_defines_also_of_services(domain: int, tmp_path: Path) -> None:
+    names, file = ("event_msgs/srv/Do_Event", "event_msgs/msg/Odd"), tmp_path / "printed"
+    texts = f"event_msgs/Part part\n{'=' * 80}\nMSG: event_msgs/Part\nint32 number\n", "what is this?\n"
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        for name, text in zip(names, texts, strict=True):
+            topic = "/" + name.rpartition("/")[2]
+            connection = writer.add_connection(topic, name, msgdef=text, rihs01="RIHS01_0")
+            writer.write(connection, START, b"\0\1\0\0\5\0\0\0")
+    assert Fork(main, ["play", str(tmp_path / "bag"), f"--domain={domain}", "--wait=0.1"], output=file).wait() == 0
+    assert "/Odd is left out: The definition of event_msgs/msg/Odd cannot be read" in file.read_text()
+    assert "1 message published" in file.read_text()
 
 
 @pytest.mark.law
