@@ -188,6 +188,15 @@ class TimingStatistics:
         copied._cells[:] = self._cells
         return copied
 
+    def since(self, before: "TimingStatistics") -> "TimingStatistics":
+        """Return what was counted after a copy was made. Its maxima are at most 12 % too high, as quantiles are."""
+        counted = self.copy()
+        cells, earlier = counted._array(), before._array()
+        cells[:_LAST_START] -= np.where(np.isin(np.arange(_LAST_START), (_LATEST, _LONGEST)), 0, earlier[:_LAST_START])
+        for first, end, largest in ((_LATENESS, _DURATION, _LATEST), (_DURATION, _LATEST, _LONGEST)):
+            cells[largest] = round(_quantile(cells[first:end], 1.0, cells[largest]) * 1e9)
+        return counted
+
     @property
     def ticks(self) -> int:
         """Ticks so far."""

@@ -112,6 +112,19 @@ def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
         memory.unlink()
 
 
+@given(TICKS, TICKS)
+def test_what_is_counted_since_a_copy_is_what_came_after_it(
+    before: list[tuple[int, int, int]], after: list[tuple[int, int, int]]
+) -> None:
+    since, alone = on_grid([*before, *after]).since(on_grid(before)).summary(), on_grid(after).summary()
+    for name in ("ticks", "overruns", "skipped"):
+        assert getattr(since, name) == getattr(alone, name)
+    for name in ("lateness_max", "duration_max", "lateness_p50", "duration_p99"):
+        exact = getattr(alone, name)
+        assert exact <= getattr(since, name) <= max(exact * BIN * 1.001, 1e-6)
+    assert abs(since.rate_error) < 1
+
+
 def test_a_used_buffer_is_cleared_for_a_new_loop() -> None:
     buffer = bytearray(b"\xff" * (TimingStatistics.nbytes + 8))
     assert TimingStatistics(PERIOD, buffer).summary() == TimingStatistics(PERIOD).summary()

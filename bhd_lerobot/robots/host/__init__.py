@@ -3,6 +3,7 @@
 __all__ = [
     "checked_plant",
     "config",
+    "frames",
     "host",
     "link",
     "plant_loop",

@@ -19,19 +19,19 @@ from rich.markup import escape
 
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.control.messages import NANOSECONDS, Limit, SendResult, Watchdog
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
+from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.link import LiveLink
 from bhd_lerobot.robots.host.robots import Acted, Deliver, Frame, FrameReport, Receipt
 from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.robots.host.state import problem_of, raised
+from bhd_lerobot.robots.host.state import problem_of
 
 _SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck
 
@@ -214,10 +214,7 @@ class LiveHost:
         return state
 
     def _frame_of(self, state: Any, seen_ns: int) -> Frame:
-        sensed = int(state["sensed_ns"])
-        age = max(0, seen_ns - sensed) + int(state["oldest_ns"])
-        physics = {keys.PHYSICS_STATE: state["physics"].copy()} if self.world is not None else {}
-        return Frame(state["observation"].copy(), np.array([sensed - self._origin]), np.array([age]), physics)
+        return frame_of(self.mirror, state, seen_ns, self._origin)
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
@@ -265,29 +262,14 @@ class LiveHost:
 
     def _report(self, before: Any, after: Any, command: Command) -> FrameReport:
         """Report the frame between two boundaries."""
-        begun, end = before["state"], after["state"]
-        limits, watchdog = raised(begun, end)
-        applied = self.to_action(end["command"])
-        columns = {
-            keys.COMMAND_AGE: np.array([int(end["command_age_ns"])]) / NANOSECONDS,
-            keys.EFFORT: end["joint_efforts"].copy(),
-            keys.LATENESS: np.array([int(after["lateness_ns"]) / NANOSECONDS]),
-            keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),
-            keys.SKIPPED: np.array([int(end["skipped"] - begun["skipped"])]),
-        }
-        if keys.WRENCH in self.columns:
-            columns[keys.WRENCH] = end["contact_wrench"].copy()
-        return FrameReport(
-            applied=applied,
-            requested=applied if isinstance(command, Goals) else self.to_action(end["requested"]),
-            sent=SendResult(np.zeros(1, np.int8)),
-            limits=np.array([limits]),
-            watchdog=np.array([watchdog]),
-            mode=end["mode"].copy(),
-            truth=partial(self._truth_at, end, end["touches"] > begun["touches"]),
-            columns=columns,
-            number=int(before["frame"]),
-            seen=self._frame_of(begun, int(begun["sensed_ns"])),  # a brain that did not observe it did not wait for it
+        end = after["state"]
+        return report_of(
+            self.mirror,
+            before,
+            after,
+            requested=end["command"] if isinstance(command, Goals) else end["requested"],
+            truth=partial(self._truth_at, end, end["touches"] > before["state"]["touches"]),
+            origin_ns=self._origin,
         )
 
     def _take(self, number: int) -> Any:
@@ -352,6 +334,20 @@ class LiveHost:
         self.link.close()
 
 
+def mirror_of(simulation: type[Simulation], config: Any) -> Host:
+    """Return the host that mirrors a robot on the wall clock: a simulation, or with `config.plant` the plant's host.
+
+    Raises:
+        ConfigError: there is no such plant.
+    """
+    kind: Any = simulation
+    if config.plant:
+        plant_class(config.plant)  # what cannot be imported is found out before a process is started
+        mirror: Host = kind.host_class(config, Unconnected())
+        return mirror
+    return kind(config)
+
+
 def make_live(simulation: type[Simulation], config: Any, name: str | None) -> LiveHost:
     """Return a robot on the wall clock: a simulated one, or with `config.plant` that of a plant.
 
@@ -365,12 +361,7 @@ def make_live(simulation: type[Simulation], config: Any, name: str | None) -> Li
         RealtimeError: its processes could not be started, or real time is required and was refused.
     """
     number = next(_nameless) if name is None else 0
-    kind: Any = simulation
-    if config.plant:
-        plant_class(config.plant)  # what cannot be imported is found out before a process is started
-        mirror: Host = kind.host_class(config, Unconnected())
-    else:
-        mirror = kind(config)
+    mirror = mirror_of(simulation, config)
     return LiveHost(mirror, name or f"{config.type}-{os.getpid()}{f'-{number}' if number else ''}")
 
 

@@ -1,0 +1,67 @@
+"""What a robot on the wall clock published, as the frames of an episode."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.robots import Frame, FrameReport
+from bhd_lerobot.robots.host.state import raised
+
+
+def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
+    """Return a published state as an observation.
+
+    Args:
+        mirror: a host like the one that published it.
+        state: a record of `state_dtype`.
+        seen_ns: when it is observed, monotonic [ns].
+        origin_ns: when the episode began, monotonic [ns].
+    """
+    sensed = int(state["sensed_ns"])
+    age = max(0, seen_ns - sensed) + int(state["oldest_ns"])
+    physics = {keys.PHYSICS_STATE: state["physics"].copy()} if mirror.world is not None else {}
+    return Frame(state["observation"].copy(), np.array([sensed - origin_ns]), np.array([age]), physics)
+
+
+def report_of(
+    mirror: Host, before: Any, after: Any, *, requested: NDArray[np.float64], truth: Callable[[], Any], origin_ns: int
+) -> FrameReport:
+    """Return the report of the frame between two boundaries of a `FrameLog`.
+
+    Args:
+        mirror: a host like the one that published them.
+        before: the boundary that it begins with.
+        after: the boundary that it ends with.
+        requested: what was requested by its end, as a command of the cerebellum, shape (1, width).
+        truth: returns what a task judges by at its end.
+        origin_ns: when the episode began, monotonic [ns].
+    """
+    begun, end = before["state"], after["state"]
+    limits, watchdog = raised(begun, end)
+    columns = {
+        keys.COMMAND_AGE: np.array([int(end["command_age_ns"])]) / NANOSECONDS,
+        keys.EFFORT: end["joint_efforts"].copy(),
+        keys.LATENESS: np.array([int(after["lateness_ns"]) / NANOSECONDS]),
+        keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),
+        keys.SKIPPED: np.array([int(end["skipped"] - begun["skipped"])]),
+    }
+    if keys.WRENCH in mirror.columns:
+        columns[keys.WRENCH] = end["contact_wrench"].copy()
+    return FrameReport(
+        applied=mirror.to_action(end["command"]),
+        requested=mirror.to_action(requested),
+        sent=SendResult(np.zeros(1, np.int8)),
+        limits=np.array([limits]),
+        watchdog=np.array([watchdog]),
+        mode=end["mode"].copy(),
+        truth=truth,
+        columns=columns,
+        number=int(before["frame"]),
+        # A brain that did not observe it did not wait for it.
+        seen=frame_of(mirror, begun, int(begun["sensed_ns"]), origin_ns),
+    )
