@@ -69,7 +69,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "ros2.serve": (
         *("bodies", "control", "control.geometry", "policies", "policies.navigation"),
         *("robots", "robots.host", "robots.viewer", "ros2.live", "ros2.messages"),
-        "sim.description",
+        *("recording", "sim.description"),
     ),
     "ros2.bag.storage": ("datasets.storage", "ros2.messages"),
     "ros2.bag.recorder": ("datasets.storage", "ros2.live", "ros2.messages", "ros2.bag.storage"),
@@ -87,7 +87,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
     "recording": (
-        *("options", "registry", "tasks", "bodies", "control", "robots.host", "robots.external", "robots.viewer"),
+        *("options", "registry", "tasks", "bodies", "control", "realtime"),
+        *("robots.host", "robots.external", "robots.viewer"),
         *("policies", "policies.teleop", "policies.topic", *_DATASETS, "datasets.writer"),
         *("rollout", "teleoperators", "hub", "cluster"),
     ),

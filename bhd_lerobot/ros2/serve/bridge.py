@@ -2,7 +2,8 @@
 
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -10,7 +11,8 @@ from rich.console import Console
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.recording.passive import PassiveRecording, RecordOptions
+from bhd_lerobot.robots.host.realtime import LiveHost, mirror_of
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of, raised
 from bhd_lerobot.ros2.live.network import NetworkConfig
@@ -38,7 +40,10 @@ class BridgeConfig(ServiceConfig):
         duration_s: end after this time [s]; 0: run until Ctrl-C.
         articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
             messages (`package.xml` and `msg/`), whose fields are found by their names.
+        record: what is recorded, and where.
     """
+
+    record: RecordOptions = field(default_factory=RecordOptions)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -105,18 +110,36 @@ def bridge(
 
     Raises:
         ConfigError: Cyclone DDS is not installed, or there is no such plant.
+        DatasetError: what is at `record.root` is no dataset of this robot, or cannot be written.
         RealtimeError: the robot is not there, another program commands it, or a process of it has ended.
     """
     names = article_names(config.articles)
     extra = (articles.TWIST_TOPIC,) if config.articles else ()
+    ended = ended or threading.Event()
+
+    def report(line: str) -> None:
+        console.print(line, markup=False, soft_wrap=True)
 
     def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
         goals: Goals = ArmGoals(host) if isinstance(host.body, Arm) else BaseGoals(host)
         topics = (POSITION_TOPIC,) if isinstance(host.body, Arm) else (TWIST_TOPIC, *extra)
+        if recording is not None:
+            recording.begin(host)
+        ended = (lambda result: None) if recording is None else recording.goal_ended
         return [
-            InterfaceTopics(host, node, counts, config.state_hz, goals, names=names),
+            InterfaceTopics(host, node, counts, config.state_hz, goals, ended=ended, names=names),
             *(Setpoints(host, node, counts, goals.interrupt, one) for one in topics),
-            Faults(host, lambda line: console.print(line, markup=False, soft_wrap=True)),
+            Faults(host, report),
         ]
 
-    run_service(config, simulation, None, parts, console=console, ended=ended, title="is behind a bridge")
+    with _recording(config, simulation, report, ended) as recording:
+        run_service(config, simulation, None, parts, console=console, ended=ended, title="is behind a bridge")
+
+
+def _recording(
+    config: BridgeConfig, simulation: type[Simulation], report: Callable[[str], None], ended: threading.Event
+) -> AbstractContextManager[PassiveRecording | None]:
+    """Return what records the robot, before it starts; nothing if it is not to be recorded."""
+    if not config.record.root:
+        return nullcontext()
+    return PassiveRecording(config.record, mirror_of(simulation, config.robot), report, ended)

@@ -57,6 +57,7 @@ class InterfaceTopics:
         state_hz: how often the state is published [Hz].
         goals: follows the commands.
         taken: called when a goal was taken.
+        ended: called with the result of each goal that was taken, before it is published.
         names: under which they are there.
     """
 
@@ -69,10 +70,11 @@ class InterfaceTopics:
         goals: Goals,
         *,
         taken: Callable[[], None] = lambda: None,
+        ended: Callable[[CommandResult], None] = lambda result: None,
         names: Sequence[Names] = (Names(),),
     ) -> None:
         self._host, self._counts, self._state_hz, self._goals, self._taken = host, counts, state_hz, goals, taken
-        self._frame = goals.frames[0]
+        self._frame, self._ended = goals.frames[0], ended
         self._results_out = [(node.publisher(one.result, one.result_type, Qos(1000)), one.result_type) for one in names]
         self._states_out = [(node.publisher(one.state, one.state_type), one.state_type) for one in names]
         self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
@@ -160,7 +162,9 @@ class InterfaceTopics:
         self._diagnostics.send(encode(DIAGNOSTICS, {"header": header(state.stamps), "status": [status]}, 1)[0])
 
     def _publish_results(self, state: State) -> None:
-        self._results.extend(self._goals.take_results())
+        for result in self._goals.take_results():
+            self._ended(result)
+            self._results.append(result)
         for _ in range(min(len(self._results), _RESULTS_AT_ONCE)):
             self._send(self._results.popleft())
 
