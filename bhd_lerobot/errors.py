@@ -112,22 +112,25 @@ class FrameError(DatasetError, ValueError):
 
 
 def as_text(error: BaseException) -> str:
-    """Return an error of another package's code as text: its kind and its message, without a full stop at the end."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(".")
+    """Return an error as text without a full stop at the end: its message, with its kind if it is not one of ours."""
+    kind = "" if isinstance(error, BhdError) else f"{type(error).__name__}: "
+    return " ".join(f"{kind}{error}".split()).removesuffix(".")
 
 
-def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
+def unknown_name(kind: str, value: object, choices: Iterable[str], meant: str = "") -> str:
     """Return the message for a name that is not among the valid ones, with the nearest valid name if there is one.
 
     Args:
         kind: what the name stands for, for example ``"brain"``.
         value: the name that was given.
         choices: the valid names.
+        meant: what it stands for, where that is known; by default the nearest valid name.
     """
     names = sorted(choices)
     by_lower_case = {name.lower(): name for name in names}
     near = difflib.get_close_matches(str(value).lower(), by_lower_case, n=1, cutoff=0.6)
-    hint = f" Did you mean {by_lower_case[near[0]]!r}?" if near else ""
+    meant = meant or (by_lower_case[near[0]] if near else "")
+    hint = f" Did you mean {meant!r}?" if meant else ""
     return f"Unknown {kind} {value!r}.{hint} Valid: {', '.join(names) if names else '(none)'}."
 
 

@@ -183,7 +183,14 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
             raise ConfigError(f"{prefix}{key} is an option of LeRobot's command. Here: {ours}.")
         if key not in fields:
             valid = [f"{prefix}{name}" for name in (*others, *fields)] + ([] if prefix else [CONFIG_PATH])
-            raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
+            inner = [
+                f"{prefix}{name}.{key}"
+                for name, (kind, _) in fields.items()
+                if dataclasses.is_dataclass(kind)
+                and not choices_of(kind)
+                and key in {one for one, *_ in options_of(typing.cast(type, kind))}
+            ]
+            raise ConfigError(unknown_name("option", f"{prefix}{key}", valid, *inner[:1]))
         kind, default = fields[key]
         of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
         given = {"type": default.get_choice_name(type(default)), **value} if of_default else value

@@ -51,6 +51,7 @@ def test_numbers_may_have_an_exponent(text):
         (["--robot.beens=36"], "Did you mean 'robot.beams'"),
         (["--brain.safe_dist=0.4"], "Did you mean 'brain.safe_distance_m'"),
         (["--brain.tpye=random"], "Did you mean 'brain.type'"),
+        (["--num_episodes=3"], "Did you mean 'dataset.num_episodes'"),
         (["--seed"], "has no value"),
         (["seed=1"], "written --key=value"),
         (["--seed=1", "--seed=2"], "given twice"),

@@ -144,7 +144,7 @@ class PlantProcess:
             except (EOFError, BrokenPipeError):
                 return
             except BhdError as error:
-                self._connection.send(("refused", f"{type(error).__name__}: {error}"))
+                self._connection.send(("refused", str(error)))
 
     def _place(self, scene: Any, seed: int) -> None:
         loop, world = self._loop, self._world

@@ -169,7 +169,7 @@ class LiveProcess:
             try:
                 self._connection.send((kind, answers[kind](*arguments)))
             except BhdError as error:
-                self._connection.send(("refused", f"{type(error).__name__}: {error}"))
+                self._connection.send(("refused", str(error)))
             except BrokenPipeError:
                 return
 
@@ -292,7 +292,7 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
             finally:
                 process.close()
     except BhdError as error:
-        _send_failure(connection, f"{type(error).__name__}: {error}")
+        _send_failure(connection, str(error))
         return 2
     except Exception:
         _send_failure(connection, traceback.format_exc())

@@ -14,6 +14,7 @@ from bhd_lerobot.ros2.live.topic_types import ros_type_name
 _GID_BYTES = {"humble": 24}  # 16 since Iron
 _TOPICS, _REQUESTS = "rt", "rq"  # what names of topics and of requests to services begin with
 _MOST = 10_000
+UNNAMED = "an unnamed node"
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,9 @@ class Graph:
         senders: dict[str, list[str]] = {}
         for one in self.endpoints():
             if one.topic in topics and one.is_publisher and not one.is_own:
-                senders.setdefault(one.topic, []).append(one.node.lstrip("/") or "an unnamed node")
+                senders.setdefault(one.topic, []).append(one.node.lstrip("/") or UNNAMED)
+        for nodes in senders.values():  # a robot's node and its guard are one
+            nodes[:] = [name for name in nodes if not (name.endswith("_guard") and name[: -len("_guard")] in nodes)]
         return [
             f"{topic} has {len(nodes)} publishers, {' and '.join(sorted(nodes))}: the newest message counts."
             for topic, nodes in sorted(senders.items())
@@ -222,7 +225,7 @@ def _mismatches(ours: Endpoint, everyone: list[Endpoint]) -> list[str]:
     for one in everyone:
         if not _meets(ours, one):
             continue
-        who = f"The {kinds[1]} of {one.topic} in {one.node or 'an unnamed node'}"
+        who = f"The {kinds[1]} of {one.topic} in {one.node or UNNAMED}"
         if one.msgtype != ours.msgtype:
             found.append(f"{who} is of type {one.msgtype}; the {kinds[0]} here is of {ours.msgtype}.")
         else:

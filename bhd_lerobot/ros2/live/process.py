@@ -306,7 +306,10 @@ class Receiver:
         if any(other.topic == one.topic for other in endpoints):
             so_long = silence_text(one.topic, silent_s) if heard else f"{one.topic} has sent no message yet"
             return f"{so_long}, though it has a publisher."
-        return f"Nobody publishes {one.topic} ({one.msgtype}){' any more' if heard else ''}. {_offers(one, endpoints)}"
+        network = self._spec.network
+        where = f"in ROS domain {network.domain_number} on {network.interface!r}"
+        any_more = " any more" if heard else ""
+        return f"Nobody publishes {one.topic} ({one.msgtype}) {where}{any_more}. {_offers(one, endpoints)}"
 
     def _intrusion(self) -> str:
         """Return which other nodes publish on the topics of commands, as text; empty if none does."""
@@ -381,7 +384,11 @@ def _offers(one: Any, endpoints: list[Endpoint], does: str = "publishes") -> str
     if fitting:
         return f"Of this type there are: {', '.join(fitting)}."
     there = sorted({other.topic for other in endpoints})
-    return f"There are: {', '.join(there)}." if there else f"No node {does} anything on this network."
+    return (
+        f"There are: {', '.join(there)}."
+        if there
+        else f"No node {does} anything there; options of the network are robot.ros2.domain and robot.ros2.interface."
+    )
 
 
 def _run_node(spec: NodeSpec, channel: Channel, connection: Connection, wake: int) -> None:

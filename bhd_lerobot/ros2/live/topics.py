@@ -17,15 +17,21 @@ from bhd_lerobot.ros2.messages.definitions import find_type
 
 _SHOWN = 8  # elements of a longer array
 _POLL_S = 0.02
+_NAMES_S = 3.0  # Fast DDS sends the names of a process's nodes to one that has come later with its next heartbeat
 
 
 def found_topics(node: Node, wait_s: float) -> list[Endpoint]:
     """Return all publishers and subscriptions of others, after the time in which they are found [s].
 
+    Names of nodes come after their topics: for those that are missing it waits a little longer.
+
     Raises:
         RealtimeError: nobody else is there.
     """
     time.sleep(wait_s)
+    end = time.monotonic() + _NAMES_S
+    while "" in {one.node for one in _of_others(node)} and time.monotonic() < end:
+        time.sleep(_POLL_S)
     found = _of_others(node)
     if not found and len(node.graph.nodes()) <= 1:
         raise RealtimeError(_nobody(node.network, wait_s))

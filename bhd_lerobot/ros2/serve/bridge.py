@@ -34,7 +34,7 @@ class BridgeConfig(ServiceConfig):
 
     Attributes:
         robot: the robot; `robot.plant` says how it is driven.
-        network: where brains are; by default the network of `robot.ros2`.
+        network: where brains are; where none of its options is given, the network of `robot.ros2`.
         namespace: of the bridge's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         duration_s: end after this time [s]; 0: run until Ctrl-C.

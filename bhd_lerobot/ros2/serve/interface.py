@@ -15,7 +15,7 @@ from bhd_lerobot.ros2.messages.parts import header, stamp_tree
 from bhd_lerobot.ros2.messages.serialize import encode, encode_known
 from bhd_lerobot.ros2.messages.types import INTERFACES
 from bhd_lerobot.ros2.serve.goals import Goals
-from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
+from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State, for_nodes
 
 COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
@@ -122,7 +122,7 @@ class InterfaceTopics:
         frame = (stamped.header.frame_id if hasattr(stamped, "header") else "") or self._frame
         if frame not in self._goals.frames:
             text = f"The frame is {frame!r}; a target pose is in {' or '.join(map(repr, self._goals.frames))}."
-            self._results.append(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
+            self._refuse(CommandResult(message.task_id, False, ResultCode.BAD_TARGET, text))
             return
         target = getattr(target, "pose", target)
         position, turn = target.position, target.orientation
@@ -138,7 +138,12 @@ class InterfaceTopics:
         if refusal is None:
             self._taken()
         else:
-            self._results.append(refusal)
+            self._refuse(refusal)
+
+    def _refuse(self, result: CommandResult) -> None:
+        """Answer a goal that is refused, and count it by the kind of its cause, of which there are few."""
+        self._counts.add(f"{COMMAND_TOPIC}: {result.code.name.lower().replace('_', ' ')}")
+        self._results.append(result)
 
     def _publish_diagnostics(self, state: State) -> None:
         """Publish what was refused and what the robot's limits have changed; a warning where it happened just now."""
@@ -175,7 +180,7 @@ class InterfaceTopics:
             "stamp": stamp_tree(stamps),
             "task_id": result.task_id,
             "success": result.success,
-            "message": result.message or result.code.name,
+            "message": for_nodes(result.message or result.code.name),
         }
         for publisher, msgtype in self._results_out:
             publisher.send(encode_known(msgtype, fields))

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2.live.graph import UNNAMED
 from bhd_lerobot.ros2.live.node import Node, Subscription
 
 _LONGEST_WAIT_S = 0.02
+_NAMES_NS = 4 * NANOSECONDS  # the name of a node of Fast DDS comes up to a heartbeat of 3 s after its topics
 
 
 @dataclass
@@ -97,6 +99,11 @@ class Input:
                 return
 
 
+def for_nodes(text: str) -> str:
+    """Return a message of the cerebellum with the remedy that a node has, in place of a program's calls."""
+    return text.replace("call reset() and activate()", "send a message on /emergency_stop/reset")
+
+
 @dataclass
 class Counts:
     """How often what was asked for was refused, and what else became of it (such as ``cut``), by the reason."""
@@ -106,6 +113,7 @@ class Counts:
 
     def add(self, reason: str) -> None:
         """Count one that was refused."""
+        reason = for_nodes(reason)
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def note(self, what: str, reason: str, count: int = 1) -> None:
@@ -172,7 +180,8 @@ class Server:
         for output in self._outputs:
             output.due_ns = start
         reported, told_ns = self.counts.all(), start
-        mismatches: set[str] = set()
+        since: dict[str, int] = {}
+        printed: set[str] = set()
         while not stop():
             now = time.monotonic_ns()
             for one in self._inputs:
@@ -190,9 +199,11 @@ class Server:
                 reported = found
                 graph = self._node.graph
                 apart = {*graph.all_mismatches(), *graph.doubles(), *graph.rivals(self._commands)}
-                for text in sorted(apart - mismatches):
+                since = {text: since.get(text, now) for text in apart}
+                due_texts = {text for text in apart if UNNAMED not in text or now - since[text] > _NAMES_NS}
+                for text in sorted(due_texts - printed):
                     report(text)
-                mismatches |= apart
+                printed |= due_texts
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))

@@ -97,6 +97,7 @@ def run_service(
             timer.daemon = True
             timer.start()
             running.callback(timer.cancel)
-        server.run(end.is_set, lambda line: console.print(line, markup=False))
+        # A log has one line for a message, whatever its length.
+        server.run(end.is_set, lambda line: console.print(line, markup=False, soft_wrap=not console.is_terminal))
         console.print(f"Ended. Commands refused: {sum(counts.refused.values())}.")
         return host.bridge.latest.copy()

@@ -117,3 +117,17 @@ def test_another_robot_of_the_same_topics_is_named_and_a_recorder_or_a_brain_is_
             "Another node, /robot, subscribes to /cmd_vel and publishes /odom, too: both robots obey"
         )
         assert kept
+
+
+def test_several_publishers_of_a_topic_are_named_and_a_robot_with_its_guard_is_one(domain: int, tmp_path: Path) -> None:
+    with contextlib.ExitStack() as others, Node("robot", NetworkConfig(domain)) as node:
+        for name in ("bridge", "bridge_guard"):
+            others.callback(Fork(stand, domain, name, (), ("/cmd_vel",), output=tmp_path / name).kill)
+        until(lambda: [one.node for one in node.graph.endpoints()].count("/bridge_guard") == 1, "the guard is found")
+        until(lambda: "/bridge" in {one.node for one in node.graph.endpoints()}, "the bridge is found")
+        assert node.graph.rivals({"/cmd_vel"}) == []
+        others.callback(Fork(stand, domain, "brain", (), ("/cmd_vel",), output=tmp_path / "brain").kill)
+        until(lambda: "/brain" in {one.node for one in node.graph.endpoints()}, "the brain is found")
+        assert node.graph.rivals({"/cmd_vel"}) == [
+            "/cmd_vel has 2 publishers, brain and bridge: the newest message counts."
+        ]

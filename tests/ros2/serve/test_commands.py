@@ -96,7 +96,19 @@ def test_each_goal_of_a_burst_to_an_arm_has_one_result(arm: Side) -> None:
     ended = arm.ended(100)
     assert sorted(one.task_id for one in ended) == sorted(names)
     assert any("goals wait already" in one.message for one in ended)
+    arm.served.wait_for(f": {COMMAND_TOPIC}: ")  # a refused goal is counted
     is_at(arm, arm.joints)
+
+
+def test_the_result_of_a_stopped_robot_names_the_topic_that_resets_it(arm: Side) -> None:
+    pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
+    arm.press()
+    arm.send(COMMAND_TOPIC, COMMAND, {"task_id": "stopped", "target_pose": pose})
+    [result] = arm.ended(1)
+    assert not result.success
+    assert result.message.endswith("clear its cause, then send a message on /emergency_stop/reset.")
+    arm.served.wait_for(f": {COMMAND_TOPIC}: estop")
+    arm.reset()
 
 
 def test_a_refused_twist_leaves_the_goal_alone(base: Side) -> None:
