@@ -19,7 +19,7 @@ from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import ur, views
 from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State
+from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 
 JOINT_STATES_HZ = 125  # of a UR5 (CB3); a UR5e has 500
@@ -29,7 +29,7 @@ _REACHED = 1e-3  # [rad], and of the gripper [m]
 _STUCK_NS = NANOSECONDS  # without coming nearer
 
 
-class ArmTopics:
+class ArmTopics(Topics):
     """The topics of an arm.
 
     Args:

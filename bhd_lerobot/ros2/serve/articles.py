@@ -17,7 +17,7 @@ from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode_known
 from bhd_lerobot.ros2.messages.types import INTERFACES, type_store
 from bhd_lerobot.ros2.serve.interface import Names
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Input, Output, State
+from bhd_lerobot.ros2.serve.server import Input, Output, State, Topics
 
 PACKAGE = "brain_bridge"
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/command_result", "/bridge/cerebellum_state"
@@ -87,7 +87,7 @@ def _find(role: str, package: str, texts: dict[str, str], articles: bool | str) 
     )
 
 
-class TrajectoryController:
+class TrajectoryController(Topics):
     """The topics of a `joint_trajectory_controller` in front of a served arm.
 
     Args:
@@ -110,10 +110,6 @@ class TrajectoryController:
     def inputs(self) -> Iterable[Input]:
         """Return what commands the robot."""
         return self._inputs
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
 
     def _publish(self, state: State) -> None:
         count, record = len(self._joints), state.record

@@ -27,7 +27,7 @@ from bhd_lerobot.ros2.messages.base import (
 )
 from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State
+from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State, Topics
 
 _COMMAND = "/cmd_vel"
 NODE_HZ = 20  # of turtlebot3_node's timer
@@ -38,7 +38,7 @@ _LIPO, _GOOD, _FULL = 3, 1, 4  # BatteryState's constants: technology, health, s
 _POLL_NS = 1_000_000  # between two looks for a scan that is due
 
 
-class BaseTopics:
+class BaseTopics(Topics):
     """The topics of a base with a scanner.
 
     Args:

@@ -21,7 +21,7 @@ from bhd_lerobot.ros2.serve import articles
 from bhd_lerobot.ros2.serve.articles import article_names
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import RESET_TOPIC, InterfaceTopics
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
+from bhd_lerobot.ros2.serve.server import Counts, Output, State, Topics
 from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
 from bhd_lerobot.ros2.serve.setpoints import Setpoints
 
@@ -62,7 +62,7 @@ class BridgeConfig(ServiceConfig):
             self.network = NetworkConfig(ros2.domain, ros2.interface, ros2.peers, ros2.distro)
 
 
-class Faults:
+class Faults(Topics):
     """Reports each fault of the robot once, with its cause and the remedy; one that no reset ends is an error.
 
     Args:
@@ -76,14 +76,6 @@ class Faults:
     def outputs(self) -> Iterable[Output]:
         """Return a look at the mode, which publishes nothing."""
         return [Output(10.0, self._look)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return that nothing commands the robot."""
-        return []
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
 
     def _look(self, state: State) -> None:
         before, self._before = self._before, state.record.copy()

@@ -14,13 +14,13 @@ from bhd_lerobot.ros2.messages import views
 from bhd_lerobot.ros2.messages.images import COMPRESSED, encode_image
 from bhd_lerobot.ros2.messages.parts import Frames, stamp_tree
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Input, Output, State
+from bhd_lerobot.ros2.serve.server import Output, State, Topics
 
 CLOCK_HZ = 100
 _CLOCK = "rosgraph_msgs/msg/Clock"
 
 
-class CameraTopics:
+class CameraTopics(Topics):
     """The images of a robot's cameras, one an action: ``/camera/image_raw/compressed``, or with the camera's name.
 
     Args:
@@ -45,14 +45,6 @@ class CameraTopics:
         """Return what is published."""
         return [Output(self._host.rates.fps, self._publish)]
 
-    def inputs(self) -> Iterable[Input]:
-        """Return that nothing commands the robot."""
-        return []
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
-
     def _publish(self, state: State) -> None:
         if self._pending:  # the renderer is behind
             return
@@ -70,7 +62,7 @@ class CameraTopics:
         self._pending -= 1
 
 
-class ClockTopic:
+class ClockTopic(Topics):
     """``/clock``, for nodes with `use_sim_time`; it is the wall clock.
 
     Args:
@@ -83,14 +75,6 @@ class ClockTopic:
     def outputs(self) -> Iterable[Output]:
         """Return what is published."""
         return [Output(CLOCK_HZ, self._publish)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return that nothing commands the robot."""
-        return []
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
 
     def _publish(self, state: State) -> None:
         fields: dict[str, Any] = {"clock": stamp_tree(state.stamps)}

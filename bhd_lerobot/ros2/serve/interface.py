@@ -1,9 +1,10 @@
 """What a brain in another process exchanges with the robot: commands, results, the state, the emergency stop."""
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, override
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
 from bhd_lerobot.control.messages import Limit
@@ -15,7 +16,7 @@ from bhd_lerobot.ros2.messages.parts import header, stamp_tree
 from bhd_lerobot.ros2.messages.serialize import encode, encode_known
 from bhd_lerobot.ros2.messages.types import INTERFACES
 from bhd_lerobot.ros2.serve.goals import Goals
-from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State, for_nodes
+from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State, Topics, for_nodes
 
 COMMAND, RESULT, STATE = (f"{INTERFACES}/msg/{name}" for name in ("BrainCommand", "BrainResult", "CerebellumState"))
 COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC = "/brain/command", "/brain/result", "/cerebellum/state"
@@ -24,6 +25,7 @@ BOOL, LOSSY = "std_msgs/msg/Bool", Qos(0, reliable=False)
 DIAGNOSTICS_TOPIC, DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 _RESULTS_HZ, _DIAGNOSTICS_HZ = 50, 1
 _CUTS = Limit.NON_FINITE | Limit.VELOCITY | Limit.POSITION | Limit.POSTURE | Limit.CLEARANCE  # others are of every day
+_LAST_S = 0.5  # that others may take to receive the last results
 _MOST_RESULTS = 1000  # that wait to be sent; commands wait until there are fewer
 _RESULTS_AT_ONCE = 5  # half of what a ROS 2 subscription keeps by default
 
@@ -47,7 +49,7 @@ class Names:
     state_type: str = STATE
 
 
-class InterfaceTopics:
+class InterfaceTopics(Topics):
     """The topics of brain and cerebellum.
 
     Args:
@@ -80,6 +82,7 @@ class InterfaceTopics:
         self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS)
         self._limits, self._reported = host.bridge.latest["limits"].copy(), counts.all()
         self._results: deque[CommandResult] = deque()
+        self._open: set[str] = set()  # goals that were taken and have not ended
         commands = dict.fromkeys((one.command, one.command_type) for one in names)
         # The stop comes after the reset: of two that arrive together the robot stays stopped. A publisher that is best
         # effort presses, too.
@@ -104,6 +107,18 @@ class InterfaceTopics:
     def poll(self, now_ns: int) -> int:
         """Follow the goal; return when there is more to do [ns]."""
         return self._goals.poll(now_ns)
+
+    @override
+    def end(self) -> None:
+        """Answer the goals that have not ended."""
+        self._take_results()
+        for name in self._open:
+            self._results.append(CommandResult(name, False, ResultCode.CANCELLED, "The robot is no longer served."))
+        while self._results:
+            self._send_some()
+            time.sleep(1 / _RESULTS_HZ)
+        for publisher, _ in self._results_out:
+            publisher.wait_for_acks(_LAST_S)
 
     def _has_room(self) -> bool:
         return len(self._results) < _MOST_RESULTS
@@ -136,6 +151,7 @@ class InterfaceTopics:
         )
         refusal = self._goals.submit(command, frame)
         if refusal is None:
+            self._open.add(command.task_id)
             self._taken()
         else:
             self._refuse(refusal)
@@ -166,10 +182,17 @@ class InterfaceTopics:
         }
         self._diagnostics.send(encode(DIAGNOSTICS, {"header": header(state.stamps), "status": [status]}, 1)[0])
 
-    def _publish_results(self, state: State) -> None:
+    def _take_results(self) -> None:
         for result in self._goals.take_results():
+            self._open.discard(result.task_id)
             self._ended(result)
             self._results.append(result)
+
+    def _publish_results(self, state: State) -> None:
+        self._take_results()
+        self._send_some()
+
+    def _send_some(self) -> None:
         for _ in range(min(len(self._results), _RESULTS_AT_ONCE)):
             self._send(self._results.popleft())
 

@@ -19,7 +19,7 @@ from bhd_lerobot.ros2.messages.base import ODOM_FRAME
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import decode, encode
 from bhd_lerobot.ros2.messages.types import type_store
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Input, Output, State
+from bhd_lerobot.ros2.serve.server import Output, State, Topics
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 
 PATH, POSE = "nav_msgs/msg/Path", "geometry_msgs/msg/PoseStamped"
@@ -29,7 +29,7 @@ _PLAN_POINTS = 100  # of the longest plan
 _DRIVEN_HZ, _DRIVEN_S = 5, 60
 
 
-class PlannedPath:
+class PlannedPath(Topics):
     """The path of an arm's tool by the plan that is followed, and its end, in the base frame.
 
     The plan is that of a goal, or a joint trajectory that came by its topic. At its end the path is empty.
@@ -53,14 +53,6 @@ class PlannedPath:
     def outputs(self) -> Iterable[Output]:
         """Return what is published."""
         return [Output(_PLAN_HZ, self._publish)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return that nothing commands the robot."""
-        return []
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
 
     def _publish(self, state: State) -> None:
         followed: Any = self._trajectory()
@@ -86,7 +78,7 @@ class PlannedPath:
         return followed.position[rows, : self._dof]
 
 
-class DrivenPath:
+class DrivenPath(Topics):
     """The path that a base has driven in the last minute, by its odometry; sent where somebody receives it.
 
     Args:
@@ -100,14 +92,6 @@ class DrivenPath:
     def outputs(self) -> Iterable[Output]:
         """Return what is published."""
         return [Output(_DRIVEN_HZ, self._publish)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return that nothing commands the robot."""
-        return []
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing else is due."""
-        return NEVER_NS
 
     def _publish(self, state: State) -> None:
         x, y, yaw = state.record["odometry"][0]

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,20 +131,26 @@ class Counts:
             self.add(f"{topic}: {reason.explanation}")
 
 
-class Topics(Protocol):
-    """The topics of a kind of robot."""
+NEVER_NS = 1 << 62
+
+
+class Topics:
+    """Some topics of a robot."""
 
     def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
+        """Return what is published at fixed rates."""
+        return ()
 
     def inputs(self) -> Iterable[Input]:
         """Return what commands the robot."""
+        return ()
 
     def poll(self, now_ns: int) -> int:
-        """Do what is due at a monotonic time [ns]; return when there is more to do, or a large number."""
+        """Do what is due at a monotonic time [ns]; return when there is more to do."""
+        return NEVER_NS
 
-
-NEVER_NS = 1 << 62
+    def end(self) -> None:
+        """Send what others still wait for: the robot is no longer served."""
 
 
 class Server:
@@ -207,3 +213,5 @@ class Server:
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))
+        for part in self._parts:
+            part.end()

@@ -11,10 +11,10 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
-from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output
+from bhd_lerobot.ros2.serve.server import Counts, Input, Topics
 
 
-class Setpoints:
+class Setpoints(Topics):
     """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm.
 
     Args:
@@ -32,17 +32,9 @@ class Setpoints:
         take = self._move if is_arm else self._drive
         self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
 
-    def outputs(self) -> Iterable[Output]:
-        """Return that nothing is published."""
-        return []
-
     def inputs(self) -> Iterable[Input]:
         """Return what commands the robot."""
         return self._inputs
-
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing is due."""
-        return NEVER_NS
 
     def _drive(self, message: Any) -> bool:
         twist = getattr(message, "twist", message)
