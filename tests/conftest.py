@@ -35,6 +35,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
 os.environ["WANDB_MODE"] = "disabled"
 os.environ["MPLBACKEND"] = "Agg"
+os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 - the name is Ray's, whose 15 starves it on a busy machine
 if "PYTEST_XDIST_WORKER" in os.environ:
     # One thread for each of torch, BLAS and OpenCV: the workers are the parallelism.
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -38,7 +38,9 @@ class Fault:
                 return
             self.change(os.fsdecode(path), is_removal=False)
         elif event in CHANGES:
-            self.change(os.fsdecode(arguments[0]), is_removal=event in REMOVALS)
+            path = arguments[0]
+            name = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path)
+            self.change(name, is_removal=event in REMOVALS)
 
     def before_step(self, action: str, path: Path) -> None:
         if action in ("write", "swap"):  # the others are seen above
