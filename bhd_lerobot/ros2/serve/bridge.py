@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from rich.console import Console
@@ -34,7 +34,7 @@ class BridgeConfig(ServiceConfig):
 
     Attributes:
         robot: the robot; `robot.plant` says how it is driven.
-        network: where brains are; where none of its options is given, the network of `robot.ros2`.
+        network: where brains are; an option that is not given is that of `robot.ros2`.
         namespace: of the bridge's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
         duration_s: end after this time [s]; 0: run until Ctrl-C.
@@ -57,9 +57,10 @@ class BridgeConfig(ServiceConfig):
             robot.odometry = True  # a goal is reached by it
         elif robot.action_space != "joint":
             raise ConfigError(f"robot.action_space is {robot.action_space!r}; a bridge takes joint positions: 'joint'.")
-        if self.network == NetworkConfig():
-            ros2 = robot.ros2
-            self.network = NetworkConfig(ros2.domain, ros2.interface, ros2.peers, ros2.distro)
+        usual = NetworkConfig()
+        names = [one.name for one in fields(usual)]
+        given = {name: value for name in names if (value := getattr(self.network, name)) != getattr(usual, name)}
+        self.network = NetworkConfig(**{name: getattr(robot.ros2, name) for name in names} | given)
 
 
 class Faults(Topics):
@@ -125,7 +126,16 @@ def bridge(
         ]
 
     with _recording(config, simulation, report, ended) as recording:
-        run_service(config, simulation, None, parts, console=console, ended=ended, title="is behind a bridge")
+        run_service(
+            config,
+            simulation,
+            None,
+            parts,
+            console=console,
+            ended=ended,
+            name=f"{config.robot.type}_bridge",
+            title="is behind a bridge",
+        )
 
 
 def _recording(

@@ -57,6 +57,7 @@ def run_service(
     console: Console,
     ended: threading.Event | None = None,
     title: str,
+    name: str = "",
     node: Callable[..., Node] = Node,
     view: bool = False,
 ) -> Any:
@@ -68,6 +69,7 @@ def run_service(
         parts: makes the topics.
         console: takes lines about the state.
         ended: ends it as well, once it is set.
+        name: of the node; the robot's type if empty.
         title: what the robot is from now on, as the first line says.
         node: makes the node of a name, a network and a namespace.
         view: show the simulation in MuJoCo's viewer.
@@ -87,7 +89,7 @@ def run_service(
         host.begin()
         for line in host.notes:
             console.print(line)
-        made = running.enter_context(node(robot.type, config.network, config.namespace))
+        made = running.enter_context(node(name or robot.type, config.network, config.namespace))
         counts = Counts()
         server = Server(host, made, parts(host, made, counts), counts)
         where = "this machine" if config.network.is_local else config.network.interface

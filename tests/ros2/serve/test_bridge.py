@@ -9,8 +9,10 @@ import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.cli import ros2, serve
-from bhd_lerobot.ros2.live.network import NetworkConfig
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.serve.bridge import BridgeConfig
 from tests.ros2.peer_env import Peer
 from tests.ros2.programs import Program, Side, log_of
 from tests.ros2.serve.bridges import FORWARD, NEAR, STAND, TWIST, arm, base, drives, twist
@@ -134,6 +136,13 @@ def test_a_robot_that_is_not_there_is_named(domain: int, tmp_path: Path) -> None
     with Program(serve.main, given, log=tmp_path / "log") as bridge:
         assert bridge.process.wait() == 2
         assert "/joint_states" in bridge.text
+
+
+def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> None:
+    robot = UR5Config(plant="ros2", ros2=Ros2Config(domain=7, interface="eth0", peers=["10.0.0.2"]))
+    config = BridgeConfig(robot, network=NetworkConfig(domain=9))
+    assert config.network == NetworkConfig(9, "eth0", ["10.0.0.2"])
+    assert BridgeConfig(robot).network == NetworkConfig(7, "eth0", ["10.0.0.2"])
 
 
 @pytest.mark.parametrize(
