@@ -149,11 +149,12 @@ def test_a_take_lasts_as_long_as_it_says_whatever_the_robot_keeps(tmp_path: Path
         )
         (episode,) = rig.loop.run([EpisodeSpec(0, 0)])
         time_s = episode.columns["control.time"]
-        assert 2.7 < time_s[-1] - time_s[0] < 3.0 + 5 / FPS
+        most_s = 4.5  # however late a busy machine sees the end; 150 frames of this robot take 8 s
+        assert 2.7 < time_s[-1] - time_s[0] < most_s
         assert episode.frames < 100
         result = RecordResult(tmp_path, tmp_path)
         result.count(episode, FPS)
-        assert 2.7 < result.simulated_s < 3.0 + 5 / FPS
+        assert 2.7 < result.simulated_s < most_s
         assert result.kept_fps is not None
         assert result.kept_fps <= 25
         found = re.search(r"The robot keeps (\d+) of the 50 frames a second", rig.text.getvalue())

@@ -63,7 +63,7 @@ def test_definitions_are_those_of_ros() -> None:
             if one["type_name"] in type_store().fielddefs:
                 assert type_store().hash_rihs01(one["type_name"]) == one["hash_string"], one["type_name"]
                 compared += one["type_name"].startswith(name)
-    assert compared == 4 * 2 + 8  # four services, and an action
+    assert compared >= 4 * 2 + 8  # four services and an action at least, of what the wheels have
 
 
 def test_every_request_to_a_service_has_its_reply_and_is_carried_out_once(shared: int, servers: Peer) -> None:
