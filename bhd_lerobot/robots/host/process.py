@@ -211,6 +211,7 @@ class LiveProcess:
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
         self._standing_ticks = 0
         grid = self._loop.run(start_ns)
+        self._publisher.restate()
         return grid.executed, grid.skipped
 
     def _problem(self) -> str:

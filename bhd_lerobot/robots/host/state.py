@@ -154,6 +154,12 @@ class StatePublisher:
         self._physics[0][:], self._physics[1][:] = host.physics
         self._ring.publish(self._state)
 
+    def restate(self) -> None:
+        """Publish the last state once more, with what is known by now to be wrong."""
+        if self._was_faulty:
+            self._record["problem"] = self._problem().encode()[:_PROBLEM_BYTES]
+            self._ring.publish(self._state)
+
     def _count(self, slot: Slot) -> bool:
         """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame.
 

@@ -72,16 +72,20 @@ class Faults(Topics):
     """
 
     def __init__(self, host: LiveHost, report: Callable[[str], None]) -> None:
-        self._host, self._report, self._before = host, report, host.bridge.latest.copy()
+        self._host, self._report, self._before, self._looks = host, report, host.bridge.latest.copy(), 0
 
     def outputs(self) -> Iterable[Output]:
         """Return a look at the mode, which publishes nothing."""
         return [Output(10.0, self._look)]
 
     def _look(self, state: State) -> None:
-        before, self._before = self._before, state.record.copy()
-        mode = Mode(int(state.record["mode"][0]))
-        if mode == before["mode"][0] or mode not in (Mode.FAULT, Mode.ESTOP):
+        before, mode = self._before, Mode(int(state.record["mode"][0]))
+        is_new = mode in (Mode.FAULT, Mode.ESTOP) and mode != before["mode"][0]
+        self._looks = (self._looks + 1) * is_new
+        if self._looks == 1:
+            return  # a moment later the cause is known better: which topic is silent, which process has ended
+        self._before, self._looks = state.record.copy(), 0
+        if not is_new:
             return
         if mode == Mode.FAULT and self._host.is_lost:
             raise RealtimeError(f"{problem_of(state.record).removesuffix('.')}. The robot is stopped; start again.")

@@ -104,7 +104,9 @@ def test_a_chunk_does_not_make_the_robot_hurry(tmp_path: Path) -> None:
             reports.append(host.step(None))
         host.stop(ONLY)
     values = [row[0] for row in sent(tmp_path)]
-    assert values == [float(one.requested[0, 0]) for one in reports]
+    requested = [float(one.requested[0, 0]) for one in reports]
+    before = [values[0], *values[:-1]]  # of a frame that ended before its action could be sent
+    assert all(one in (own, last) for one, own, last in zip(requested, values, before, strict=True)), requested
     late = [min(1.0 + one.number - reports[0].number, 8.0) - value for one, value in zip(reports, values, strict=True)]
     assert min(late) >= 0.0  # more where frames begin while the action is chosen
     assert values[3] >= values[2] + 3
