@@ -37,12 +37,13 @@ SHORT = {
     "refusals": "--path=perception --episodes=1",
     "robots": "--seconds=4 --rounds=1",
     "ros2": "--rounds=1 --seconds=1",
+    "ros2_record": "--rounds=1 --seconds=2",
     "sequential": "--runs=100 --pairs=20",
     "sight": "--rounds=1 --seconds=0.2",
     "wire": "--streams=7 --frames=2 --n=1",
 }
 # A minute or more each, because they start several interpreters, each of which imports PyTorch and LeRobot.
-SLOW = {"cluster", "images", "robots", "ros2"}
+SLOW = {"cluster", "images", "robots", "ros2", "ros2_record"}
 
 
 # MuJoCo chooses how it renders while it is imported, and these benchmarks choose before.
