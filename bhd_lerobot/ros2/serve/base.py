@@ -5,8 +5,7 @@ stops by itself when no command comes for `command_timeout_s`, where a real one 
 """
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -19,17 +18,14 @@ from bhd_lerobot.ros2.messages import views
 from bhd_lerobot.ros2.messages.base import (
     GYRO,
     TWIST,
-    BareTwistPart,
     GyroPart,
     OdometryPart,
     ScanPart,
-    TwistPart,
 )
 from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.serve.server import Counts, Input, Output, State, Topics
+from bhd_lerobot.ros2.serve.server import Output, State, Topics
 
-_COMMAND = "/cmd_vel"
 NODE_HZ = 20  # of turtlebot3_node's timer
 _JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _BATTERY = "sensor_msgs/msg/BatteryState"
@@ -44,19 +40,14 @@ class BaseTopics(Topics):
     Args:
         host: the robot, with odometry and a gyroscope in its observation.
         node: the node.
-        counts: what is refused.
         view: what is known of the robot.
-        interrupt: called when a command was taken.
     """
 
-    def __init__(
-        self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView, interrupt: Callable[[], None]
-    ) -> None:
+    def __init__(self, host: LiveHost, node: Node, view: views.RobotView) -> None:
         body = host.body
         if not isinstance(body, MobileBase) or body.lidar is None:
             raise AssertionError(f"{host.config.type} is no base with a lidar.")
-        self._interrupt = interrupt
-        self._host, self._counts, self._view, self._drive = host, counts, view, body.drive
+        self._host, self._view, self._drive = host, view, body.drive
         beams = host.config.beams
         names = list(host.observation_names)
         self._gyro = [names.index(name) for name in GYRO]
@@ -67,8 +58,6 @@ class BaseTopics(Topics):
         self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
-        # The type of Jazzy, and the one of Humble and of most tutorials.
-        self._commands = [node.subscription(_COMMAND, part.msgtype) for part in (TwistPart, BareTwistPart)]
         self._odometry = node.publisher("/odom", OdometryPart.msgtype)
         self._imu = node.publisher("/imu", GyroPart.msgtype)
         self._joints = node.publisher("/joint_states", views.JOINT_STATE)
@@ -82,19 +71,6 @@ class BaseTopics(Topics):
     def outputs(self) -> Iterable[Output]:
         """Return what is published."""
         return [Output(NODE_HZ, self._publish)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return [Input(one, self._drive_by) for one in self._commands]
-
-    def _drive_by(self, message: Any) -> bool:
-        twist = getattr(message, "twist", message)
-        sent = self._host.bridge.send(np.array([[twist.linear.x, twist.angular.z]]))
-        self._counts.add_result(_COMMAND, sent)
-        if sent.reasons[0]:
-            return False
-        self._interrupt()
-        return True
 
     def _publish(self, state: State) -> None:
         record, stamps = state.record, state.stamps

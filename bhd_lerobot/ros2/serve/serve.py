@@ -133,9 +133,9 @@ def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts, name
             parts.append(TrajectoryController(host, node, arm.follow))
     else:
         interface = InterfaceTopics(host, node, counts, config.state_hz, goals, names=names)
-        parts = [interface, BaseTopics(host, node, counts, view, goals.interrupt), DrivenPath(node)]
-        if config.articles:
-            parts.append(Setpoints(host, node, counts, goals.interrupt, TWIST_TOPIC))
+        twists = ("/cmd_vel", *((TWIST_TOPIC,) if config.articles else ()))
+        commands = [Setpoints(host, node, counts, goals.interrupt, topic) for topic in twists]
+        parts = [interface, BaseTopics(host, node, view), *commands, DrivenPath(node)]
     if view.joints:
         publish_description(node, config.robot.type, view, parts_of(host.body))
     if host.camera_shapes:

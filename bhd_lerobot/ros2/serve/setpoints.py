@@ -1,4 +1,4 @@
-"""Setpoints that a brain streams to a robot behind a bridge."""
+"""Setpoints that are streamed to a robot: twists to a base, joint positions to an arm."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -28,6 +28,7 @@ class Setpoints(Topics):
     def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
         self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
         is_arm = isinstance(host.body, Arm)
+        # Twists of Jazzy, and those of Humble and of most tutorials.
         types = (ur.FLOATS,) if is_arm else (TwistPart.msgtype, BareTwistPart.msgtype)
         take = self._move if is_arm else self._drive
         self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
