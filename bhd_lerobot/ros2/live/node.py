@@ -3,6 +3,8 @@
 import os
 import socket
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
@@ -76,7 +78,7 @@ class Publisher:
     @property
     def receivers(self) -> int:
         """How many subscriptions fit, of any node."""
-        return len(self._writer.get_matched_subscriptions())
+        return len(_matched(self._writer.get_matched_subscriptions))
 
 
 class Subscription:
@@ -104,7 +106,14 @@ class Subscription:
     def sender_ids(self) -> list[int]:
         """The publishers that fit."""
         # Cyclone DDS returns them signed here, and unsigned with a sample (11.0.1).
-        return [handle % 2**64 for handle in self.reader.get_matched_publications()]
+        return [handle % 2**64 for handle in _matched(self.reader.get_matched_publications)]
+
+
+def _matched(ask: Callable[[], list[int]]) -> list[int]:
+    """Return the other ends: Cyclone DDS (11.0.1) counts them first, and fails where one more fits before it lists them."""
+    while True:
+        with suppress(IndexError):
+            return ask()
 
 
 class Node:

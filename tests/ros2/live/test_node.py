@@ -4,6 +4,7 @@ import contextlib
 import os
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,22 @@ def test_a_real_node_lists_ours_and_receives_what_it_sends(domain: int) -> None:
             until(lambda: [publisher.send(data), [line for line in peer.lines if text in str(line)]][1], "it arrives")
         with Peer("topic.py", "list", domain=domain) as peer:
             peer.wait(lambda line: "robot" in str(line) and "/words" in str(line), "the node")
+
+
+def test_other_ends_are_counted_while_they_come_and_go(domain: int) -> None:
+    with Node("robot", NetworkConfig(domain)) as node, ThreadPoolExecutor(1) as pool:
+        publisher = node.publisher("/words", "std_msgs/msg/String")
+
+        def come_and_go() -> None:
+            for _ in range(100):
+                for one in [node.subscription("/words", "std_msgs/msg/String") for _ in range(20)]:
+                    node.remove(one)
+
+        done = pool.submit(come_and_go)
+        while not done.done():
+            assert 0 <= publisher.receivers <= 20
+        done.result()
+        until(lambda: not publisher.receivers, "none is left")
 
 
 def test_numbers_arrive_bit_for_bit(domain: int) -> None:
