@@ -110,7 +110,7 @@ class Subscription:
 
 
 def _matched(ask: Callable[[], list[int]]) -> list[int]:
-    """Return the other ends: Cyclone DDS (11.0.1) counts them first, and fails where one more fits before it lists them."""
+    """Return the other ends: Cyclone DDS (11.0.1) counts them first, and fails if one more fits before it lists."""
     while True:
         with suppress(IndexError):
             return ask()
