@@ -2,8 +2,8 @@
 
 A benchmark is a file here that runs as a module and prints its table. It exits with 0 if it met its goals, with 3 if it
 missed one, with 1 after an exception, and with 2 if its options are wrong or it could not measure anything here. Files
-whose names start with an underscore are what benchmarks share. Two are run only if they are named: `realtime`, which
-has `make bench-realtime`, and `refusals`, which needs the option `--path`.
+whose names start with an underscore are what benchmarks share. `realtime`, which has `make bench-realtime`, is run only
+if it is named.
 """
 
 import subprocess
@@ -13,7 +13,6 @@ from pathlib import Path
 
 from benchmarks._turns import GOAL_MISSED, status
 
-APART = ("realtime", "refusals")
 FOLDER = Path(__file__).resolve().parent
 NAMES = sorted(p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "run")
 
@@ -29,7 +28,7 @@ def main(chosen: list[str]) -> int:
         print(f"Unknown benchmark: {', '.join(unknown)}. Valid: {', '.join(NAMES)}.", file=sys.stderr)
         return 2
     failed, missed = [], []
-    for name in chosen or [name for name in NAMES if name not in APART]:
+    for name in chosen or [name for name in NAMES if name != "realtime"]:
         print(f"== {name}", flush=True)
         started = time.perf_counter()
         done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}"], cwd=FOLDER.parent, check=False)

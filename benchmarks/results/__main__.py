@@ -16,7 +16,7 @@ from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.table import Table
 from bhd_lerobot.datasets.storage.disk import Disk
 
-_KEPT = Path("docs/reference/results")
+_KEPT = Path("docs/reference/results.json")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--episodes is {options.episodes}; it must be at least 1.")
     is_full = options.episodes is None and options.folder is None
     out = options.folder or (out if options.episodes is None else Path(f"{out}_{options.episodes}"))
-    kept = REPOSITORY / (_KEPT if is_full else out / "results")
+    kept = REPOSITORY / (_KEPT if is_full else out / "results.json")
     table, failed = Table(out), []
     if not options.kept:
         try:
@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
                 _write(table, kept)  # what takes hours may be stopped
     missed = _write(table, kept)
     print("\n".join(failed), file=sys.stderr, end="\n" if failed else "")
-    print(f"Written: {kept}.md.", *(f"Missed: {one}." for one in missed), sep="\n")
+    print(f"Written: {kept.with_suffix('.md')}.", *(f"Missed: {one}." for one in missed), sep="\n")
     return 2 if failed else status(met=not missed or options.kept or not is_full)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from benchmarks._report import Row
 from benchmarks.results.rows import Rows
-from benchmarks.results.runner import Part, Ran
+from benchmarks.results.runner import Part, Ran, read_parts
 from benchmarks.results.table import Table
 
 _HEAD = """# Results
@@ -28,13 +28,11 @@ and with which commit, if known; `make results RESULTS=--kept` writes the page a
 
 def read(table: Table, kept: Path) -> dict[str, dict[tuple[str, int | None], Part]]:
     """Return what was kept, by section, and by the part's name and the training seed, None of what was run once."""
-    found = {}
+    everything, found = read_parts(kept), {}
     for name, section in table.sections.items():
-        places = {(name, None): kept / f"{name}.json"} if "once" in section else {}
-        places |= {
-            (part, seed): kept / f"{part}_{seed}.json" for part in section.get("parts", {}) for seed in table.seeds
-        }
-        found[name] = {key: Part.read(path) for key, path in places.items() if path.exists()}
+        keys: dict[tuple[str, int | None], str] = {(name, None): name} if "once" in section else {}
+        keys |= {(part, seed): f"{part}_{seed}" for part in section.get("parts", {}) for seed in table.seeds}
+        found[name] = {key: everything[word] for key, word in keys.items() if word in everything}
     return found
 
 

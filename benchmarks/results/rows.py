@@ -144,15 +144,6 @@ class Rows:
         yield Row(f"{what}: wrong object", rate(saw["wrong"], {}))
         yield Row(f"{what}: within the radius stated for 90 %", rate(saw["in_90"], {}))
 
-    def _refused(self, _: dict[str, Any], refs: list[str], seeds: list[int]) -> Iterator[Row]:
-        """What a brain does that is asked for something that is not there, or that is there twice."""
-        for world, counts in self._get(refs[0], seeds[0]).items():
-            for kind, words in (("absent", "is not there"), ("several", "is there several times")):
-                if (count := counts[kind])["tables"]:
-                    what = f"seed_{seeds[0]}, {world} world, asked for what {words}: goes for something, in"
-                    found = asdict(wilson(count["went"], count["tables"]))
-                    yield Row(f"{what} {count['tables']} tables", rate(found, {}))
-
     def _another(self, spec: dict[str, Any], refs: list[str], seeds: list[int]) -> Iterator[Row]:
         """How often a brain takes another object than the one that is named."""
         brain = self._brain(refs[0], seeds[0])

@@ -56,11 +56,22 @@ class Part:
     commands: list[Ran]
     measured: Any = field(default_factory=dict)
 
-    @classmethod
-    def read(cls, path: Path) -> "Part":
-        """Read one that was kept."""
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        return cls(kept["made"], [Ran.read(one) for one in kept["commands"]], kept["measured"])
+
+def read_parts(kept: Path) -> dict[str, Part]:
+    """Read what was measured, by the names of the parts with their training seeds; nothing if there is no file."""
+    if not kept.exists():
+        return {}
+    parts = json.loads(kept.read_text(encoding="utf-8"))
+    return {
+        name: Part(one["made"], [Ran.read(ran) for ran in one["commands"]], one["measured"])
+        for name, one in parts.items()
+    }
+
+
+def write_parts(kept: Path, parts: Mapping[str, Part]) -> None:
+    """Write what was measured, a part in a line."""
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(asdict(one))}" for name, one in sorted(parts.items()))
+    Disk().publish(kept, f"{{\n{lines}\n}}\n".encode())
 
 
 class Runner:
@@ -96,7 +107,7 @@ class Runner:
         os.close(self._lock)
 
     def make(self, section: Mapping[str, Any], name: str, table: Table, kept: Path) -> None:
-        """Run the commands of a section; what was measured goes to the folder `kept`.
+        """Run the commands of a section; what was measured goes to the file `kept`.
 
         Raises:
             FailedError: a command failed.
@@ -107,12 +118,10 @@ class Runner:
             for part, spec in section.get("parts", {}).items()
             for seed in table.seeds
         ]
-        kept.mkdir(parents=True, exist_ok=True)
-        for file, spec, words in parts:
+        for key, spec, words in parts:
             commands = [self.run(command) for command in table.commands(spec, **words)]
             measured = self.measure(table.fill(spec.get("measured", {}), **words))
-            part = Part(provenance(REPOSITORY), commands, measured)
-            Disk().publish(kept / f"{file}.json", (json.dumps(asdict(part)) + "\n").encode())
+            write_parts(kept, {**read_parts(kept), key: Part(provenance(REPOSITORY), commands, measured)})
 
     def run(self, text: str) -> Ran:
         """Run a command line, or find that it was run.

@@ -13,7 +13,7 @@ import pytest
 from benchmarks._report import mean
 from benchmarks.results import page
 from benchmarks.results.rows import is_met, over_seeds, over_trainings
-from benchmarks.results.runner import REPOSITORY, FailedError, Part, Ran, Runner
+from benchmarks.results.runner import REPOSITORY, FailedError, Part, Ran, Runner, write_parts
 from benchmarks.results.table import Table
 from bhd_lerobot import plugin  # noqa: F401 - registers our policies
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -23,7 +23,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from tests.cases import each_case
 
-TABLE, KEPT = Table(Path("outputs/results")), REPOSITORY / "docs/reference/results"
+TABLE, KEPT = Table(Path("outputs/results")), REPOSITORY / "docs/reference/results.json"
 
 
 def commands(section: dict[str, Any]) -> list[str]:
@@ -68,9 +68,8 @@ def test_a_section_shows_rows_seeds_remarks_and_each_command_once(tmp_path: Path
     rows = [{"what": "a", "value": "1"}, {"what": "b", "value": "2", "goal": "at least 3", "met": False}]
     parts = {"one": Part("", [Ran("bhd-record z", 1.0, 4.0)], {"rows": rows})}
     parts |= {f"one_{seed}": Part("on 2020-01-01", [train, other, train], {"value": 1}) for seed in (0, 2)}
-    for name, part in parts.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(part, default=vars), encoding="utf-8")
-    text, missed = page.write(table, tmp_path)
+    write_parts(tmp_path / "results.json", parts)
+    text, missed = page.write(table, tmp_path / "results.json")
     assert missed == ["one: b"]
     for line in (
         "Made on 2020-01-02.",

@@ -10,7 +10,6 @@ import pytest
 
 from benchmarks import run
 from benchmarks._turns import GOAL_MISSED
-from benchmarks.sight import first_look, untrained_perception
 from tests.forks import Fork
 
 # The shortest form of each: a benchmark that is new has none, and fails here until it gets one.
@@ -22,32 +21,27 @@ SHORT = {
     "cluster": "--episodes=2 --episode_s=1 --turns=1",
     "contact": "--speeds=3 --frames=5",
     "envs": "--n=1 --repeats=1 --seconds=0.1 --peers sync",
-    "evaluate": "--demonstrations=2 --steps=2 --episodes=1 --n_envs=1 --turns=1",
-    "images": "--policies=bhd_cnn --episodes=2 --steps=2 --turns=1 --whole",
     "impedance": "--quick",
     "kinematics": "--poses=2",
     "lines": "--lines=1",
     "loader": "--episodes 1 0 --repeats=1 --seconds=0.1 --no_start",
-    "merge": "--datasets=2 --episodes=10 --frames=10 --turns=1",
     "motion": "--motions=1",
     "navigate": "--episodes=1",
     "realtime": "--quick --seconds=0.2 --robots=ur5 --conditions=quiet",
     "record": "--repeats=1 --simulated_s=1 --robots=turtlebot3 --n_envs=1",
     "recording": "--episodes=1 --length=20 --repeats=1",
-    "refusals": "--path=perception --episodes=1",
     "robots": "--seconds=4 --rounds=1",
     "ros2": "--rounds=1 --seconds=1",
     "ros2_record": "--rounds=1 --seconds=2",
-    "sequential": "--runs=100 --pairs=20",
     "sight": "--rounds=1 --seconds=0.2",
     "wire": "--streams=7 --frames=2 --n=1",
 }
 # A minute or more each, because they start several interpreters, each of which imports PyTorch and LeRobot.
-SLOW = {"cluster", "images", "robots", "ros2", "ros2_record"}
+SLOW = {"cluster", "robots", "ros2", "ros2_record"}
 
 
-# MuJoCo chooses how it renders while it is imported, and these benchmarks choose before.
-OWN_INTERPRETER = {"images", "record"}
+# MuJoCo chooses how it renders while it is imported, and this benchmark chooses before.
+OWN_INTERPRETER = {"record"}
 
 
 def _benchmark(name: str, *options: str) -> None:
@@ -62,8 +56,6 @@ def test_a_benchmark_runs_in_its_shortest_form(name: str, tmp_path: Path) -> Non
     if name in SLOW and os.environ.get("BHD_SWEEP") != "full":
         pytest.skip("takes minutes: it starts several interpreters; runs with BHD_SWEEP=full")
     options = SHORT[name]
-    if "--path=perception" in options:
-        options = options.replace("perception", str(untrained_perception(tmp_path / "perception", first_look()[0])))
     log = tmp_path / "log"
     if name in OWN_INTERPRETER:
         command = [sys.executable, "-m", f"benchmarks.{name}", *options.split()]
