@@ -1,20 +1,17 @@
-"""One simulation as a Gymnasium environment."""
+"""One simulation as a Gymnasium environment: the vector environment of one."""
 
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs import register  # noqa: F401  registers the environments
 from bhd_lerobot.envs.course import STREAM, Course
-from bhd_lerobot.envs.settings import make_settings
-from bhd_lerobot.envs.spaces import ActionScale, observation_space
-from bhd_lerobot.envs.stage import EVENT_NAMES, ClosedError, ResetNeededError, Seen, Stage
-from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.task import Event, Outcome, Split
+from bhd_lerobot.envs.vector import RENDER_MODES, BhdVectorEnv, info_of
+from bhd_lerobot.tasks.task import Split
 
-RENDER_MODES = ("rgb_array",)
 Observation = dict[str, Any]
 
 
@@ -31,7 +28,6 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Attributes:
         stage: simulation and task.
-        course: which episode comes next.
         task: name of the environment.
 
     Args:
@@ -68,16 +64,30 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         first_episode: int | None = None,
         episode_stride: int = STREAM,
     ) -> None:
-        settings = make_settings(environment, robot, task, cameras=cameras, obs_type=obs_type)
-        self.render_mode = check_render_mode(render_mode)
-        self.course = Course(seed, split, first_episode, episode_stride)
-        self.stage = Stage(settings.robot, settings.task)
-        self.task = settings.name
-        self.metadata = {**self.metadata, "render_fps": settings.robot.fps}
-        self._scale = ActionScale(self.stage.simulation, normalise=normalise_actions)
-        self.action_space = self._scale.space
-        self.observation_space = observation_space(self.stage.simulation, self.stage.task, settings.parts)
-        self._closed = False
+        self._one = BhdVectorEnv(
+            1,
+            environment,
+            robot,
+            task,
+            seed=seed,
+            split=split,
+            cameras=cameras,
+            obs_type=obs_type,
+            normalise_actions=normalise_actions,
+            render_mode=render_mode,
+            autoreset_mode=AutoresetMode.DISABLED,
+            first_episode=first_episode,
+            episode_stride=episode_stride,
+        )
+        self.render_mode, self.task, self.stage = render_mode, self._one.task, self._one.stage
+        self.metadata = {**self.metadata, "render_fps": self._one.metadata["render_fps"]}
+        self.action_space = self._one.single_action_space
+        self.observation_space = self._one.single_observation_space
+
+    @property
+    def course(self) -> Course:
+        """Which episode comes next."""
+        return self._one.members[0].course
 
     @property
     def task_description(self) -> str:
@@ -99,10 +109,9 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ClosedError: the environment was closed.
         """
-        self._check_open()
+        observation, info = self._one.reset(seed=[seed])
         super().reset(seed=seed)
-        self.stage.reset(_FIRST, [self.course.advance(seed)])
-        return self._observe(), self._info(Event.NOTHING)
+        return _first(observation), info_of(info, 0)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict]:
         """Let one frame go by; return observation, reward, terminated, truncated and info.
@@ -115,17 +124,8 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             ResetNeededError: no episode was started, or it is over.
             ClosedError: the environment was closed.
         """
-        self._check_open()
-        if not self.stage.running[0]:
-            raise ResetNeededError("No episode is running; call reset() first, and again after each episode's end.")
-        stepped = self.stage.step(self._scale.to_robot(np.asarray(action)[None], self.stage.running))
-        event = Event(int(stepped.event[0]))
-        observation, info = self._observe(), self._info(event)
-        if event != Event.NOTHING:
-            self.stage.rest(_FIRST)
-            outcome = self.stage.outcome(0, event)
-            info |= end_info(outcome)
-        return observation, float(stepped.reward[0]), bool(stepped.terminated[0]), bool(stepped.truncated[0]), info
+        observation, reward, terminated, truncated, info = self._one.step(np.asarray(action)[None])
+        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info_of(info, 0)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the scene from outside, shape (height, width, 3); None without a render mode.
@@ -133,51 +133,14 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             RenderingError: no image can be rendered here.
         """
-        self._check_open()
-        return None if self.render_mode is None else self.stage.render(0)
+        images = self._one.render()
+        return None if images is None else images[0]
 
     def close(self) -> None:
         """Free the simulation. May be called twice."""
-        if not self._closed:
-            self._closed = True
-            self.stage.close()
-
-    def _observe(self) -> Observation:
-        observation = batched(self.stage.observe(), self.observation_space)
-        return {
-            key: {name: image[0] for name, image in value.items()} if isinstance(value, dict) else value[0]
-            for key, value in observation.items()
-        }
-
-    def _info(self, event: Event) -> dict[str, Any]:
-        return {
-            "is_success": False,
-            "event": EVENT_NAMES[event],
-            "episode_index": self.course.episode,
-            "seed": int(self.stage.seeds[0]),
-        }
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise ClosedError(f"The environment {self.task!r} was closed; make a new one.")
+        self._one.close()
 
 
-_FIRST = np.zeros(1, np.intp)
-
-
-def batched(seen: Seen, space: Any) -> dict[str, Any]:
-    """Return what was seen as observations of a batch, with the keys of the space of a single one."""
-    parts = {"agent_pos": seen.state, "environment_state": seen.environment_state, "pixels": seen.images}
-    return {key: parts[key] for key in space}
-
-
-def end_info(outcome: Outcome) -> dict[str, Any]:
-    """Return what the info of an episode's last step says besides."""
-    return {"is_success": outcome.success, "score": float(outcome.score), "details": dict(outcome.details)}
-
-
-def check_render_mode(render_mode: str | None) -> str | None:
-    """Return the render mode if there is such a one."""
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ConfigError(unknown_name("render_mode", render_mode, RENDER_MODES))
-    return render_mode
+def _first(observation: Observation) -> Observation:
+    """Return the first row of everything."""
+    return {key: _first(value) if isinstance(value, dict) else value[0] for key, value in observation.items()}

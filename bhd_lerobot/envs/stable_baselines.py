@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from bhd_lerobot.envs.vector import BhdVectorEnv
+from bhd_lerobot.envs.vector import BhdVectorEnv, info_of
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import Event
 
@@ -60,7 +60,7 @@ class BhdSb3VecEnv(VecEnv):
         observation, info = self.env.reset(seed=self._first)
         self._first = None
         self._reset_options()
-        self.reset_infos = [_info_of(info, sim) for sim in range(self.num_envs)]
+        self.reset_infos = [info_of(info, sim) for sim in range(self.num_envs)]
         self._begin(self._all, observation)
         return self._observations()
 
@@ -80,14 +80,14 @@ class BhdSb3VecEnv(VecEnv):
         if len(ended):
             event[ended] = [Event[name.upper()] for name in info["event"][ended]]
         rewards = np.asarray(self._rewards(reward, event, terminated), np.float32)
-        infos = [_info_of(info, sim) for sim in range(self.num_envs)]
+        infos = [info_of(info, sim) for sim in range(self.num_envs)]
         for one, is_over in zip(infos, truncated & ~terminated, strict=True):
             one["TimeLimit.truncated"] = bool(is_over)
         if len(ended):
             self._finish(ended, infos)
             observation, begun = self.env.reset(options={"reset_mask": done})
             for sim in ended.tolist():
-                self.reset_infos[sim] = _info_of(begun, sim)
+                self.reset_infos[sim] = info_of(begun, sim)
             self._begin(ended, observation)
         return self._observations(), rewards, done, infos
 
@@ -168,13 +168,3 @@ class BhdSb3VecEnv(VecEnv):
         """Start the next `reset` with episode `seed`, and the environment behind it with the next one each."""
         self._first = seed
         return [None if seed is None else seed + i for i in range(self.num_envs)]
-
-
-def _info_of(info: dict[str, Any], sim: int) -> dict[str, Any]:
-    """Return what the vector environment reports of one environment, as plain values."""
-    found = {}
-    for key, values in info.items():
-        if not key.startswith("_") and info[f"_{key}"][sim]:
-            value = values[sim] if not isinstance(values, dict) else _info_of(values, sim)
-            found[key] = value.item() if isinstance(value, np.generic) else value
-    return found

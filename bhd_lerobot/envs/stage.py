@@ -1,7 +1,7 @@
 """n simulations of a robot with a task: the episodes of `rollout/episode.py`, stepped from outside."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -26,21 +26,6 @@ class ResetNeededError(BhdError, gymnasium.error.ResetNeeded):
 
 class ClosedError(BhdError, gymnasium.error.ClosedEnvironmentError):
     """An environment was used after it had been closed."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What n robots see.
-
-    Attributes:
-        state: the robots' floats, shape (n, k).
-        environment_state: what the task reports, shape (n, e), or None.
-        images: by camera name, shape (n, height, width, 3); only those of the requested simulations.
-    """
-
-    state: NDArray[np.float32]
-    environment_state: NDArray[np.float32] | None
-    images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -103,27 +88,31 @@ class Stage:
         """Leave simulations alone until their next `reset`."""
         self.simulation.stop(ids)
 
-    def observe(self, ids: NDArray[np.intp] | None = None) -> Seen:
+    def observe(self, ids: NDArray[np.intp] | None = None) -> dict[str, Any]:
         """Return what the robots see now. Call it once a frame: noisy sensors read something else each time.
 
         Args:
             ids: the simulations to observe, all that run if None; rows of others mean nothing.
+
+        Returns:
+            `agent_pos`, shape (n, k); `environment_state`, shape (n, e), if the task reports one; and `pixels` by
+            camera name, shape (n, height, width, 3), if there are cameras.
         """
         simulation, running = self.simulation, self.simulation.running
         if ids is not None:
             simulation.running = np.zeros(self.n, np.bool_)
             simulation.running[ids] = True
         try:
-            state = simulation.observe().state.astype(np.float32)
-            images = self._images(np.flatnonzero(simulation.running)) if simulation.camera_names else {}
+            seen: dict[str, Any] = {"agent_pos": simulation.observe().state.astype(np.float32)}
+            if simulation.camera_names:
+                seen["pixels"] = self._images(np.flatnonzero(simulation.running))
         finally:
             simulation.running = running
-        reported = None
         if self.task.environment_names:
             # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
             truth = simulation.truth() if self._truth is None else self._truth
-            reported = self.task.environment_state(truth).astype(np.float32)
-        return Seen(state, reported, images)
+            seen["environment_state"] = self.task.environment_state(truth).astype(np.float32)
+        return seen
 
     def step(self, actions: NDArray[np.float64]) -> Stepped:
         """Let one frame go by. Simulations whose episodes ended continue running until `rest` or `reset`.

@@ -9,7 +9,6 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs.course import STREAM, Course
-from bhd_lerobot.envs.gym_env import RENDER_MODES, batched, check_render_mode, end_info
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.spaces import ActionScale, observation_space
 from bhd_lerobot.envs.stage import EVENT_NAMES, ClosedError, ResetNeededError, Stage
@@ -17,6 +16,7 @@ from bhd_lerobot.envs.vector_member import Images, Member
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.task import Event, Split
 
+RENDER_MODES = ("rgb_array",)
 # `lerobot-eval` passes this to reset(): it wants one episode of each environment and ignores all that comes after.
 _ONE_EPISODE = "lerobot_new_rollout"
 
@@ -76,7 +76,9 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ConfigError(f"num_envs is {num_envs!r}; it must be a whole number of at least 1.")
         settings = make_settings(environment, robot, task, cameras=cameras, obs_type=obs_type)
-        self.render_mode = check_render_mode(render_mode)
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ConfigError(unknown_name("render_mode", render_mode, RENDER_MODES))
+        self.render_mode = render_mode
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.num_envs = n = num_envs
         self.stage = Stage(settings.robot, settings.task, n, threads)
@@ -161,7 +163,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         if self.autoreset_mode == AutoresetMode.DISABLED and self._over.any() and not self._one_episode:
             raise ResetNeededError(
                 f"The episodes of environments {np.flatnonzero(self._over).tolist()} are over and autoreset_mode is "
-                "DISABLED; call reset(options={'reset_mask': …}) first."
+                "DISABLED; call reset() first, of some of several with options={'reset_mask': …}."
             )
         over = np.flatnonzero(self._over)
         values = self._scale.to_robot(actions, self.stage.running)
@@ -255,7 +257,9 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
                 "event": EVENT_NAMES[self._event[sim]],
                 "episode_index": int(self._episodes[sim]),
                 "seed": int(self.stage.seeds[sim]),
-                **end_info(outcome),
+                "is_success": outcome.success,
+                "score": float(outcome.score),
+                "details": dict(outcome.details),
             }
             for sim, outcome in zip(ended.tolist(), outcomes, strict=True)
         ]
@@ -282,7 +286,9 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
             return
         everything = len(ids) == self.num_envs
         running = np.count_nonzero(self.stage.running)
-        new = batched(self.stage.observe(None if len(ids) == running else ids), self.single_observation_space)
+        seen = self.stage.observe(None if len(ids) == running else ids)
+        parts: Any = self.single_observation_space
+        new = {key: seen[key] for key in parts}
         if everything or self._observation is None:
             self._observation = new
             return
@@ -342,6 +348,16 @@ def _merged(old: Mapping[str, Any], new: Mapping[str, Any], ids: NDArray[np.intp
             merged[key] = value.copy()
             merged[key][ids] = new[key][ids]
     return merged
+
+
+def info_of(infos: dict[str, Any], sim: int) -> dict[str, Any]:
+    """Return what a vector environment reports of one environment, as plain values."""
+    found = {}
+    for key, values in infos.items():
+        if not key.startswith("_") and infos[f"_{key}"][sim]:
+            value = values[sim] if not isinstance(values, dict) else info_of(values, sim)
+            found[key] = value.item() if isinstance(value, np.generic) else value
+    return found
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -22,16 +22,6 @@ def test_no_two_seeds_lead_into_the_same_episodes() -> None:
     assert runs[3] == played(Course(), 3)
 
 
-def test_the_first_number_is_the_episode_of_the_run() -> None:
-    for split in ("train", "held_out"):
-        assert Course(7, split).advance(4) == episode_seed(7, 4, split)
-        assert Course(7, split, first=4).advance() == episode_seed(7, 4, split)
-
-
-def test_without_any_number_the_first_is_drawn() -> None:
-    assert len({Course().advance() for _ in range(8)}) == 8
-
-
 @pytest.mark.parametrize("episode", [-1, 2**63])
 def test_numbers_out_of_range_are_refused_and_change_nothing(episode: int) -> None:
     course = Course(first=5)

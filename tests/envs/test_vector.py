@@ -44,7 +44,9 @@ def play(env: VectorEnv, actions: np.ndarray, **reset: Any) -> Iterator[Any]:
     [*((name, AutoresetMode.SAME_STEP) for name in NAMES), *((name, AutoresetMode.NEXT_STEP) for name in NAMES[::3])],
 )
 def test_it_is_the_single_environments_bit_for_bit(name: str, mode: AutoresetMode) -> None:
-    ours, sync = make(name=name, autoreset_mode=mode), SyncVectorEnv(makers(name), autoreset_mode=mode)
+    ours = gymnasium.make_vec(f"bhd_lerobot/{name}", N, autoreset_mode=mode, threads=1, **short(name))
+    assert isinstance(ours, BhdVectorEnv)  # Gymnasium makes ours by itself
+    sync = SyncVectorEnv(makers(name), autoreset_mode=mode)
     actions = some_actions(name, 60, N)
     ends = 0
     for mine, theirs in zip(play(ours, actions), play(sync, actions), strict=True):
@@ -70,17 +72,6 @@ def test_images_are_those_of_the_single_environments() -> None:
     assert final["pixels"]["front"].std() > 0
     ours.close()
     sync.close()
-
-
-def test_an_environment_does_not_depend_on_its_neighbours_or_on_threads() -> None:
-    many = gymnasium.make_vec(f"bhd_lerobot/{AVOID}", 4, autoreset_mode="SameStep", threads=1, **short(AVOID))
-    assert isinstance(many, BhdVectorEnv)  # Gymnasium makes ours by itself
-    one = make(1, autoreset_mode="SameStep")
-    actions = some_actions(AVOID, 45, 4)
-    for mine, alone in zip(play(many, actions), play(one, actions[:, :1]), strict=True):
-        np.testing.assert_array_equal(mine[0]["agent_pos"][0], alone[0]["agent_pos"][0])
-        if len(mine) == 5:
-            assert [part[0] for part in mine[1:4]] == [part[0] for part in alone[1:4]]
 
 
 def test_environments_run_different_episodes_that_follow_from_the_seed() -> None:
@@ -197,8 +188,6 @@ def test_wrong_actions_and_seeds_are_named() -> None:
     wrong[1, 1] = np.nan
     with pytest.raises(ActionError, match=r"'theta.vel' of environment 1 is nan"):
         env.step(wrong)
-    with pytest.raises(ActionError, match=r"shape \(2, 2\)"):
-        env.step(np.zeros((2, 2), np.float32))
     env.close()
     env.close()
     for use in (env.reset, env.render, lambda: env.call("task"), lambda: env.step(np.zeros((N, 2), np.float32))):
