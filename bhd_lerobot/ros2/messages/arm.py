@@ -1,9 +1,7 @@
 """The messages of an arm: JointState and PoseStamped."""
 
-from collections.abc import Sequence
-from typing import Any, override
+from typing import override
 
-from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.messages.parts import Array, FieldsPart, Frames, Part, header
 from bhd_lerobot.ros2.messages.serialize import encode
 
@@ -28,13 +26,6 @@ class JointsPart(Part):
         if len(self.names) > count:
             fields["velocity"] = values[:, count:]
         return encode(self.msgtype, fields, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        if any(message.name != self.joints for message in messages):
-            raise DatasetError(f"The joints of {self.topic} are not {', '.join(self.joints)}.")
-        with_speeds = len(self.names) > len(self.joints)
-        return self.table([[*message.position, *(message.velocity if with_speeds else ())] for message in messages])
 
 
 class PosePart(FieldsPart):

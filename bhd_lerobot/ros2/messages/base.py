@@ -92,11 +92,6 @@ class OdometryPart(Part):
                 fields["pose"]["covariance"] = _pose_covariance(self.noise, pose[:, 2])
         return encode(self.msgtype, fields, len(values))
 
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        speeds, pose = odometry(messages)
-        return np.concatenate([speeds, pose], axis=1)[:, : len(self.names)]
-
     def pose(self, frames: Frames, values: Array) -> Array:
         """Return x, y and yaw at each frame, shape (n, 3)."""
         if len(self.names) > len(TWIST):
@@ -210,8 +205,3 @@ class ScanPart(Part):
             "ranges": ranges,
         }
         return encode(self.msgtype, fields, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        ranges = self.table([message.ranges for message in messages])
-        return np.where(np.isposinf(ranges), np.array([[message.range_max] for message in messages]), ranges)

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, override
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -84,16 +83,6 @@ class Part(ABC):
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
         """Return messages of values, shape (n, len(names))."""
 
-    @abstractmethod
-    def decode(self, messages: Sequence[Any]) -> Array:
-        """Return the values in deserialised messages, shape (n, len(names))."""
-
-    def table(self, rows: Sequence[Sequence[float]]) -> Array:
-        """Return rows of numbers as an array, shape (n, len(names))."""
-        if any(len(row) != len(self.names) for row in rows):
-            raise DatasetError(f"{self.topic} does not have {len(self.names)} numbers in each message.")
-        return np.array(rows, np.float64).reshape(-1, len(self.names))
-
     def __len__(self) -> int:
         """Return how many numbers it carries."""
         return len(self.names)
@@ -117,11 +106,6 @@ class FieldsPart(Part):
             Field(self.msgtype, field).put(tree, column)
         return encode(self.msgtype, tree, len(values))
 
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        fields = [Field(self.msgtype, field) for field in self.fields]
-        return self.table([[field.read(message) for field in fields] for message in messages])
-
     def rest(self) -> dict[str, Any]:
         """Return the other fields that are not zero."""
         return {}
@@ -135,10 +119,6 @@ class NumbersPart(Part):
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
         return encode(self.msgtype, {**frames.fields(), "names": list(self.names), "values": values}, len(values))
-
-    @override
-    def decode(self, messages: Sequence[Any]) -> Array:
-        return self.table([message.values for message in messages])
 
 
 class IntegersPart(NumbersPart):

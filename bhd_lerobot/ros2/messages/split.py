@@ -1,7 +1,7 @@
 """Which topics carry the numbers of a feature: the names decide."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from bhd_lerobot.bodies.body import LidarSpec
@@ -20,15 +20,7 @@ from bhd_lerobot.ros2.messages.base import (
     ScanPart,
     TwistPart,
 )
-from bhd_lerobot.ros2.messages.parts import IntegersPart, NumbersPart, Part, own_topic
-
-PARTS: Mapping[str, type[Part]] = {
-    kind.__name__: kind
-    for kind in (
-        TwistPart, BareTwistPart, OdometryPart, GyroPart, ScanPart, JointsPart, PosePart, NumbersPart, IntegersPart,
-    )
-}  # fmt: skip
-"""What a part can be, by its name in the bag."""
+from bhd_lerobot.ros2.messages.parts import NumbersPart, Part, own_topic
 
 _SCAN = re.compile(r"scan_\d+\.pos")
 _OBSERVED, _ASKED, _APPLIED = keys.OBSERVATION_STATE, keys.ACTION, keys.APPLIED_ACTION

@@ -12,12 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.storage.atomic import UNFINISHED_VERSION
-from bhd_lerobot.ros2.bag.exporter.episode import ExportOptions
-from bhd_lerobot.ros2.bag.exporter.export import export_bags
-from bhd_lerobot.ros2.messages.views import RobotView
 from tests.datasets import support
 from tests.datasets.edit_support import record
 from tests.datasets.foreign import edit_json
+from tests.ros2.bag.support import drive, write
 
 NOTES = "notes.txt"  # what somebody else put there; it must stay
 
@@ -111,8 +109,8 @@ def _into(folder: Path) -> None:
     (folder / "parts" / NOTES).write_text("mine", encoding="utf-8")
 
 
-def _bags(folder: Path) -> None:
-    export_bags(record(folder / "d", [0, 1]), folder / "bags", view=RobotView(), options=ExportOptions())
+def _bag(folder: Path) -> None:
+    write(folder / "bag", drive(seconds=2))
 
 
 def _afar(folder: Path) -> None:
@@ -208,8 +206,11 @@ OPERATIONS = (
     ),
     Operation(
         "import",
-        _bags,
-        lambda folder: ["import", str(folder / "bags"), "--repo_id=t/t", "--root", str(folder / "new")],
+        _bag,
+        lambda folder: [
+            *("import", str(folder / "bag"), "--task=Drive.", "--beams=36"),
+            *("--repo_id=t/t", "--root", str(folder / "new")),
+        ],
         "new",
         **EXISTS,
     ),

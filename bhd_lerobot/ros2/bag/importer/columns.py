@@ -13,7 +13,7 @@ from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, newest, newest_before
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track
 from bhd_lerobot.ros2.messages.base import ODOMETRY, TWIST
-from bhd_lerobot.tasks.task import OUTCOMES, Event
+from bhd_lerobot.tasks.task import Event
 
 MOST_UNEXPLAINED = 0.1
 """Share of the frames in which a robot may move without a command: beyond it, what drove it is another one."""
@@ -22,7 +22,7 @@ _MOVES = 0.01
 
 
 def frame_columns(
-    options: ImportOptions, tracks: Sequence[Track], times: Times, ages: Times, outcome: str | None
+    options: ImportOptions, tracks: Sequence[Track], times: Times, ages: Times
 ) -> dict[str, NDArray[Any]]:
     """Return the columns of an episode.
 
@@ -37,10 +37,9 @@ def frame_columns(
     applied = np.clip(commands, -limits, limits)
     over = (applied != commands).any(axis=1)
     done = np.arange(n) == n - 1
-    ended = Event[outcome.upper()] if outcome in OUTCOMES else Event.NOTHING
+    ended = Event.NOTHING if options.outcome is None else Event[options.outcome.upper()]
     vectors = {
         keys.OBSERVATION_STATE: _state(options, tracks, times),
-        keys.ENVIRONMENT_STATE: _vector(options.environment_names, keys.ENVIRONMENT_STATE, tracks, times),
         keys.ACTION: commands,
         keys.APPLIED_ACTION: applied,
     }
@@ -101,7 +100,7 @@ def unexplained_frames(
         times: of the frames [ns], shape (n,).
     """
     commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
-    observed = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    observed = _vector(options.observation_names, tracks, times)
     moves, driven = _moves(options.observation_names, observed), _moves(options.action_names, commands)
     return int((moves & (age < 0)).sum()), int((~moves & driven).sum())
 
@@ -152,7 +151,7 @@ def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> 
 
 
 def _state(options: ImportOptions, tracks: Sequence[Track], times: Times) -> Array:
-    state = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    state = _vector(options.observation_names, tracks, times)
     names = list(options.observation_names)
     if options.pose:
         pose = [names.index(name) for name in ODOMETRY]
@@ -164,13 +163,13 @@ def _state(options: ImportOptions, tracks: Sequence[Track], times: Times) -> Arr
     return state
 
 
-def _vector(names: tuple[str, ...], feature: str, tracks: Sequence[Track], at: Times) -> Array:
-    """Return what the newest messages at some times say of a feature, shape (n, len(names))."""
+def _vector(names: tuple[str, ...], tracks: Sequence[Track], at: Times) -> Array:
+    """Return what the newest messages of the sensors at some times say, shape (n, len(names))."""
     columns: dict[str, Array] = {}
     for track in tracks:
-        if track.source.feature == feature:
+        if track.source.feature == keys.OBSERVATION_STATE:
             columns |= dict(zip(track.names, track.values[newest(track.times, at)].T, strict=True))
-    return np.stack([columns[name] for name in names], axis=1) if names else np.zeros((len(at), 0))
+    return np.stack([columns[name] for name in names], axis=1)
 
 
 def _since_start(pose: Array) -> Array:

@@ -23,9 +23,8 @@ from bhd_lerobot.ros2.bag.importer.columns import (
     unanswered,
     unexplained_frames,
 )
-from bhd_lerobot.ros2.bag.importer.exported import ExportedEpisode
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids, recorded_grid
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
 from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.ros2.bag.importer.video import CameraImages
@@ -55,21 +54,14 @@ class ImportReport:
     notes: list[str] = field(default_factory=list)
 
 
-def import_bags(
-    bags: Sequence[Bag],
-    root: Path | str | None,
-    repo_id: str,
-    options: ImportOptions,
-    exported: Sequence[Sequence[ExportedEpisode]] = (),
-) -> ImportReport:
-    """Make a dataset of bags of a robot, or of exported ones; the whole of it, or nothing, also after a kill.
+def import_bags(bags: Sequence[Bag], root: Path | str | None, repo_id: str, options: ImportOptions) -> ImportReport:
+    """Make a dataset of bags of a robot; the whole of it, or nothing, also after a kill.
 
     Args:
         bags: in order; each gives one episode, or several where it has gaps.
         root: where to put it; LeRobot's default place if None.
         repo_id: its name.
         options: what becomes of them.
-        exported: the episodes that each bag describes, if `bhd-data export` wrote it.
 
     Raises:
         DatasetError: a bag does not have what is needed.
@@ -78,7 +70,7 @@ def import_bags(
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
     names = options.observation_names
-    if not exported and {*TWIST} <= {*options.action_names} and not {*TWIST} & {*names}:
+    if {*TWIST} <= {*options.action_names} and not {*TWIST} & {*names}:
         report.notes.append(
             f"no odometry is read: the state is {names[0]} to {names[-1]}, without {' and '.join(TWIST)}. Whether the "
             "robot obeyed is not known, and a policy that learns from it needs a robot that observes the same"
@@ -88,8 +80,8 @@ def import_bags(
         complete_or_not(report.root, "--root", "import bags", "No dataset was made.") as folder,
         _recording(folder, repo_id, options) as recording,
     ):
-        for place, bag in enumerate(bags):
-            robot_bag = _RobotBag(bag, options, recording, exported[place] if exported else ())
+        for bag in bags:
+            robot_bag = _RobotBag(bag, options, recording)
             episodes = list(robot_bag.episodes())
             robot_bag.check_commands(episodes)
             for episode in episodes:
@@ -152,9 +144,8 @@ class _Recording:
         if self._recorder is None:
             options = self._options
             images = {camera.key.removeprefix(f"{keys.OBSERVATION_IMAGES}."): camera.shape() for camera in cameras}
-            features = keys.dataset_features(
-                options.observation_names, options.action_names, images, {}, options.environment_names
-            )  # the state of a real robot's physics is not known
+            # The state of a real robot's physics is not known.
+            features = keys.dataset_features(options.observation_names, options.action_names, images, {})
             self._recorder = DatasetRecorder.create(
                 self._repo_id,
                 options.fps,
@@ -183,17 +174,14 @@ class _Episode:
 
     grid: Grid
     tracks: Sequence[Track]
-    exported: ExportedEpisode | None
 
 
 class _RobotBag:
     """One bag, all of it but images in memory."""
 
-    def __init__(
-        self, bag: Bag, options: ImportOptions, recording: _Recording, exported: Sequence[ExportedEpisode]
-    ) -> None:
+    def __init__(self, bag: Bag, options: ImportOptions, recording: _Recording) -> None:
         self.notes: list[str] = []
-        self._bag, self._options, self._recording, self._exported = bag, options, recording, exported
+        self._bag, self._options, self._recording = bag, options, recording
         self._tracks = read_tracks(bag, options, self.notes)
         self._cameras = [CameraImages(bag, track, self.notes) for track in self._tracks if not track.names]
         self._begin = min(int(track.times.min()) for track in self._tracks)
@@ -217,7 +205,6 @@ class _RobotBag:
         options = self._options
         parts = segments(
             self._tracks,
-            [episode.place for episode in self._exported],
             stamps=options.stamps,
             max_speed=options.max_speed if options.pose else None,
             max_gap_s=options.max_gap_s,
@@ -227,31 +214,23 @@ class _RobotBag:
         for part in parts:
             # The pose began anew, not the clock: a command from before is still in force.
             begin = begin if part.why == "reset" else part.first
-            begun = [episode for episode in self._exported if episode.place <= part.first] or self._exported[:1]
             of_commands = part._replace(first=begin)
             tracks = [track.part((of_commands if track.is_action else part).mask(track)) for track in self._tracks]
             sensors = [track for track in tracks if not track.is_action]
             self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
             times = [track.times for track in sensors]
-            recorded = (
-                recorded_grid(times, begun[-1].frames, part.why) if begun and begun[-1].fps == options.fps else None
-            )
-            for found in (
-                [recorded]
-                if recorded
-                else grids(
-                    times,
-                    options.fps,
-                    max_age_ns=round(options.max_age_s * NANO),
-                    max_gap_ns=round(options.max_gap_s * NANO),
-                    why=part.why,
-                )
+            for found in grids(
+                times,
+                options.fps,
+                max_age_ns=round(options.max_age_s * NANO),
+                max_gap_ns=round(options.max_gap_s * NANO),
+                why=part.why,
             ):
                 if (grid := self._answered(found, tracks)) is None:
                     continue
                 lasts = (len(grid.times) - 1) / options.fps
                 if lasts >= options.min_episode_s:
-                    yield _Episode(grid, tracks, begun[-1] if begun else None)
+                    yield _Episode(grid, tracks)
                 else:
                     self.notes.append(
                         f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
@@ -306,12 +285,10 @@ class _RobotBag:
             for camera in self._cameras:
                 shown = camera.write(camera.of(episode.tracks), times, writer)
                 ages = np.maximum(ages, times - shown)
-            task, metadata = self._described(episode)
-            columns = frame_columns(self._options, episode.tracks, times, ages, metadata.get("outcome"))
-            columns[keys.TIME] = (times - self._begin_of(episode)) / NANO
+            columns = frame_columns(self._options, episode.tracks, times, ages)
             self._recording.refuse_again(self._bag.path, int(times[0]), columns)
             writer.set_columns(columns)
-            recorder.save(writer, task=task, metadata={**metadata, "source": self._source(episode, columns)})
+            recorder.save(writer, task=self._options.task, metadata=self._metadata(episode, columns))
         except BaseException:
             writer.discard()
             raise
@@ -333,33 +310,10 @@ class _RobotBag:
             )
         return replace(episode, grid=grid.since(blind))
 
-    def _begin_of(self, episode: _Episode) -> int:
-        """Return when an episode began [ns]: with its first frame, or as its export states, shortly before."""
-        first, exported = int(episode.grid.times[0]), episode.exported
-        start = first if exported is None else exported.start[self._options.stamps == "header"]
-        return start if 0 <= first - start < NANO // self._options.fps else first
-
-    def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
-        """Return the task of an episode, and its metadata: those of the user have precedence over those of the bag."""
-        options, exported = self._options, episode.exported
-        given: dict[str, Any] = {}
-        if options.outcome is not None:
-            given = {"outcome": options.outcome, "success": options.outcome == Event.SUCCESS.cause}
-        if exported is None:
-            assert options.task is not None
-            return options.task, given
-        metadata = {**exported.metadata}
-        end = exported.start[options.stamps == "header"] + exported.duration
-        if int(episode.grid.times[-1]) + 2 * NANO // options.fps < end and metadata.get("outcome"):
-            self.notes.append(
-                f"{self._after_start(episode.grid)}: the episode ends before the one that was exported, so that its "
-                f"outcome, {metadata['outcome']}, is left out"
-            )
-            metadata |= {"outcome": ""} | ({"success": False} if "success" in metadata else {})
-        return options.task or exported.task, metadata | given
-
-    def _source(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> str:
-        """Return where an episode is from, JSON."""
+    def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        """Return how an episode ended, if that is known, and where it is from."""
+        outcome = self._options.outcome
+        ended = {} if outcome is None else {"outcome": outcome, "success": outcome == Event.SUCCESS.cause}
         source = {
             "bag": self._bag.path.name,
             "start_ns": int(episode.grid.times[0]),
@@ -367,7 +321,7 @@ class _RobotBag:
             "late_frames": int(columns[keys.LATE].sum()),
             "problems": self._bag.problems,
         }
-        return json.dumps(source)
+        return {**ended, "source": json.dumps(source)}
 
     def _after_start(self, grid: Grid) -> str:
         return f"{seconds(int(grid.times[0]) - self._begin)} after the start"

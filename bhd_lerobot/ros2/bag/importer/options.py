@@ -15,9 +15,9 @@ class ImportOptions:
 
     Attributes:
         robot_type: of the dataset.
-        task: the instruction; None if exported bags have one for each episode.
+        task: the instruction.
         fps: frames a second.
-        observation_names, action_names, environment_names: of the dataset's numbers, in order.
+        observation_names, action_names: of the dataset's numbers, in order.
         sources: what is read of a bag.
         stamps: whose time counts: ``"auto"``, ``"header"`` or ``"receive"``.
         pose: whether ``x.pos``, ``y.pos`` and ``theta.pos`` are those since the episode's start.
@@ -32,7 +32,7 @@ class ImportOptions:
     """
 
     robot_type: str
-    task: str | None
+    task: str
     fps: int
     observation_names: tuple[str, ...]
     action_names: tuple[str, ...]
@@ -42,7 +42,6 @@ class ImportOptions:
     max_gap_s: float
     command_timeout_s: float
     min_episode_s: float
-    environment_names: tuple[str, ...] = ()
     stamps: str = "receive"
     pose: bool = False
     outcome: str | None = None
@@ -54,5 +53,5 @@ class ImportOptions:
         plain = ("stamps", "max_age_s", "max_gap_s", "min_episode_s")
         values = {name: getattr(self, name) for name in plain} | dict(self.given)
         timeout = None if np.isinf(self.command_timeout_s) else self.command_timeout_s
-        topics = {source.key: source.topic for source in self.sources}
+        topics = {f"{source.feature}{source.topic}": source.topic for source in self.sources}
         return {"imported": {"format": "rosbag2", "topics": topics, "command_timeout_s": timeout, **values}}

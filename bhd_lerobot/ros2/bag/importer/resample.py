@@ -119,14 +119,6 @@ def frame_times(first: int, count: int, fps: float) -> Times:
     return first + np.round(np.arange(count) * (NANO / fps)).astype(np.int64)
 
 
-def recorded_grid(sensors: Sequence[Times], frames: int, why: str) -> Grid | None:
-    """Return the frames as they were recorded: one sensor has a message for each; None if none has."""
-    for at in sensors:
-        if len(at) == frames and min(int(times[0]) for times in sensors if len(times)) >= int(at[0]) - ROUNDING_NS:
-            return Grid(at, np.stack([np.maximum(at - times[newest(times, at)], 0) for times in sensors]), why)
-    return None
-
-
 def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: int, why: str = "start") -> list[Grid]:
     """Return the frames of the episodes that some sensors allow.
 

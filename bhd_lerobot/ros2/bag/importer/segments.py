@@ -1,6 +1,6 @@
 """Where a bag's recording breaks off and begins anew: silences, clocks that go back, drivers that restart."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -42,7 +42,6 @@ class Segment(NamedTuple):
 
 def segments(
     tracks: Sequence[Track],
-    starts: Iterable[int],
     *,
     stamps: str,
     max_speed: tuple[float, ...] | None,
@@ -58,8 +57,7 @@ def segments(
     jumps = clock_jumps([track.times for track in tracks], [track.order for track in tracks], step)
     if len(jumps):
         notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
-    found = _cut([Segment(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(starts, "start"))
-    found = _cut(found, dict.fromkeys(jumps.tolist(), "clock"))
+    found = _cut([Segment(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(jumps.tolist(), "clock"))
     for track in tracks:
         if not track.is_action and track.stamps is not None and track.stamps is not track.times:
             found = _cut(found, dict.fromkeys(_restarts(track, track.stamps, found, notes), "clock"))

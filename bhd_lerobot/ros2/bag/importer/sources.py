@@ -17,7 +17,7 @@ from bhd_lerobot.ros2.bag.storage.read import Messages
 from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
 from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, topics_of
-from bhd_lerobot.ros2.messages.parts import Part, header_stamps
+from bhd_lerobot.ros2.messages.parts import header_stamps
 from bhd_lerobot.ros2.messages.scan import ScanReader, Static
 
 Array = NDArray[np.float64]
@@ -50,27 +50,23 @@ class Source:
     """What one topic carries of the dataset.
 
     Attributes:
-        key: what it is called where the dataset says how it was made.
         topic: its name.
-        feature: of the dataset: the state, the environment's state, the action, or the images of a camera.
+        feature: of the dataset: the state, the action, or the images of a camera.
         names: of its numbers in the feature; none of images.
         readers: type that the topic's messages may have -> what reads them.
         meaning: what is read from it, for messages.
         option: what names the topic.
-        remedy: if it is missing, instead of the option.
         is_turned: whether ``/tf_static`` states how the sensor is mounted.
         angles: those of the names that are yaws, which count on beyond half a turn, and a whole turn of each.
         size: height and width that images must have [px]; 0 for any.
     """
 
-    key: str
     topic: str
     feature: str
     names: tuple[str, ...]
     readers: Mapping[str, Reader]
     meaning: str
     option: str = "--map"
-    remedy: str = ""
     is_turned: bool = False
     angles: Mapping[str, float] = field(default_factory=dict)
     size: tuple[int, int] = (0, 0)
@@ -104,45 +100,20 @@ def mapped_sources(
             names = tuple(list(numbers)[column] for column in topic.columns)
             is_observed = feature == keys.OBSERVATION_STATE
             angles = {names[column]: turn for column, turn in topic.turns.items() if is_observed}
-            key, readers = f"{feature}{topic.topic}", {topic.msgtype: partial(_fields, topic, names, angles)}
+            readers = {topic.msgtype: partial(_fields, topic, names, angles)}
             meaning = f"{place}.{names[0]}" + f" and {len(names) - 1} more" * (len(names) > 1)
-            found.append(Source(key, topic.topic, feature, names, readers, meaning, angles=angles))
+            found.append(Source(topic.topic, feature, names, readers, meaning, angles=angles))
         for name, one in section.items():
             if one.beams:
                 lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
                 topic_name, names = "/" + one.topic.lstrip("/"), one.names(name)
                 reader = partial(_scans, ScanReader(topic_name, lidar, one.beams, scan_frame, scan_yaw))
-                key, meaning = f"{feature}{topic_name}", f"{place}.{name}"
-                found.append(Source(key, topic_name, feature, names, {SCAN: reader}, meaning, is_turned=True))
+                found.append(Source(topic_name, feature, names, {SCAN: reader}, f"{place}.{name}", is_turned=True))
     for name, camera in mapping.images.items():
         feature = f"{keys.OBSERVATION_IMAGES}.{name}"
         topic_name, size = "/" + camera.topic.lstrip("/"), (camera.height, camera.width)
         of_images: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
-        found.append(Source(feature, topic_name, feature, (), of_images, f"images.{name}", size=size))
-    return found
-
-
-def exported_sources(parts: Mapping[str, Sequence[Part]], cameras: Mapping[str, str]) -> list[Source]:
-    """Return what is read of an exported bag.
-
-    Args:
-        parts: of its vectors, by feature.
-        cameras: name -> topic.
-    """
-    remedy = "It is listed in /bhd/episode. Export the dataset again."
-    found = [
-        Source(
-            f"{feature}{part.topic}", part.topic, feature, part.names, {part.msgtype: partial(_part, part)}, feature,
-            "/bhd/episode", remedy,
-            angles=dict.fromkeys(part.names[4:], 2 * np.pi) if isinstance(part, OdometryPart) else {},
-        )
-        for feature, several in parts.items()
-        for part in several
-    ]  # fmt: skip
-    for name, topic in cameras.items():
-        feature = f"{keys.OBSERVATION_IMAGES}.{name}"
-        readers: dict[str, Reader] = dict.fromkeys(_IMAGES, _places)
-        found.append(Source(f"camera/{name}", topic, feature, (), readers, feature, "/bhd/episode", remedy))
+        found.append(Source(topic_name, feature, (), of_images, f"images.{name}", size=size))
     return found
 
 
@@ -161,33 +132,20 @@ def base_sources(
     bare_readers = {one.feature: one.readers for one in mapped_sources(bare) if one.is_action}
     for source in mapped_sources(mapping, scan_frame, scan_yaw):
         (first, *_) = source.readers
-        role = "cmd" if source.is_action else _ROLES[first]
         readers = {**source.readers, **bare_readers.get(source.feature, {})}
-        if role == "odom":
+        if first == OdometryPart.msgtype:
             readers = {first: partial(_odometry, readers[first], odom_frame)}
-        key = f"camera/{source.feature.rpartition('.')[2]}" if role == "camera" else role
-        found.append(replace(source, key=key, readers=readers, meaning=_MEANING[role], option=f"--{role}"))
+        found.append(replace(source, readers=readers, option="--cmd" if source.is_action else _OPTIONS[first]))
     return found
 
 
 _IMAGES = (IMAGE, COMPRESSED)
-_ROLES = {SCAN: "scan", OdometryPart.msgtype: "odom", GyroPart.msgtype: "imu", IMAGE: "camera"}
-_MEANING = {
-    "scan": "the scan",
-    "odom": "the robot's speed",
-    "cmd": "the action",
-    "imu": "the yaw rate of the gyroscope",
-    "camera": "the image",
-}
+_OPTIONS = {SCAN: "--scan", OdometryPart.msgtype: "--odom", GyroPart.msgtype: "--imu", IMAGE: "--camera"}
 
 
 def _places(reading: Reading) -> Array:
     """Return the places of images in the bag."""
     return reading.messages.order.astype(np.float64)[:, None]
-
-
-def _part(part: Part, reading: Reading) -> Array:
-    return part.decode(reading.decoded)
 
 
 def _fields(fields: TopicFields, names: Sequence[str], angles: Mapping[str, float], reading: Reading) -> Array:

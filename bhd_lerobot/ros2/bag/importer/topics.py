@@ -1,42 +1,16 @@
 """Which topics of a bag are read for what, and who published them."""
 
-import contextlib
 import difflib
 from collections.abc import Sequence
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.sources import Source
 from bhd_lerobot.ros2.bag.storage.read import Bag, Topic
-from bhd_lerobot.ros2.messages.base import OdometryPart, ScanPart
-from bhd_lerobot.ros2.messages.serialize import decode
-from bhd_lerobot.ros2.messages.views import JOINT_STATE
 
-_BASE = (ScanPart.msgtype, OdometryPart.msgtype)
-_NAMED = 6  # joints
-
-
-def _refuse_arm(bag: Bag) -> None:
-    """Refuse a bag of an arm: it has joints that are no wheels, no scans and no odometry."""
-    if any(topic.msgtype in _BASE and topic.count for topic in bag.topics.values()):
-        return
-    for topic in bag.topics.values():
-        joints = _joints(bag, topic.name) if topic.msgtype == JOINT_STATE and topic.count else []
-        if joints and not any("wheel" in joint for joint in joints):
-            more = ", …" if len(joints) > _NAMED else ""
-            raise DatasetError(
-                f"{bag.path} seems to be of an arm: {topic.name} has the joints {', '.join(joints[:_NAMED])}{more}, "
-                "and there are no scans and no odometry. Without --map, bhd-data import is for bags of a TurtleBot3: "
-                "it needs scans, odometry and speed commands. --map=FILE.yaml names the fields of any other robot, "
-                "--map=ur5 those of a UR5 as bhd-data export writes them."
-            )
-
-
-def _joints(bag: Bag, topic: str) -> list[str]:
-    """Return the joints of the first message of a topic; none if that cannot be read."""
-    with contextlib.suppress(DatasetError):
-        for *_, payload in bag.messages((topic,)):
-            return list(decode(JOINT_STATE, payload).name)
-    return []
+_OTHERS = (
+    " Without --map, bhd-data import is for bags of a TurtleBot3. --map=FILE.yaml names the fields of any other robot, "
+    "--map=ur5 those of a UR5 as bhd-data export writes them."
+)
 
 
 def wanted_topics(bag: Bag, sources: Sequence[Source]) -> list[tuple[Source, Topic]]:
@@ -48,10 +22,9 @@ def wanted_topics(bag: Bag, sources: Sequence[Source]) -> list[tuple[Source, Top
     found = [(one, bag.topics.get(one.topic) or bag.topics.get(other_form(one.topic))) for one in sources]
     lacking = [_lacking(bag, source, topic) for source, topic in found if not topic or not topic.count]
     if lacking:
-        if any(source.option == "--scan" for source in sources):
-            _refuse_arm(bag)
+        others = _OTHERS * any(source.option == "--scan" for source in sources)
         there = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in bag.topics.values()) or "none"
-        raise DatasetError(f"{bag.path} has {' It has '.join(lacking)} The bag has: {there}.{_damage(bag)}")
+        raise DatasetError(f"{bag.path} has {' It has '.join(lacking)} The bag has: {there}.{others}{_damage(bag)}")
     return [(source, _checked(bag, source, topic)) for source, topic in found if topic]
 
 
@@ -63,9 +36,7 @@ def other_form(name: str) -> str:
 def _lacking(bag: Bag, source: Source, topic: Topic | None) -> str:
     """Return the end of a sentence: which topic there is not, and what may be read in its place."""
     fitting = [one.name for one in bag.topics.values() if one.msgtype in source.readers and one.count]
-    if source.remedy:
-        remedy = source.remedy
-    elif fitting:
+    if fitting:
         near = difflib.get_close_matches(source.topic, fitting, n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
         remedy = f"{hint}Name another one with {source.option}. Of the right type: {', '.join(fitting)}."
@@ -81,7 +52,7 @@ def _checked(bag: Bag, source: Source, topic: Topic) -> Topic:
     if topic.msgtype not in source.readers:
         raise DatasetError(
             f"{topic.name} in {bag.path} is of type {topic.msgtype}; valid for {source.option}: "
-            f"{', '.join(source.readers)}. {source.remedy}".rstrip()
+            f"{', '.join(source.readers)}."
         )
     if topic.others:
         raise DatasetError(

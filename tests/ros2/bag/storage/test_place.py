@@ -10,14 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import DatasetExistsError
-from bhd_lerobot.ros2.bag.exporter.episode import ExportOptions
-from bhd_lerobot.ros2.bag.exporter.export import export_bags
 from bhd_lerobot.ros2.bag.storage.place import complete_or_not
-from bhd_lerobot.ros2.messages.views import RobotView
-from tests.datasets import support
+from tests.cli.data.import_support import run
+from tests.ros2.bag.support import drive, write
 
 
 @pytest.mark.law
@@ -76,9 +73,7 @@ def test_a_full_disk_leaves_no_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The recorder's message about saved episodes, and `repair`, does not hold for an import."""
-    with support.create(tmp_path / "d") as recorder:
-        support.record(recorder)
-    export_bags(tmp_path / "d", tmp_path / "bags", view=RobotView(), options=ExportOptions())
+    write(tmp_path / "bag", drive(seconds=2))
     move = Disk.move
     for moves in (0, 1, 6):
         count = itertools.count()
@@ -89,9 +84,9 @@ def test_a_full_disk_leaves_no_dataset(
             move(disk, source, target)
 
         monkeypatch.setattr(Disk, "move", refuse)
-        assert main.main(["import", str(tmp_path / "bags"), "--repo_id=t/t", f"--root={tmp_path / 'new'}"]) == 2
+        assert run(tmp_path / "bag", tmp_path / "new", "--beams=36") == 2
         error = " ".join(capsys.readouterr().err.split())
         assert "No space left" in error
         assert "No dataset was made." in error
         assert "intact" not in error
-        assert sorted(os.listdir(tmp_path)) == ["bags", "d"]
+        assert os.listdir(tmp_path) == ["bag"]
