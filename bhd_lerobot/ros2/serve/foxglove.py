@@ -214,19 +214,16 @@ class MirroredNode(Node):
         self._server = server
 
     @override
-    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt") -> Publisher:
+    def publisher(self, topic: str, msgtype: str, qos: Qos | None = None) -> Publisher:
         qos, name = qos or Qos(), self.full_name(topic)
         channel = self._server.channel(name, msgtype)
-        publisher = MirroredPublisher(*self._writer(f"{prefix}{name}", msgtype, qos), topic, msgtype, channel)
+        publisher = MirroredPublisher(*self._writer(f"rt{name}", msgtype, qos), topic, msgtype, channel)
         if qos.transient_local:
             self._server.keep_last(name, publisher)
         return publisher
 
     @override
-    def subscription(
-        self, topic: str, msgtype: str, qos: Qos | None = None, prefix: str = "rt", *, wakes: bool = True
-    ) -> Subscription:
-        name = self.full_name(topic)
-        qos = qos or Qos()
-        reader = self._reader(f"{prefix}{name}", msgtype, qos, wakes=wakes)
+    def subscription(self, topic: str, msgtype: str, qos: Qos | None = None) -> Subscription:
+        qos, name = qos or Qos(), self.full_name(topic)
+        reader = self._reader(f"rt{name}", msgtype, qos)
         return MirroredSubscription(reader, topic, msgtype, self._server.inbox(name, msgtype, qos.depth))

@@ -1,19 +1,22 @@
 import json
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
-from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
-from bhd_lerobot.ros2.live.clients import ActionClient, GoalStatus, ServiceClient
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.ros2.live.clients import ServiceClient
 from bhd_lerobot.ros2.live.network import NetworkConfig
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.definitions import DEFINITIONS, find_type, register_types
 from bhd_lerobot.ros2.messages.types import type_store
+from tests.docs.support import load_script
 from tests.ros2.peer_env import Peer, environment, free_domain
 
 SET_BOOL, TRIGGER, FIBONACCI = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger", "test_msgs/action/Fibonacci"
+example = load_script("send_action", "examples")
 NUMBERS = [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89]
 
 
@@ -24,14 +27,14 @@ def types() -> None:
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[int]:
-    """The domain of the servers of most tests, beside which other clients send goals."""
+    """The domain of the servers of most tests."""
     with free_domain() as domain:
         yield domain
 
 
 @pytest.fixture(scope="module")
 def servers(shared: int) -> Iterator[Peer]:
-    with Peer("servers.py", "--others=0.2", domain=shared) as peer:
+    with Peer("servers.py", domain=shared) as peer:
         peer.wait_event("ready")
         yield peer
 
@@ -84,17 +87,13 @@ def test_every_request_to_a_service_has_its_reply_and_is_carried_out_once(shared
 def test_what_cannot_be_called_is_named(node: Node, servers: Peer) -> None:
     before = len(servers.events("motor_power"))
     ServiceClient(node, "/motor_power", SET_BOOL).wait_for_server(60)
-    ActionClient(node, "/fibonacci", FIBONACCI).send_goal({"order": 1}, timeout_s=60)
-    goals = ActionClient(node, "/fibonaci", FIBONACCI)
     for call, kind, said in (
         (lambda: ServiceClient(node, "/motor_powr", SET_BOOL).call(timeout_s=0.1), RealtimeError, "'/motor_power'?"),
-        (lambda: ServiceClient(node, "/x", SET_BOOL).call(timeout_s=0.1), RealtimeError, "Valid: /motor_power, /reset"),
-        (lambda: goals.send_goal({"order": 1}, timeout_s=0.1), RealtimeError, "'/fibonacci'?"),
+        (lambda: ServiceClient(node, "/x", SET_BOOL).call(timeout_s=0.1), RealtimeError, "/motor_power, /reset"),
         (lambda: ServiceClient(node, "/reset_odometry", SET_BOOL).call(), ConfigError, f"{TRIGGER}; the client is of"),
         (lambda: ServiceClient(node, "/motor_power", "std_srvs/srv/SetBol"), ConfigError, "'std_srvs/srv/SetBool'"),
         (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"dat": True}), ConfigError, "'data'?"),
         (lambda: ServiceClient(node, "/motor_power", SET_BOOL).call({"data": 1}), ConfigError, "is 1; it is true or"),
-        (lambda: ActionClient(node, "/fibonacci", FIBONACCI).send_goal({"order": 2**31}), ConfigError, "2147483647"),
     ):
         with pytest.raises(kind) as found:
             call()
@@ -112,45 +111,33 @@ def test_no_reply_in_time_is_an_error_and_an_idempotent_request_is_sent_again(do
         peer.wait(lambda _: len(peer.events("motor_power")) >= 3, "three requests")
 
 
-@pytest.mark.usefixtures("servers")
-def test_a_goal_has_its_own_feedback_and_result_beside_other_clients(node: Node) -> None:
-    client = ActionClient(node, "/fibonacci", FIBONACCI)
-    for order in range(6, 13):
-        feedback: list = []
-        goal = client.send_goal({"order": order}, feedback.append, 60)
-        ended = goal.result(60)
-        assert ended.status == GoalStatus.SUCCEEDED
-        np.testing.assert_array_equal(ended.result.sequence, NUMBERS[:order])
-        for one in feedback:
-            np.testing.assert_array_equal(one.sequence, NUMBERS[: len(one.sequence)])
-        assert len(feedback) > 1
-    both = [client.send_goal({"order": order}) for order in (8, 9)]
-    assert [len(goal.result(60).result.sequence) for goal in reversed(both)] == [9, 8]
+def test_the_example_follows_a_goal_to_its_end(node: Node, servers: Peer, capsys: pytest.CaptureFixture[str]) -> None:
+    def send(order: int, on_feedback: Callable[[Any], None] = lambda _: None) -> Any:
+        return example.send_goal(node, "/fibonacci", FIBONACCI, {"order": order}, on_feedback, timeout_s=60)
 
+    def interrupt(_: Any) -> None:
+        interrupts.append(1)
+        if len(interrupts) == 1:
+            raise KeyboardInterrupt
 
-def test_a_goal_is_refused_cancelled_or_aborted(node: Node, servers: Peer) -> None:
-    client = ActionClient(node, "/fibonacci", FIBONACCI)
-    with pytest.raises(CommandRefusedError, match="refuses the goal"):
-        client.send_goal({"order": 0}, timeout_s=60)
-    goal = client.send_goal({"order": 50})
-    with pytest.raises(RealtimeError, match=r"has not ended the goal within 0\.05 s"):
-        goal.result(0.05)
-    assert goal.cancel(60)
-    assert goal.result(60).status == GoalStatus.CANCELED
-    assert client.send_goal({"order": 120}).result(60).status == GoalStatus.ABORTED
-    goal = client.send_goal({"order": 60})
-    with pytest.raises(CommandRefusedError, match="refuses to cancel"):
-        goal.cancel(60)
-    assert goal.result(60).status == GoalStatus.SUCCEEDED
-    assert not goal.cancel()
+    feedback: list[Any] = []
+    ended, result = send(12, feedback.append)
+    assert (ended, result.sequence.tolist()) == ("succeeded", NUMBERS)
+    assert len(feedback) > 1
+    for one in feedback:
+        np.testing.assert_array_equal(one.sequence, NUMBERS[: len(one.sequence)])
+    assert send(0) == ("refused", None)
+    assert send(120)[0] == "aborted"
+    for order, how, said in ((50, "canceled", ""), (60, "succeeded", "refuses to cancel")):
+        interrupts: list[int] = []
+        assert send(order, interrupt)[0] == how
+        assert said in capsys.readouterr().out
     assert [line["succeeded"] for line in servers.events("ended") if line["order"] >= 50] == [False, False, True]
 
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_server_that_leaves_during_a_goal_is_an_error(domain: int, other: Node, how: signal.Signals) -> None:
-    with Peer("servers.py", "--step", 0.5, domain=domain) as peer:
-        client = ActionClient(other, "/fibonacci", FIBONACCI)
-        goal = client.send_goal({"order": 40}, lambda _: peer.signal(how), 60)
-        with pytest.raises(RealtimeError, match="/fibonacci has left the network before the goal ended"):
-            goal.result(120)
+    left = pytest.raises(RealtimeError, match="/fibonacci has left the network before the goal ended")
+    with Peer("servers.py", "--step", 0.5, domain=domain) as peer, left:
+        example.send_goal(other, "/fibonacci", FIBONACCI, {"order": 40}, lambda _: peer.signal(how), timeout_s=60)

@@ -2,7 +2,7 @@
 
 /motor_power (SetBool) keeps what it is given; /reset_odometry (Trigger) counts its calls; --busy S delays replies.
 /fibonacci (Fibonacci) appends a number each --step S; an order of 0 is refused, one over 100 is aborted after three
-steps, and no goal of over 50 can be cancelled. With --others, clients of this process send goals and requests as well.
+steps, and no goal of over 50 can be cancelled.
 """
 
 import time
@@ -10,7 +10,7 @@ import time
 import node as peer
 import rclpy
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -20,7 +20,6 @@ from test_msgs.action import Fibonacci
 parser = peer.options(__doc__)
 parser.add_argument("--busy", type=float, default=0.0, help="before a reply [s]")
 parser.add_argument("--step", type=float, default=0.02, help="of a goal [s]")
-parser.add_argument("--others", type=float, help="time between goals of other clients, which ask for 5 numbers [s]")
 args = parser.parse_args()
 
 
@@ -39,15 +38,6 @@ class Servers:
             cancel_callback=lambda goal: CancelResponse.REJECT if goal.request.order > 50 else CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
         )
-        if args.others:
-            self.client = ActionClient(node, Fibonacci, "/fibonacci")
-            node.create_timer(args.others, self.send_goal)
-
-    def send_goal(self) -> None:
-        def accepted(future: rclpy.task.Future) -> None:
-            future.result().get_result_async()
-
-        self.client.send_goal_async(Fibonacci.Goal(order=5)).add_done_callback(accepted)
 
     def on_motor_power(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         time.sleep(args.busy)

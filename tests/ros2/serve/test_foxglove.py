@@ -21,10 +21,9 @@ from bhd_lerobot.ros2.messages.serialize import decode, encode
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
 from bhd_lerobot.ros2.serve.server import Counts, Input
-from tests.docs.support import load_script
+from tests.ros2.serve.foxglove_client import Client
 from tests.waiting import until
 
-Client = load_script("draw_foxglove").Client
 BOOL, TWIST, STAMPED = "std_msgs/msg/Bool", "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 FORWARD = {"linear": {"x": 0.1}}
 SENT: dict[str, tuple[str, dict[str, Any]]] = {
