@@ -10,6 +10,7 @@ __all__ = [
     "log",
     "loop",
     "output",
+    "plots",
     "rl",
     "setup",
     "step",

@@ -1,4 +1,4 @@
-"""What a training run writes about itself: `metrics.jsonl`, `loss.png`, and the progress on the console."""
+"""What a training run writes about itself: `metrics.jsonl`, and the progress on the console."""
 
 import json
 import math
@@ -8,8 +8,6 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
@@ -61,64 +59,7 @@ def _line(row: Row) -> str:
     return json.dumps(plain) + "\n"
 
 
-def draw_loss(rows: Sequence[Row], path: Path, heading: str, loss: str) -> None:
-    """Draw training and held-out loss over the steps, and below them the learning rate; `loss` names the y-axis."""
-    figure = Figure(figsize=(8.5, 5.2))
-    figure.subplots_adjust(
-        left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13
-    )  # a layout engine takes as long again
-    figure.suptitle(heading, fontsize=11)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    smallest = []
-    for key, label, colour, marker in (
-        *((key, f"training, {key}", colour, None) for key, colour in zip(_parts(rows), _PART_COLOURS, strict=False)),
-        ("loss", "training, mean since the previous point", "#2c3e50", None),
-        ("held_out_loss", "held-out episodes, not trained on", "#c0392b", "o"),
-    ):
-        points = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
-        if not points:
-            continue
-        steps, values = zip(*points, strict=True)
-        above.plot(
-            steps,
-            values,
-            color=colour,
-            marker="o" if len(points) == 1 else marker,
-            markersize=3.5,
-            linewidth=1.3,
-            label=f"{label}: {values[-1]:.3g} at step {steps[-1]:,}",
-        )
-        smallest.append(min(values))
-    if smallest and min(smallest) > 0:  # a negative log-likelihood may be below 0
-        above.set_yscale("log")
-        above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
-        above.yaxis.set_minor_locator(NullLocator())
-        above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        loss += ", log scale"
-    above.set_ylabel(loss)
-    above.grid(alpha=0.3, which="both")
-    if smallest:
-        above.legend(frameon=False, fontsize=9)
-    rates = [(row["step"], row["lr"]) for row in rows if row.get("lr") is not None]
-    if rates:
-        below.plot(*zip(*rates, strict=True), color="#8a8478", linewidth=1.2)
-    below.set_ylim(bottom=0)
-    below.set_ylabel("learning\nrate")
-    below.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3))
-    below.set_xlabel("training step")
-    below.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-    below.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
-
-
 _LONG_S = 2 * 3600.0  # [s] more is worth a line of its own
-_PART_COLOURS = ("#2980b9", "#8e9a3b", "#8e44ad", "#d68910")
-
-
-def _parts(rows: Sequence[Row]) -> list[str]:
-    """Return the keys of what a loss is the sum of, if the policy says so; a held-out loss may be one of them only."""
-    keys = [key for key in (rows[0] if rows else {}) if key.endswith("_loss") and key != "held_out_loss"]
-    return keys if len(keys) > 1 else []
 
 
 class RunProgress:

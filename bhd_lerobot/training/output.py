@@ -21,7 +21,8 @@ from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.checkpoint import TrainingParts
 from bhd_lerobot.training.config import BhdTrainConfig, without_places
-from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, draw_loss, read_metrics
+from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, read_metrics
+from bhd_lerobot.training.plots import draw_loss
 
 
 class RunOutput:

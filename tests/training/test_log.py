@@ -2,13 +2,9 @@ import io
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 
-from bhd_lerobot.training import log
-from bhd_lerobot.training.log import MetricsFile, RunProgress, draw_loss, read_metrics
-
-pytestmark = pytest.mark.figures
+from bhd_lerobot.training.log import MetricsFile, RunProgress, read_metrics
 
 ROWS = [{"step": step, "loss": 1 / step, "lr": 1e-3, "held_out_loss": 2 / step} for step in (10, 20, 30)]
 
@@ -28,33 +24,6 @@ def test_an_incomplete_file_and_values_that_are_not_finite(tmp_path: Path) -> No
     with file.path.open("a") as stream:
         stream.write('{"step": 50, "lo')
     assert read_metrics(file.path) == [*ROWS, {"step": 40, "grad_norm": None}]
-
-
-def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:
-    figures = []
-
-    class Spy(Figure):
-        def __init__(self, *args, **kwargs) -> None:
-            super().__init__(*args, **kwargs)
-            figures.append(self)
-
-    monkeypatch.setattr(log, "Figure", Spy)
-    draw_loss(rows, path, "toy", "loss of toy (l1)")
-    assert path.stat().st_size > 1000
-    return figures[0]
-
-
-def test_the_curve_shows_both_losses_on_a_log_scale(tmp_path: Path, monkeypatch) -> None:
-    above, below = drawn(ROWS, tmp_path / "loss.png", monkeypatch).axes
-    assert above.get_yscale() == "log"
-    assert [line.get_label() for line in above.lines] == [
-        "training, mean since the previous point: 0.0333 at step 30",
-        "held-out episodes, not trained on: 0.0667 at step 30",
-    ]
-    assert [axes.get_ylabel() for axes in (above, below)] == ["loss of toy (l1), log scale", "learning\nrate"]
-    assert below.get_xlabel() == "training step"
-    assert above.lines[1].get_ydata().tolist() == [0.2, 0.1, 2 / 30]
-    assert below.lines[0].get_xdata().tolist() == [10, 20, 30]
 
 
 @pytest.mark.parametrize(("completed", "said"), [(0, "15:00:00 left, by the first step. Take less."), (90, "")])

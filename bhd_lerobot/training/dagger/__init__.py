@@ -1,3 +1,3 @@
 """Dataset aggregation: a policy drives, a rule says what it would have done, and the policy learns that, in rounds."""
 
-__all__ = ["config", "curve", "train"]
+__all__ = ["config", "train"]

@@ -39,7 +39,7 @@ from bhd_lerobot.training.dagger.config import (
     parse_aggregation,
     read_stages,
 )
-from bhd_lerobot.training.dagger.curve import draw_curve
+from bhd_lerobot.training.plots import draw_rounds
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
 _DONE = "done.json"
@@ -204,7 +204,7 @@ class _Rounds:
         rows = list(self._rows.values())
         report = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": rows}
         Disk().publish(self._folder / ROUNDS, (json.dumps(report, indent=2) + "\n").encode())
-        draw_curve(rows, self._expert, self._folder / CURVE, self._folder.resolve().name)
+        draw_rounds(rows, self._expert, self._folder / CURVE, self._folder.resolve().name)
 
     def conclude(self) -> None:
         """Show the rounds, and how to judge the last policy."""

@@ -1,13 +1,3 @@
 """Reinforcement learning."""
 
-__all__ = [
-    "checkpoint",
-    "config",
-    "environment",
-    "features",
-    "learner",
-    "log",
-    "parts",
-    "train",
-    "validation",
-]
+__all__ = ["config", "environment", "learner", "parts", "run", "train"]

@@ -1,17 +1,13 @@
-"""PPO on a `bhd_mlp`: actor and critic, the learner, and its loop. Import this only where stable-baselines3 is there.
+"""PPO on a `bhd_mlp`: actor, critic and learner. Import this only where stable-baselines3 is there.
 
 The actor's modules are those of a `bhd_mlp`, so that exporting it is exact.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
@@ -19,19 +15,7 @@ from torch import Tensor, nn
 from bhd_lerobot.policies.mlp.modeling_mlp import ACTIVATION_LAYERS, MlpPolicy, chosen_mode
 from bhd_lerobot.training.rl.config import RlConfig
 from bhd_lerobot.training.rl.environment import RlVecEnv
-from bhd_lerobot.training.rl.log import Row
 from bhd_lerobot.training.rl.parts import RlParts
-
-_LOGGED = {
-    "train/approx_kl": "kl",
-    "train/clip_fraction": "clip_fraction",
-    "train/explained_variance": "explained_variance",
-    "train/value_loss": "value_loss",
-    "train/policy_gradient_loss": "policy_loss",
-    "train/std": "std",
-    "train/learning_rate": "lr",
-}
-_NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
 
 
 class ActorHead(nn.Module):
@@ -105,20 +89,7 @@ class MlpActorCritic(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **kwargs)
 
 
-class WarmedUpPPO(PPO):
-    """PPO of stable-baselines3, whose actor is frozen for the first `critic_warmup` environment steps."""
-
-    policy: MlpActorCritic
-    critic_warmup = 0
-
-    def train(self) -> None:
-        """Learn from the samples that were gathered."""
-        for actor_parameter in self.policy.actor_parameters():
-            actor_parameter.requires_grad_(self.num_timesteps > self.critic_warmup)
-        super().train()
-
-
-def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO:
+def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> PPO:
     """Return PPO on an actor."""
     options = asdict(config.ppo)
     lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
@@ -126,7 +97,7 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO
     if log_std is None:
         own = parts.actor.log_std
         log_std = 0.0 if own is None or parts.fresh else float(own.detach().mean())
-    learner = WarmedUpPPO(
+    learner = PPO(
         MlpActorCritic,
         env,
         learning_rate=lr if schedule == "constant" else lambda remaining: lr * max(0.0, remaining),
@@ -142,68 +113,5 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO
             "log_std_init": log_std,
         },
     )
-    learner.critic_warmup = config.critic_warmup
     learner.set_logger(Logger(None, []))
     return learner
-
-
-def learn(learner: WarmedUpPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
-    """Learn until a number of environment steps is done, or until it is over."""
-    watcher = _Watcher(updated, is_over)
-    learner.learn(
-        max(0, steps - learner.num_timesteps), callback=watcher, log_interval=_NEVER, reset_num_timesteps=False
-    )
-    watcher.report()
-
-
-class _Watcher(BaseCallback):
-    """Reports after each update, which is before the next samples are gathered."""
-
-    def __init__(self, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
-        super().__init__()
-        self._updated, self._is_over = updated, is_over
-        self._gathered, self._since, self._gathering_s = 0, time.perf_counter(), 0.0
-        self._episodes: list[dict[str, Any]] = []
-
-    def _on_rollout_start(self) -> None:
-        self.report()
-        self._start = time.perf_counter()
-
-    def _on_rollout_end(self) -> None:
-        self._gathering_s = time.perf_counter() - self._start
-
-    def _on_step(self) -> bool:
-        self._episodes += [info for info in self.locals["infos"] if "episode" in info]
-        return not self._is_over()
-
-    def report(self) -> None:
-        """Report the last update, if there was one since the last report."""
-        frames = self.model.num_timesteps - self._gathered
-        values = self.model.logger.name_to_value
-        if frames and self._gathering_s:
-            took = time.perf_counter() - self._since
-            row = _means(self._episodes)
-            row |= {name: float(values[key]) for key, name in _LOGGED.items() if key in values}
-            row |= {
-                "frames_per_s": frames / took,
-                "gathering_s": self._gathering_s,
-                "update_s": took - self._gathering_s,
-            }
-            self._episodes = []
-            self._updated(self.model, row)
-        self._gathered, self._since, self._gathering_s = self.model.num_timesteps, time.perf_counter(), 0.0
-
-
-def _means(episodes: list[dict[str, Any]]) -> Row:
-    """Return the means of episodes that ended, and the share of each failure; nothing if none did."""
-    if not episodes:
-        return {}
-    values = {
-        "return": [episode["episode"]["r"] for episode in episodes],
-        "success": [episode["is_success"] for episode in episodes],
-        "score": [episode["score"] for episode in episodes],
-        "length": [episode["episode"]["l"] for episode in episodes],
-    }
-    row: Row = {"episodes": len(episodes)} | {key: float(np.mean(each)) for key, each in values.items()}
-    failures = [episode["event"] for episode in episodes if not episode["is_success"]]
-    return row | {cause: failures.count(cause) / len(episodes) for cause in sorted(set(failures))}

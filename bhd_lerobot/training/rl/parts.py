@@ -25,9 +25,10 @@ from bhd_lerobot.policies.mlp.processor_mlp import make_bhd_mlp_pre_post_process
 from bhd_lerobot.rollout.provenance import versions
 from bhd_lerobot.rollout.types import Episode
 from bhd_lerobot.training.rl.config import RlConfig
-from bhd_lerobot.training.rl.features import rows_of
 
 Stats = dict[str, dict[str, torch.Tensor]]
+Rows = dict[str, NDArray[np.float32]]
+_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 _RANDOM_FRAMES = 50  # of each environment, when nothing else shows how large the observations are
 
 
@@ -47,6 +48,11 @@ class RlParts:
     after: Any
     contract: PolicyContract
     fresh: bool
+
+
+def rows_of(observation: dict[str, Any]) -> Rows:
+    """Return an environment's observation, by LeRobot's names, each of shape (n, width)."""
+    return {key: observation[name] for name, key in _KEYS.items() if name in observation}
 
 
 def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] = ()) -> RlParts:

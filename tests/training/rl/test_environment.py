@@ -12,8 +12,7 @@ from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.config import RewardConfig, RlConfig, parse_rl
-from bhd_lerobot.training.rl.environment import RlVecEnv, Shaping, pose_potential
-from bhd_lerobot.training.rl.features import FeatureStack
+from bhd_lerobot.training.rl.environment import FeatureStack, RlVecEnv, Shaping, pose_potential
 from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import RlParts, make_parts
 
