@@ -6,7 +6,6 @@ traceback.
 """
 
 import difflib
-import math
 import shlex
 from collections.abc import Iterable
 
@@ -132,25 +131,6 @@ def unknown_name(kind: str, value: object, choices: Iterable[str], meant: str = 
     meant = meant or (by_lower_case[near[0]] if near else "")
     hint = f" Did you mean {meant!r}?" if meant else ""
     return f"Unknown {kind} {value!r}.{hint} Valid: {', '.join(names) if names else '(none)'}."
-
-
-def check_positive(prefix: str, config: object, names: Iterable[str], *, or_zero: bool = False) -> None:
-    """Check that attributes are positive and finite numbers.
-
-    Args:
-        prefix: what the attributes belong to, for the message: ``"task"``, for example.
-        config: the object.
-        names: the attributes.
-        or_zero: whether 0 is valid, too.
-
-    Raises:
-        ConfigError: the message names the attribute and its value.
-    """
-    for name in names:
-        value = getattr(config, name)
-        if not 0 <= value < math.inf or not (value or or_zero):
-            valid = "0 or positive, and finite" if or_zero else "positive and finite"
-            raise ConfigError(f"{prefix}.{name} is {value}; it must be {valid}.")
 
 
 def install_extra(extra: str) -> str:

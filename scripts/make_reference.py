@@ -26,6 +26,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.environment import EnvironmentEvalConfig
+from bhd_lerobot.options.declared import declaration_of
 from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
@@ -177,7 +178,10 @@ def _options(
             groups = {key: typing.cast(type, kind)}
         else:
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
-            rows.append((f"`{key}`", _type_name(kind), shown, meaning))
+            declared = declaration_of(config_class, name)
+            kind_name, null, _ = _type_name(kind).partition(" or null")
+            kind_name = f"{kind_name}, {declared}{',' * bool(null)}{null}" if declared else kind_name + null
+            rows.append((f"`{key}`", kind_name.removeprefix("text, "), shown, meaning))
         if classes := frozenset(groups.values()):
             first, where = next((found for known, found in listed.items() if classes <= known), ("", ""))
             if first:

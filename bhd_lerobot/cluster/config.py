@@ -1,17 +1,17 @@
 """Where episodes are run: in this process, or on a cluster of machines."""
 
 import importlib.util
-import math
 from dataclasses import dataclass
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
+from bhd_lerobot.errors import ConfigError, install_extra
+from bhd_lerobot.options.declared import Count, NotNegative, Options, Positive
 
 ENGINES = ("local", "ray")
 
 
 @dataclass
-class RayConfig:
+class RayConfig(Options, prefix="ray."):
     """The cluster, and the share of it that is used. The names are those of Ray.
 
     Attributes:
@@ -28,29 +28,19 @@ class RayConfig:
     """
 
     address: str | None = None
-    num_workers: int | None = None
-    cpus_per_worker: int = 1
-    gpus_per_worker: float = 0.0
-    episodes_per_task: int | None = None
-    timeout_s: float = 60.0
+    num_workers: Count | None = None
+    cpus_per_worker: Count = 1
+    gpus_per_worker: NotNegative = 0.0
+    episodes_per_task: Count | None = None
+    timeout_s: Positive = 60.0
     include_dashboard: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
-        for name in ("num_workers", "cpus_per_worker", "episodes_per_task"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"ray.{name} is {value}; it must be at least 1.")
-        if not 0 <= self.gpus_per_worker < math.inf or (self.gpus_per_worker > 1 and self.gpus_per_worker % 1):
+        super().__post_init__()
+        if self.gpus_per_worker > 1 and self.gpus_per_worker % 1:
             raise ConfigError(
                 f"ray.gpus_per_worker is {self.gpus_per_worker}; it is a share up to 1, or a whole number."
             )
-        if not 0 < self.timeout_s < math.inf:
-            raise ConfigError(f"ray.timeout_s is {self.timeout_s}; it must be positive.")
         if self.address is not None:
             _check_address(self.address)
 
@@ -64,8 +54,6 @@ def check_engine(config: Any) -> None:
     Raises:
         ConfigError: names the option and the remedy.
     """
-    if config.engine not in ENGINES:
-        raise ConfigError(unknown_name("engine", config.engine, ENGINES))
     if config.engine == "local":
         if config.ray != RayConfig():
             raise ConfigError("Options of ray are set, but engine is 'local'; add --engine=ray, or leave them out.")

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.timing import TimingSummary
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Options, Positive, Share, Whole
 
 
 @dataclass
-class TimingTolerance:
+class TimingTolerance(Options, prefix="timing."):
     """What is tolerated of a robot on the wall clock; without effect on the lockstep clock, which is never late.
 
     The defaults follow from what a time stands for. A tick, or a frame, is taken to have happened at its place on the
@@ -31,24 +31,12 @@ class TimingTolerance:
             in `control.late`.
     """
 
-    max_lateness_s: float | None = None
-    max_age_s: float | None = None
-    max_jitter_s: float | None = None
-    max_skipped: int = 0
-    max_late_frames: float = 0.01
+    max_lateness_s: Positive | None = None
+    max_age_s: Positive | None = None
+    max_jitter_s: Positive | None = None
+    max_skipped: Whole = 0
+    max_late_frames: Share = 0.01
     reject: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("max_lateness_s", "max_age_s", "max_jitter_s"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"timing.{name} is {value}; it must be positive, or null for the default.")
-        if self.max_skipped < 0:
-            raise ConfigError(f"timing.max_skipped is {self.max_skipped}; it must be 0 or more.")
-        if not 0 <= self.max_late_frames <= 1:
-            raise ConfigError(
-                f"timing.max_late_frames is {self.max_late_frames}; it is a share of frames, from 0 to 1."
-            )
 
     def limits(self, rates: Rates, sensor_period_s: float = 0.0) -> dict[str, float]:
         """Return what is tolerated at some rates: `lateness`, `age`, `jitter` [s], `skipped`, `late_frames` [share].

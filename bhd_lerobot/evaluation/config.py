@@ -1,12 +1,13 @@
 """Configuration of `bhd-eval`."""
 
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.cluster.config import RayConfig, check_engine
+from bhd_lerobot.cluster.config import ENGINES, RayConfig, check_engine
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.declared import Count, OneOf, Options, Range, Share, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
@@ -32,7 +33,7 @@ class EvalDatasetConfig:
     root: str | None = None
 
 
-class Comparison:
+class Comparison(Options):
     """What every evaluation has: brains by name, one of them the baseline."""
 
     brains: dict[str, BrainConfig]
@@ -85,8 +86,6 @@ class Comparison:
                     raise ConfigError(unknown_name(f"brain in {key}", label, self.brains))
         if self.only is not None and not self.only:
             raise ConfigError("only is empty; name at least one brain, or leave it out.")
-        if self.fail_below is not None and not 0 <= self.fail_below <= 1:
-            raise ConfigError(f"fail_below is {self.fail_below}; it is a success rate, from 0 to 1.")
 
 
 @dataclass
@@ -132,28 +131,28 @@ class EvalConfig(Comparison):
     brains: dict[str, BrainConfig] = field(default_factory=dict)
     brain: BrainConfig | None = None
     only: list[str] | None = None
-    n_episodes: int = 100
-    episodes: list[int] | None = None
-    seed: int = 0
-    split: str = "held_out"
+    n_episodes: Count = 100
+    episodes: list[Whole] | None = None
+    seed: Whole = 0
+    split: Annotated[str, OneOf(SPLITS)] = "held_out"
     baseline: str | None = None
-    n_envs: int = 16
-    threads: int | None = None
-    engine: str = "local"
+    n_envs: Count = 16
+    threads: Count | None = None
+    engine: Annotated[str, OneOf(ENGINES)] = "local"
     ray: RayConfig = field(default_factory=RayConfig)
-    videos: int | None = None
+    videos: Whole | None = None
     view: bool = False
     gate: GateConfig = field(default_factory=GateConfig)
-    fps: int = 0
+    fps: Whole = 0
     plan: bool = False
-    plan_points: float = 10.0
+    plan_points: Annotated[float, Range("(0, 100)")] = 10.0
     sequential: bool = False
     record: EvalDatasetConfig = field(default_factory=EvalDatasetConfig)
-    fail_below: float | None = None
+    fail_below: Share | None = None
     output_dir: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured."""
+        super().__post_init__()
         check_robot_and_task(self.robot, self.task, "bhd-eval")
         self._name_brains()
         for label, brain in self.brains.items():
@@ -167,7 +166,7 @@ class EvalConfig(Comparison):
             )
         if not is_ours(self.robot.type):
             self.fps = self.fps or FPS
-        self._check_numbers()
+        self._check_episodes()
         self._check_comparison()
 
     @property
@@ -195,30 +194,11 @@ class EvalConfig(Comparison):
         """Return the options that run a single episode again."""
         return [f"--episodes=[{episode}]"]
 
-    def _check_numbers(self) -> None:
-        for name, value in (
-            ("n_episodes", self.n_episodes),
-            ("n_envs", self.n_envs),
-            ("threads", 1 if self.threads is None else self.threads),
-        ):
-            if value < 1:
-                raise ConfigError(f"{name} is {value}; it must be at least 1.")
-        for name, number in (
-            ("seed", self.seed),
-            ("videos", self.videos or 0),
-            ("fps", self.fps),
-            *(("episodes", i) for i in self.indices),
-        ):
-            if number < 0:
-                raise ConfigError(f"{name} holds {number}; it must be 0 or more.")
+    def _check_episodes(self) -> None:
         if self.episodes is not None and (not self.episodes or len(set(self.episodes)) != len(self.episodes)):
             raise ConfigError(f"episodes is {self.episodes}; it must name at least one episode, and none twice.")
         if self.fps and is_ours(self.robot.type):
             raise ConfigError(f"fps is {self.fps}, and robot.type is {self.robot.type!r}: set --robot.fps instead.")
-        if not 0 < self.plan_points < 100:
-            raise ConfigError(f"plan_points is {self.plan_points}; it is a difference of rates, between 0 and 100.")
-        if self.split not in SPLITS:
-            raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         if self.record.root is not None and self.record.repo_id is None:
             raise ConfigError("record.root is set and record.repo_id is not; datasets need a name, such as me/eval.")
 

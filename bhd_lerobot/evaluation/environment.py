@@ -29,6 +29,7 @@ from bhd_lerobot.evaluation.metrics import EnvironmentMetrics
 from bhd_lerobot.evaluation.report import NO_SUCCESS, ReportInput
 from bhd_lerobot.evaluation.results import ENVIRONMENT_MEANS, summarise
 from bhd_lerobot.options.command import Program
+from bhd_lerobot.options.declared import Count, Share, Whole
 from bhd_lerobot.options.parse import CommandLine, choices_of, decode, encode
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
@@ -63,23 +64,20 @@ class EnvironmentEvalConfig(Comparison):
     brains: dict[str, BrainConfig] = field(default_factory=dict)
     brain: BrainConfig | None = None
     only: list[str] | None = None
-    n_episodes: int = 100
-    seed: int = 0
+    n_episodes: Count = 100
+    seed: Whole = 0
     baseline: str | None = None
-    n_envs: int = 16
-    fail_below: float | None = None
+    n_envs: Count = 16
+    fail_below: Share | None = None
     output_dir: str | None = None
     record = EvalDatasetConfig()  # not options: nothing is recorded, and all episodes are run
     sequential = False
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured."""
+        super().__post_init__()
         self._name_brains()
         for label, brain in self.brains.items():
             _check_policy(f"brains.{label}", brain)
-        for name, least in (("n_episodes", 1), ("n_envs", 1), ("seed", 0)):
-            if (value := getattr(self, name)) < least:
-                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
         if self.env.fps < 1:
             raise ConfigError(f"env.fps is {self.env.fps}; it must be at least 1.")
         self.n_envs = min(self.n_envs, self.n_episodes)

@@ -2,6 +2,7 @@
 
 __all__ = [
     "command",
+    "declared",
     "dotted",
     "help",
     "parse",

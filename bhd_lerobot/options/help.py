@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from bhd_lerobot.options.declared import declaration_of
 from bhd_lerobot.options.parse import choices_of, entries_of, options_of, valid_names
 
 _INDENT = 26  # [characters] where meanings begin
@@ -161,7 +162,8 @@ def _lines(config_class: type, prefix: str, title: str, chosen: Mapping[str, str
             inner.append((group, f"{key}.", f"{key}: {meaning or summary_of(group)}"))
         else:
             shown = "required" if default is dataclasses.MISSING else f"default: {_short(default)}"
-            yield from _entry(f"--{key}={type_word(kind)}", f"{meaning} ({shown})".strip(), width)
+            valid = "; ".join(filter(None, (declaration_of(config_class, name), shown)))
+            yield from _entry(f"--{key}={type_word(kind)}", f"{meaning} ({valid})".strip(), width)
     for group, inner_prefix, heading in inner:
         yield from _lines(group, inner_prefix, heading, chosen, width)
 

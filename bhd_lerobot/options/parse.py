@@ -21,6 +21,7 @@ import draccus
 import yaml
 
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+from bhd_lerobot.options.declared import check_option, declared_types
 from bhd_lerobot.options.plugins import load_lerobot, names_of_lerobot
 from bhd_lerobot.options.shipped import found_config
 
@@ -195,6 +196,7 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
         of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
         given = {"type": default.get_choice_name(type(default)), **value} if of_default else value
         values[key] = _checked(f"{prefix}{key}", given, kind)
+        check_option(f"{prefix}{key}", values[key], declared_types(config_class)[key])
     for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not choices_of(kind):

@@ -1,14 +1,15 @@
 """What a trained brain has to beat: doing nothing, and moving at random."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Range
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
@@ -32,14 +33,8 @@ class RandomConfig(BrainConfig):
             positions.
     """
 
-    period_s: float = 1.0
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.period_s < math.inf:
-            raise ConfigError(f"brain.period_s is {self.period_s}; it must be a finite time, 0 or more.")
-        if not 0 < self.scale <= 1:
-            raise ConfigError(f"brain.scale is {self.scale}; it must be in (0, 1].")
+    period_s: NotNegative = 1.0
+    scale: Annotated[float, Range("(0, 1]")] = 1.0
 
 
 class NoopBrain(ConfiguredBrain):

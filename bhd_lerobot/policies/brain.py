@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Options
 
 
-class BrainConfig(draccus.ChoiceRegistry):
+class BrainConfig(Options, draccus.ChoiceRegistry, prefix="brain."):
     """Base class of brain configurations.
 
     Attributes:

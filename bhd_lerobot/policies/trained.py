@@ -1,9 +1,9 @@
 """What the configurations of the trained policies have in common."""
 
 import fnmatch
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import check_options
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 """Where the tool is, in `observation.state`."""
@@ -27,17 +28,16 @@ class TrainedConfig(PreTrainedConfig):
     It has no options of its own: a type has those of the options used here that it declares.
     """
 
+    option_prefix: ClassVar[str] = "policy."
+
     # LeRobot's class says so as well, but without types.
     input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
     output_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
 
-    def check_numbers(self, what: str, is_valid: Callable[[Any], bool], *names: str) -> None:
-        """Refuse numbers, alone or in a list, that are not what they must be; nothing is no number."""
-        for name in names:
-            value = getattr(self, name)
-            for number in value if isinstance(value, list) else [value]:
-                if number is not None and not is_valid(number):
-                    raise ConfigError(f"policy.{name} is {value}; it must be {what}.")
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured."""
+        super().__post_init__()
+        check_options(self)
 
     def check_chunk(self: Any) -> None:
         """Refuse to carry out more actions than are predicted."""

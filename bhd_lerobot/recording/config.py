@@ -1,15 +1,16 @@
 """Configuration of `bhd-record`."""
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.cluster.config import RayConfig, check_engine
+from bhd_lerobot.cluster.config import ENGINES, RayConfig, check_engine
 from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.policies.topic.config import TopicConfig
@@ -26,7 +27,7 @@ from bhd_lerobot.teleoperators import (  # noqa: F401  registers them
 
 
 @dataclass
-class DatasetConfig:
+class DatasetConfig(Options, prefix="dataset."):
     """What is recorded and where. The names are those of `lerobot-record`.
 
     Attributes:
@@ -68,10 +69,10 @@ class DatasetConfig:
 
     repo_id: str = ""
     root: str | None = None
-    fps: int = 0
-    num_episodes: int = 50
-    episode_time_s: float | None = None
-    reset_time_s: float = 0.0
+    fps: Whole = 0
+    num_episodes: Count = 50
+    episode_time_s: Positive | None = None
+    reset_time_s: NotNegative = 0.0
     language: bool = False
     expert_action: bool = False
     push_to_hub: bool = False
@@ -80,7 +81,7 @@ class DatasetConfig:
 
 
 @dataclass
-class RecordConfig:
+class RecordConfig(Options):
     """Record episodes of a robot, driven by a brain or a person, into a LeRobotDataset.
 
     Attributes:
@@ -135,11 +136,11 @@ class RecordConfig:
     gate: GateConfig = field(default_factory=GateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     timing: TimingTolerance = field(default_factory=TimingTolerance)
-    seed: int = 0
-    split: str = "train"
-    n_envs: int = 1
-    threads: int | None = None
-    engine: str = "local"
+    seed: Whole = 0
+    split: Annotated[str, OneOf(SPLITS)] = "train"
+    n_envs: Count = 1
+    threads: Count | None = None
+    engine: Annotated[str, OneOf(ENGINES)] = "local"
     ray: RayConfig = field(default_factory=RayConfig)
     resume: bool = False
     output_dir: str | None = None
@@ -155,36 +156,19 @@ class RecordConfig:
     display_compressed_images: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured."""
+        super().__post_init__()
         if not self.dataset.repo_id:
             if self.dataset.push_to_hub:
                 raise ConfigError("dataset.push_to_hub is true: set --dataset.repo_id=user/name, or leave it out.")
             self.dataset.repo_id = local_name(self.dataset.root)
         check_robot_and_task(self.robot, self.task, "bhd-record")
         self._settle_brain()
-        for name, value in (
-            ("dataset.num_episodes", self.dataset.num_episodes),
-            ("n_envs", self.n_envs),
-            ("threads", 1 if self.threads is None else self.threads),
-        ):
-            if value < 1:
-                raise ConfigError(f"{name} is {value}; it must be at least 1.")
-        if not 0 <= self.dataset.reset_time_s < float("inf"):
-            raise ConfigError(
-                f"dataset.reset_time_s is {self.dataset.reset_time_s}; it must be finite and not negative."
-            )
-        if self.seed < 0:
-            raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)
         check_view(self.view, self.robot)
         check_engine(self)
         estop_signal(self.estop_signal)
-        if self.split not in SPLITS:
-            raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot
         if not is_ours(robot.type):
-            if self.dataset.fps < 0:
-                raise ConfigError(f"dataset.fps is {self.dataset.fps}; it must be at least 1, or 0 for {FPS}.")
             self.dataset.fps = self.dataset.fps or FPS
             self._settle_duration()
             return
@@ -223,8 +207,6 @@ class RecordConfig:
 
     def _settle_duration(self) -> None:
         if self.dataset.episode_time_s is not None:
-            if not 0 < self.dataset.episode_time_s < float("inf"):
-                raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
             chosen: Any = self.task
             if chosen.duration_s not in (type(chosen).duration_s, self.dataset.episode_time_s):
                 raise ConfigError(

@@ -16,6 +16,7 @@ from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, as_text
+from bhd_lerobot.options.declared import Options, Positive
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.recording.onlooker import Onlooker
 from bhd_lerobot.robots.host.host import Host
@@ -29,7 +30,7 @@ from bhd_lerobot.tasks.task import Event, episode_seed
 
 
 @dataclass
-class RecordOptions:
+class RecordOptions(Options, prefix="record."):
     """What is recorded of a robot that others command.
 
     Attributes:
@@ -41,14 +42,11 @@ class RecordOptions:
 
     root: str = ""
     task: str = "Follow the commands of the brain."
-    episode_time_s: float = 60.0
-    idle_s: float = 2.0
+    episode_time_s: Positive = 60.0
+    idle_s: Positive = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("episode_time_s", "idle_s"):
-            value = getattr(self, name)
-            if not 0 < value < float("inf"):
-                raise ConfigError(f"record.{name} is {value}; it must be positive and finite [s].")
+        super().__post_init__()
         if not self.task:
             raise ConfigError("record.task is empty; it is a sentence, the instruction of the episodes.")
 

@@ -7,7 +7,7 @@ the robot is put into each recorded physics state, and its sensors are read agai
 import json
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
@@ -21,13 +21,12 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.options.declared import OneOf, Options, Range
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.provenance import command_from_json, versions
-
-MODES = ("open_loop", "state", "both")
 
 
 @dataclass
@@ -46,7 +45,7 @@ class ReplayDatasetConfig:
 
 
 @dataclass
-class ReplayConfig:
+class ReplayConfig(Options):
     """Replay a recorded episode, in simulation or on a robot, and report how far it diverges from the recording.
 
     Attributes:
@@ -60,17 +59,11 @@ class ReplayConfig:
     """
 
     dataset: ReplayDatasetConfig = field(default_factory=ReplayDatasetConfig)
-    mode: str = "both"
+    mode: Annotated[str, OneOf(("open_loop", "state", "both"))] = "both"
     output_dir: str | None = None
-    tolerance_m: float | None = None
+    tolerance_m: Annotated[float, Range("[0, inf]")] | None = None
     robot: RobotConfig | None = None
     gate: GateConfig = field(default_factory=GateConfig)
-
-    def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ConfigError(unknown_name("mode", self.mode, MODES))
-        if self.tolerance_m is not None and not self.tolerance_m >= 0:
-            raise ConfigError(f"tolerance_m is {self.tolerance_m}; it must be 0 or positive.")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.truth import BaseTruth
-from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, OneOf, Positive
 from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
 
@@ -31,7 +33,7 @@ class AvoidConfig(TaskConfig):
     """What the avoid task asks for.
 
     Attributes:
-        arena: ``"random"``, ``"turtlebot3_world"`` or ``"empty"``.
+        arena: the layout.
         random_start: start at a random free pose in the fixed layouts too.
         duration_s: length of an episode [s].
         min_path_m: length of the path that a success needs [m].
@@ -43,21 +45,18 @@ class AvoidConfig(TaskConfig):
         sensing: what is wrong with the robot's pose that the trail is drawn around.
     """
 
-    arena: str = "random"
+    arena: Annotated[str, OneOf(ARENAS)] = "random"
     random_start: bool = False
-    duration_s: float = 60.0
-    min_path_m: float = 3.0
-    cell_m: float = 0.25
-    stuck_path_m: float = 0.1
-    stuck_time_s: float = 10.0
+    duration_s: Positive = 60.0
+    min_path_m: NotNegative = 3.0
+    cell_m: Positive = 0.25
+    stuck_path_m: NotNegative = 0.1
+    stuck_time_s: Positive = 10.0
     trail: bool = False
     sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
-        if self.arena not in ARENAS:
-            raise ConfigError(unknown_name("arena", self.arena, ARENAS))
-        check_positive("task", self, ("duration_s", "cell_m", "stuck_time_s"))
-        check_positive("task", self, ("min_path_m", "stuck_path_m"), or_zero=True)
+        super().__post_init__()
         if not (self.trail or self.sensing.is_exact):
             raise ConfigError(
                 "task.sensing states what is wrong with the pose that the trail is drawn around, and task.trail is "

@@ -1,7 +1,7 @@
 """The task `free`: an instruction and a time, for every robot; a person says how an episode ends."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.declared import OneOf, Positive
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, TaskConfig
 
 
@@ -21,18 +21,12 @@ class FreeConfig(TaskConfig):
     Attributes:
         instruction: what it is to do; also what a policy is told.
         duration_s: longest duration of an episode [s].
-        arena: where a simulated base is: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``.
+        arena: where a simulated base is.
     """
 
     instruction: str = ""
-    duration_s: float = 60.0
-    arena: str = "turtlebot3_world"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.duration_s < float("inf"):
-            raise ConfigError(f"task.duration_s is {self.duration_s}; it must be positive and finite [s].")
-        if self.arena not in ARENAS:
-            raise ConfigError(unknown_name("task.arena", self.arena, ARENAS))
+    duration_s: Positive = 60.0
+    arena: Annotated[str, OneOf(ARENAS)] = "turtlebot3_world"
 
 
 class FreeTask(BaseTask):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import ARENAS, Arena
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.truth import BaseTruth
-from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, OneOf, Positive, Range
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
 from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, PathLengths, TaskConfig
@@ -30,7 +32,7 @@ class NavigateConfig(TaskConfig):
     """What the navigate task asks for.
 
     Attributes:
-        arena: ``"random"``, ``"turtlebot3_world"`` or ``"empty"``.
+        arena: the layout.
         random_start: start at a random free pose in the fixed layouts too.
         duration_s: longest duration of an episode [s].
         min_distance_m: straight distance of the goal from the start, at least [m].
@@ -45,28 +47,22 @@ class NavigateConfig(TaskConfig):
         sensing: what is wrong with what the task senses of the goal.
     """
 
-    arena: str = "random"
+    arena: Annotated[str, OneOf(ARENAS)] = "random"
     random_start: bool = False
-    duration_s: float = 60.0
-    min_distance_m: float = 1.5
-    goal_clearance_m: float = 0.2
-    tolerance_m: float = 0.1
-    tolerance_deg: float = 10.0
-    rest_speed: float = 0.03
-    rest_turn_speed: float = 0.15
-    hold_s: float = 0.5
-    stuck_path_m: float = 0.1
-    stuck_time_s: float = 10.0
+    duration_s: Positive = 60.0
+    min_distance_m: NotNegative = 1.5
+    goal_clearance_m: NotNegative = 0.2
+    tolerance_m: Positive = 0.1
+    tolerance_deg: Annotated[float, Range("(0, 180]")] = 10.0
+    rest_speed: Positive = 0.03
+    rest_turn_speed: Positive = 0.15
+    hold_s: Positive = 0.5
+    stuck_path_m: NotNegative = 0.1
+    stuck_time_s: Positive = 10.0
     sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
-        if self.arena not in ARENAS:
-            raise ConfigError(unknown_name("arena", self.arena, ARENAS))
-        positive = ("duration_s", "tolerance_m", "tolerance_deg", "rest_speed", "rest_turn_speed", "hold_s")
-        check_positive("task", self, (*positive, "stuck_time_s"))
-        check_positive("task", self, ("min_distance_m", "goal_clearance_m", "stuck_path_m"), or_zero=True)
-        if self.tolerance_deg > 180:
-            raise ConfigError(f"task.tolerance_deg is {self.tolerance_deg}; 180 already allows every heading.")
+        super().__post_init__()
         if self.tolerance_m >= self.min_distance_m:
             raise ConfigError(
                 f"task.tolerance_m is {self.tolerance_m} and task.min_distance_m {self.min_distance_m}: the robot "

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import OneOf, Positive
 from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
@@ -44,10 +46,6 @@ HELD_OUT_INSTRUCTIONS = {
 """Other ways to ask: what learns to read from `INSTRUCTIONS` has seen none of them."""
 HELD_OUT_NAMES = (("red", "cup"), ("blue", "box"), ("yellow", "cup"), ("purple", "box"))
 """Colour and kind that are left out together where `names` is `known`; each of the words occurs with others."""
-_WORDINGS = ("known", "held_out")
-_NAMES = ("any", "known", "held_out")
-_OBJECTS = ("known", "unseen")
-_ORDERS = ("target", "random")
 _ZH = {
     **{"red": "红色", "green": "绿色", "blue": "蓝色", "yellow": "黄色"},
     **{"orange": "橙色", "purple": "紫色", "white": "白色", "black": "黑色"},
@@ -66,7 +64,7 @@ class PickConfig(TaskConfig):
         hold_s: time that it must be held there [s].
         min_objects: smallest number of objects on the table.
         max_objects: largest number of objects on the table.
-        language: language of the instructions: ``"en"``, ``"zh"`` or ``"any"``.
+        language: language of the instructions.
         wording: how it is asked: ``"known"``, or ``"held_out"`` for other sentences.
         names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
             ``"held_out"``, where it is asked for one of these four.
@@ -78,36 +76,27 @@ class PickConfig(TaskConfig):
         sensing: what is wrong with what the task senses of the objects.
     """
 
-    duration_s: float = 20.0
-    lift_m: float = 0.1
-    hold_s: float = 1.0
+    duration_s: Positive = 20.0
+    lift_m: Positive = 0.1
+    hold_s: Positive = 1.0
     min_objects: int = 1
     max_objects: int = MAX_OBJECTS
-    language: str = "en"
-    wording: str = "known"
-    names: str = "any"
-    objects: str = "known"
-    order: str = "target"
+    language: Annotated[str, OneOf((*INSTRUCTIONS, "any"))] = "en"
+    wording: Annotated[str, OneOf(("known", "held_out"))] = "known"
+    names: Annotated[str, OneOf(("any", "known", "held_out"))] = "any"
+    objects: Annotated[str, OneOf(("known", "unseen"))] = "known"
+    order: Annotated[str, OneOf(("target", "random"))] = "target"
     swap: bool = False
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
     sensing: SensingConfig = field(default_factory=SensingConfig)
 
     def __post_init__(self) -> None:
-        check_positive("task", self, ("duration_s", "lift_m", "hold_s"))
+        super().__post_init__()
         if not 1 <= self.min_objects <= self.max_objects <= MAX_OBJECTS:
             raise ConfigError(
                 f"task.min_objects is {self.min_objects} and task.max_objects is {self.max_objects}; "
                 f"they must be between 1 and {MAX_OBJECTS}, in this order."
             )
-        for name, value, valid in (
-            ("language", self.language, (*INSTRUCTIONS, "any")),
-            ("wording", self.wording, _WORDINGS),
-            ("names", self.names, _NAMES),
-            ("objects", self.objects, _OBJECTS),
-            ("order", self.order, _ORDERS),
-        ):
-            if value not in valid:
-                raise ConfigError(unknown_name(f"task.{name}", value, valid))
         if self.swap and self.min_objects < 2:
             raise ConfigError(
                 f"task.swap is true and task.min_objects is {self.min_objects}; to ask for another object there must "

@@ -15,7 +15,8 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Positive, Share
 from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
@@ -45,18 +46,13 @@ class ReachConfig(TaskConfig):
         sensing: what is wrong with what the task senses of the target.
     """
 
-    duration_s: float = 10.0
-    tolerance_m: float = 0.005
-    tolerance_deg: float = 2.0
-    hold_s: float = 0.25
-    start_spread_rad: float = 0.3
+    duration_s: Positive = 10.0
+    tolerance_m: Positive = 0.005
+    tolerance_deg: Positive = 2.0
+    hold_s: Positive = 0.25
+    start_spread_rad: Share = 0.3
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
     sensing: SensingConfig = field(default_factory=SensingConfig)
-
-    def __post_init__(self) -> None:
-        check_positive("task", self, ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"))
-        if not 0 <= self.start_spread_rad <= 1:
-            raise ConfigError(f"task.start_spread_rad is {self.start_spread_rad}; it must be between 0 and 1.")
 
 
 class ReachTask(ArmTask):

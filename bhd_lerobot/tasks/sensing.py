@@ -2,36 +2,28 @@
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError
-
-_MOST_NOISE_M, _LONGEST_DELAY_S = 100.0, 3600.0  # what no tracker is worse than; far larger numbers would overflow
+from bhd_lerobot.options.declared import Options, Range, Share
 
 
 @dataclass
-class SensingConfig:
+class SensingConfig(Options, prefix="sensing."):
     """What is wrong with what the task senses; nothing by default: then it is the truth.
 
     Attributes:
-        noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame, at most 100 [m].
-        delay_s: how old it is, in whole frames, at most 3600 [s].
+        noise_m: standard deviation of the noise on each coordinate of a position, anew in every frame [m].
+        delay_s: how old it is, in whole frames [s].
         dropout: probability that something is missing, for each thing and anew in every frame: an object is left out;
             of a target, a goal or the robot's pose, what was sensed before is repeated.
     """
 
-    noise_m: float = 0.0
-    delay_s: float = 0.0
-    dropout: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, unit, most in (("noise_m", "m", _MOST_NOISE_M), ("delay_s", "s", _LONGEST_DELAY_S)):
-            if not 0 <= getattr(self, name) <= most:
-                raise ConfigError(f"sensing.{name} is {getattr(self, name)}; it must be from 0 to {most:g} [{unit}].")
-        if not 0 <= self.dropout <= 1:
-            raise ConfigError(f"sensing.dropout is {self.dropout}; it is a probability, from 0 to 1.")
+    noise_m: Annotated[float, Range("[0, 100]")] = 0.0
+    delay_s: Annotated[float, Range("[0, 3600]")] = 0.0
+    dropout: Share = 0.0
 
     @property
     def is_exact(self) -> bool:

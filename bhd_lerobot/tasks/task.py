@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import BURGER_RADIUS, Arena, make_arena
 from bhd_lerobot.bodies.body import Body, MobileBase
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Options
 from bhd_lerobot.options.registry import Registry
 
 
-class TaskConfig(draccus.ChoiceRegistry):
+class TaskConfig(Options, draccus.ChoiceRegistry, prefix="task."):
     """Base class of task configurations."""
 
 

@@ -2,19 +2,20 @@
 
 import itertools
 import math
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
 import numpy as np
 
 from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, Variation, check_camera_error
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Options, Range
 
 _FIXED = ("camera_error_m", "camera_shift_m", "camera_turn_rad")  # the same in every episode
 
 
 @dataclass
-class RandomisationConfig:
+class RandomisationConfig(Options, prefix="randomisation."):
     """Ranges of domain randomisation, and what is off in every episode. It is recorded with each, in its scene.
 
     Attributes:
@@ -34,7 +35,7 @@ class RandomisationConfig:
         camera_rad: both cameras are turned by up to this about each of their axes [rad].
         sensor_noise_rad: noise on observed joint positions has a standard deviation of up to this [rad], on speeds ten
             times that [rad/s].
-        latency_s: the servos get their commands up to this late, at most 0.05 [s].
+        latency_s: the servos get their commands up to this late [s].
         latency_min_s: and at least this late; with `latency_s` as large, always [s].
         camera_error_m: added to the positions that the task reports, the same in every episode: x, y, z in the base
             frame, each at most 0.2 [m]. As if the camera that sees target and objects were not where it is taken to be.
@@ -44,26 +45,27 @@ class RandomisationConfig:
     """
 
     enabled: bool | None = None
-    mass: float = 0.5
-    friction: float = 0.25
-    size: float = 0.1
-    colour: float = 0.08
-    plain: float = 0.0
-    marked: float = 0.0
-    across: float = 0.0
-    surface: float = 0.0
-    light: float = 0.4
-    light_direction: float = 0.3
-    camera_m: float = 0.02
-    camera_rad: float = 0.02
-    sensor_noise_rad: float = 0.0005
-    latency_s: float = 0.01
-    latency_min_s: float = 0.0
+    mass: NotNegative = 0.5
+    friction: NotNegative = 0.25
+    size: Annotated[float, Range("[0, 1)")] = 0.1
+    colour: NotNegative = 0.08
+    plain: NotNegative = 0.0
+    marked: NotNegative = 0.0
+    across: NotNegative = 0.0
+    surface: NotNegative = 0.0
+    light: Annotated[float, Range("[0, 1)")] = 0.4
+    light_direction: NotNegative = 0.3
+    camera_m: NotNegative = 0.02
+    camera_rad: NotNegative = 0.02
+    sensor_noise_rad: NotNegative = 0.0005
+    latency_s: Annotated[float, Range(f"[0, {MAX_LATENCY_S}]")] = 0.01
+    latency_min_s: NotNegative = 0.0
     camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     camera_shift_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     camera_turn_rad: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_camera_error("randomisation.camera_error_m", self.camera_error_m)
         for name, unit in (("camera_shift_m", "m"), ("camera_turn_rad", "rad")):
             values = getattr(self, name)
@@ -75,11 +77,6 @@ class RandomisationConfig:
                     f"randomisation.{name} is {list(getattr(self, name))}, but randomisation.enabled is false, so "
                     "that nothing would be off; set --task.randomisation.enabled=true."
                 )
-        for name, value in asdict(self).items():
-            if name not in ("enabled", *_FIXED) and not 0 <= value < math.inf:
-                raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
-        if self.latency_s > MAX_LATENCY_S:
-            raise ConfigError(f"randomisation.latency_s is {self.latency_s}; it must be at most {MAX_LATENCY_S}.")
         if self.latency_min_s > self.latency_s:
             raise ConfigError(
                 f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
@@ -90,9 +87,6 @@ class RandomisationConfig:
                 f"randomisation.plain is {self.plain}, randomisation.marked {self.marked} and randomisation.across "
                 f"{self.across}; they are probabilities, together at most 1."
             )
-        for name in ("size", "light"):
-            if getattr(self, name) >= 1:
-                raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
         if not self.enabled:
             self._switch_off()
 

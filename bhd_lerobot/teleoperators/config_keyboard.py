@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from bhd_lerobot.errors import check_positive
+from bhd_lerobot.options.declared import Options, Positive
 
 
 @dataclass(kw_only=True)
-class KeyboardConfig(TeleoperatorConfig):
+class KeyboardConfig(Options, TeleoperatorConfig, prefix="teleop."):
     """Options of a teleoperator whose keys come from the terminal: the recorder's marks are then not on letters.
 
     Attributes:
@@ -16,7 +16,4 @@ class KeyboardConfig(TeleoperatorConfig):
             the first time after about 0.5 s, and does not report its release.
     """
 
-    hold_s: float = 0.6
-
-    def __post_init__(self) -> None:
-        check_positive("teleop", self, ("hold_s",))
+    hold_s: Positive = 0.6

@@ -6,24 +6,23 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
 from bhd_lerobot.datasets.loader.config import LoaderConfig
-from bhd_lerobot.datasets.loader.selection import EpisodeFilter
-from bhd_lerobot.errors import ConfigError, quoted, unknown_name
+from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
+from bhd_lerobot.errors import ConfigError, quoted
+from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Range, Share, check_options
 from bhd_lerobot.options.parse import encode
 
 OWN_CONFIG_NAME = "bhd_train.json"
 """The fields that LeRobot's `train_config.json` has no place for; beside it in every checkpoint."""
 
-STATISTICS = ("checkpoint", "dataset")
-
 
 @dataclass
-class SelectionConfig:
+class SelectionConfig(Options, prefix="selection."):
     """Selection of the frames to train on.
 
     Attributes:
@@ -39,19 +38,15 @@ class SelectionConfig:
     """
 
     outcome: list[str] = field(default_factory=lambda: ["all"])
-    min_score: float | None = None
+    min_score: Share | None = None
     exclude_late: bool = False
-    intervention_weight: float = 1.0
-    learner_weight: float = 1.0
+    intervention_weight: NotNegative = 1.0
+    learner_weight: NotNegative = 1.0
     expert_action: bool = False
-    hold_out: str = "episode"
+    hold_out: Annotated[str, OneOf(HOLD_OUTS)] = "episode"
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
+        super().__post_init__()
         _ = self.filter
 
     @property
@@ -89,12 +84,12 @@ class BhdTrainConfig(TrainPipelineConfig):
     """
 
     selection: SelectionConfig = field(default_factory=SelectionConfig)
-    budget_gib: float = 4.0
+    budget_gib: Annotated[float, Range("(0, inf]")] = 4.0
     fine_tune: str | None = None
-    fine_tune_statistics: str = "checkpoint"
+    fine_tune_statistics: Annotated[str, OneOf(("checkpoint", "dataset"))] = "checkpoint"
     fine_tune_parameters: list[str] = field(default_factory=lambda: ["*"])
     fine_tune_camera: bool = False
-    threads: int | None = None
+    threads: Count | None = None
 
     def _resolve_pretrained_from_cli(self) -> None:
         """Do nothing: `arguments.parse_train` has done it, and from its own arguments."""
@@ -105,9 +100,9 @@ class BhdTrainConfig(TrainPipelineConfig):
         Raises:
             ConfigError: names the value, and what would be valid.
         """
+        check_options(self)
         for name, value, least in (
             ("steps", self.steps, 1),
-            ("threads", 1 if self.threads is None else self.threads, 1),
             ("log_freq", self.log_freq, 0),
             ("save_freq", self.save_freq, 0),
             ("eval_steps", self.eval_steps, 0),
@@ -118,8 +113,6 @@ class BhdTrainConfig(TrainPipelineConfig):
             if value < least:
                 raise ConfigError(f"{name} is {value}; it must be at least {least}.")
         self.loader_config()
-        if self.fine_tune_statistics not in STATISTICS:
-            raise ConfigError(unknown_name("fine_tune_statistics", self.fine_tune_statistics, STATISTICS))
         if self.fine_tune_camera and not (self.fine_tune or self.resume):
             raise ConfigError("fine_tune_camera is true, but no checkpoint is given; set --fine_tune.")
         if self.policy is None:

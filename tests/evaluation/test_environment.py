@@ -202,8 +202,6 @@ def test_an_environment_that_fails_is_named_with_the_brain(
         ([*LINE, "--env.speed=1"], "Unknown option 'env.speed'"),
         ([*LINE, "--env.task=Lines-v0"], "env.type is 'line', which"),
         ([*LINE, "--videos=1"], "Unknown option 'videos'"),
-        ([*LINE, "--n_envs=0"], "n_envs is 0; it must be at least 1"),
-        ([*LINE, "--seed=-1"], "seed is -1; it must be at least 0"),
         ([*LINE, "--brains.rule.type=noop"], "brains.rule.type is 'noop'; in an environment of LeRobot only policies"),
         ([*LINE, "--brain.stream=true"], "brains.learned.stream is True, which LeRobot's rollout does not have"),
         ([*LINE, "--brains.other.path=/nowhere"], "brains.other: There is no policy at '/nowhere'"),

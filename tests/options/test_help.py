@@ -49,7 +49,7 @@ def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
     assert "robot.type=turtlebot3: " in text
     assert "--robot.beams=N" in text
     assert "[m]" in text
-    assert "(default: 0.05)" in text
+    assert "(at least 0 and finite; default: 0.05)" in text
     assert "Its options: --task.type=TYPE --help" in text
     assert "--robot.beams" not in help_of(RecordConfig, {})
     assert "--policy.chunk_size=N" in help_of(BhdTrainConfig, {"policy.type": "act"})

@@ -1,7 +1,6 @@
 """What is wrong with what tasks tell: as noisy, late and incomplete as it is set to be, and otherwise the truth."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -139,21 +138,6 @@ def test_how_many_run_side_by_side_and_when_they_begin_changes_nothing(name: str
         if frame == 6:  # another episode begins, and everybody is asked again
             beside.begin(np.array([0]), [beside.sample(4)])
             assert np.array_equal(beside.environment_state(truth(beside, frame + 1, 3))[1], alone[frame + 1].ravel())
-
-
-@each_case(
-    ("sensing", "message"),
-    [
-        ({"noise_m": -0.1}, r"sensing.noise_m is -0.1"),
-        ({"noise_m": 1e300}, r"sensing.noise_m is 1e\+300; it must be from 0 to 100 \[m\]"),
-        ({"delay_s": math.inf}, r"sensing.delay_s is inf; it must be from 0 to 3600 \[s\]"),
-        ({"dropout": 1.5}, r"sensing.dropout is 1.5; it is a probability"),
-        ({"dropout": math.nan}, r"sensing.dropout is nan"),
-    ],
-)
-def test_sensing_that_cannot_be_made(sensing: dict[str, float], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        SensingConfig(**sensing)
 
 
 def test_where_nothing_is_told_nothing_can_be_wrong_with_it() -> None:

@@ -236,20 +236,6 @@ def test_an_observation_without_the_pose_is_refused(
         teleop.start_from(observation)
 
 
-@each_case(
-    ("options", "message"),
-    [
-        ({"action_space": "tol"}, "Did you mean 'tool'"),
-        ({"speed": 0.5}, r"teleop.speed is 0.5; 0.25 is the most"),
-        ({"turn_speed": float("nan")}, r"teleop.turn_speed is nan"),
-        ({"opening": 0.0}, r"teleop.opening is 0.0; it must be positive"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        BhdKeyboardArmConfig(**options)
-
-
 def test_it_finds_the_robot_of_its_process_and_says_what_does_not_fit(make: Any, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="connected are: none"):
         make().get_action()

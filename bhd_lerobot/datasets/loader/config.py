@@ -1,21 +1,20 @@
 """What a training reads of a dataset, and in which form: the configuration of `make_loader`."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Integral
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import torch
 from torch import Tensor
 
 from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Range, Whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoaderConfig:
+class LoaderConfig(Options):
     """Which samples a training reads, in which order and form, and where batches are put.
 
     Attributes:
@@ -50,30 +49,30 @@ class LoaderConfig:
         ConfigError: an unknown field, or a value out of range; the message names the valid ones.
     """
 
-    batch_size: int
-    seed: int = 0
+    batch_size: Count
+    seed: Whole = 0
     episodes: Sequence[int] | None = None
     selection: EpisodeFilter | None = None
-    intervention_weight: float = 1.0
-    learner_weight: float = 1.0
+    intervention_weight: NotNegative = 1.0
+    learner_weight: NotNegative = 1.0
     expert_action: bool = False
-    eval_split: float = 0.0
-    hold_out: str = "episode"
-    max_eval_samples: int = 0
+    eval_split: Annotated[float, Range("[0, 1)")] = 0.0
+    hold_out: Annotated[str, OneOf(HOLD_OUTS)] = "episode"
+    max_eval_samples: Whole = 0
     delta_timestamps: Mapping[str, Sequence[float]] | None = None
-    drop_n_last_frames: int = 0
+    drop_n_last_frames: Whole = 0
     image_transforms: Callable[[Tensor], Tensor] | None = None
     use_imagenet_stats: bool = True
     return_uint8: bool = True
-    tolerance_s: float = 1e-4
+    tolerance_s: Positive = 1e-4
     video_backend: str | None = "pyav"
     keep: Collection[str] | None = None
-    budget_gib: float = 4.0
-    num_workers: int = 0
+    budget_gib: Annotated[float, Range("(0, inf]")] = 4.0
+    num_workers: Whole = 0
     drop_last: bool = False
     device: torch.device | str | None = None
-    rank: int = 0
-    world_size: int = 1
+    rank: Whole = 0
+    world_size: Count = 1
 
     def __new__(cls, **fields: Any) -> Self:
         """Refuse a field that does not exist."""
@@ -84,30 +83,6 @@ class LoaderConfig:
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        for name, least in (
-            ("batch_size", 1),
-            ("seed", 0),
-            ("max_eval_samples", 0),
-            ("drop_n_last_frames", 0),
-            ("num_workers", 0),
-            ("world_size", 1),
-        ):
-            value = getattr(self, name)
-            if not isinstance(value, Integral):
-                raise ConfigError(f"{name} is {value!r}; it must be a whole number, at least {least}.")
-            if value < least:
-                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
-        if not 0 <= self.rank < self.world_size:
+        super().__post_init__()
+        if self.rank >= self.world_size:
             raise ConfigError(f"rank is {self.rank}; it must be from 0 to world_size - 1 = {self.world_size - 1}.")
-        for name in ("intervention_weight", "learner_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} is {getattr(self, name)}; it must be 0 or more, and finite.")
-        if not 0 <= self.eval_split < 1:
-            raise ConfigError(f"eval_split is {self.eval_split}; it must be from 0 to below 1.")
-        if self.hold_out not in HOLD_OUTS:
-            raise ConfigError(unknown_name("hold_out", self.hold_out, HOLD_OUTS))
-        if not 0 < self.tolerance_s < math.inf:
-            raise ConfigError(f"tolerance_s is {self.tolerance_s}; it must be more than 0, and finite [s].")
-        if not self.budget_gib > 0:
-            raise ConfigError(f"budget_gib is {self.budget_gib}; it must be more than 0 [GiB].")

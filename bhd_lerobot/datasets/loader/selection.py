@@ -16,6 +16,7 @@ from bhd_lerobot.datasets.format.features import EVENT
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.loader.table import FrameTable, checked_episodes
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.options.declared import Options, Share
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class StoredEpisodes:
 
 
 @dataclass(frozen=True)
-class EpisodeFilter:
+class EpisodeFilter(Options):
     """Which episodes are wanted, by what `bhd-record` stored about each.
 
     Attributes:
@@ -66,18 +67,17 @@ class EpisodeFilter:
     """
 
     outcome: str | Sequence[str] = "success"
-    min_score: float | None = None
+    min_score: Share | None = None
     exclude_late: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         names = [self.outcome] if isinstance(self.outcome, str) else list(self.outcome)
         if not names:
             raise ConfigError(f"No outcome is given. Valid: all, {', '.join(OUTCOMES)}.")
         for name in names:
             if name not in ("all", *OUTCOMES):
                 raise ConfigError(unknown_name("outcome", name, ["all", *OUTCOMES]))
-        if self.min_score is not None and not 0 <= self.min_score <= 1:
-            raise ConfigError(f"min_score is {self.min_score}; scores go from 0 to 1.")
 
     @property
     def outcomes(self) -> tuple[str, ...] | None:

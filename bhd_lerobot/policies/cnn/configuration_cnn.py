@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import OBS_STATE
 
 from bhd_lerobot.bodies.turtlebot3 import RANGE_MAX, RANGE_MIN, SCANNER_AHEAD
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, NotNegative, Positive, Range
 from bhd_lerobot.policies.brain import find_scan
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.trained import names_of
@@ -44,20 +45,20 @@ class CnnConfig(MlpConfig):
         odometry_columns: columns that are the odometry, x [m], y [m] and yaw [rad]; found by their names.
     """
 
-    n_obs_steps: int = 8
-    obs_stride: int = 5
-    chunk_size: int = 1
+    n_obs_steps: Count = 8
+    obs_stride: Count = 5
+    chunk_size: Count = 1
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
 
     camera: str = "front"
-    field_of_view: float = 60.0
-    range_minimum: float = RANGE_MIN
-    range_maximum: float = RANGE_MAX
+    field_of_view: Annotated[float, Range("(0, 360]")] = 60.0
+    range_minimum: Positive = RANGE_MIN
+    range_maximum: Positive = RANGE_MAX
     scanner_ahead: float = SCANNER_AHEAD
-    channels: list[int] = field(default_factory=lambda: [12, 24, 32])
-    image_dim: int = 128
-    sectors: int = 36
-    range_weight: float = 1.0
+    channels: list[Count] = field(default_factory=lambda: [12, 24, 32])
+    image_dim: Count = 128
+    sectors: Count = 36
+    range_weight: NotNegative = 1.0
     range_columns: list[int] = field(default_factory=list)
     range_angles: list[float] = field(default_factory=list)
     odometry_columns: list[int] = field(default_factory=list)
@@ -72,12 +73,9 @@ class CnnConfig(MlpConfig):
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
         super().__post_init__()
-        self.check_numbers("at least 1", lambda number: number >= 1, "image_dim", "sectors", "channels")
-        self.check_numbers("in (0, 360] [deg]", lambda number: 0 < number <= 360, "field_of_view")
-        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, "range_weight")
         if not self.channels:
             raise ConfigError("policy.channels is []; it must name at least one width.")
-        if not 0 < self.range_minimum < self.range_maximum < math.inf:
+        if self.range_minimum >= self.range_maximum:
             raise ConfigError(
                 f"policy.range_minimum is {self.range_minimum} and policy.range_maximum is {self.range_maximum}; the "
                 "first must be positive and below the second [m]."

@@ -5,7 +5,6 @@ that it gets itself into: DAgger (S. Ross, G. Gordon and D. Bagnell, AISTATS 201
 C. Sidrane, K. Driggs-Campbell and M. Kochenderfer, ICRA 2019), with a rule in the place of the human.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.options.declared import Positive
 from bhd_lerobot.policies.brain import (
     ANY_ROBOT,
     Brain,
@@ -52,18 +52,15 @@ class DaggerConfig(BrainConfig):
 
     learner: DriverConfig
     expert: DriverConfig
-    collision_s: float | None = 0.5
-    stall_s: float | None = 3.0
-    disagreement: float | None = None
-    disagreement_s: float = 0.5
-    patience_s: float | None = None
-    hold_s: float | None = None
+    collision_s: Positive | None = 0.5
+    stall_s: Positive | None = 3.0
+    disagreement: Positive | None = None
+    disagreement_s: Positive = 0.5
+    patience_s: Positive | None = None
+    hold_s: Positive | None = None
 
     def __post_init__(self) -> None:
-        for name in ("collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"brain.{name} is {value}; it must be positive and finite, or left out (null).")
+        super().__post_init__()
         for name in ("learner", "expert"):
             if isinstance(getattr(self, name), DaggerConfig):
                 raise ConfigError(f"brain.{name}.type is 'dagger' itself; choose a brain that drives.")

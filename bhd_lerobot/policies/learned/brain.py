@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.options.declared import Count
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
@@ -43,20 +44,17 @@ class LearnedBrainConfig(BrainConfig):
 
     path: str
     device: str = "cpu"
-    n_action_steps: int | None = None
+    n_action_steps: Count | None = None
     sample: bool = False
     stream: bool = False
     exact: bool = False
-    threads: int | None = None
+    threads: Count | None = None
     name: str = "learned"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.path:
             raise ConfigError("brain.path is empty; name a checkpoint or a training run's folder.")
-        for name in ("n_action_steps", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"brain.{name} is {value}; it must be at least 1.")
 
 
 class LearnedBrain(ConfiguredBrain):

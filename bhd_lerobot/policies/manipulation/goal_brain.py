@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.options.declared import Count, Positive, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation
 
 
@@ -27,22 +27,13 @@ class GoalBrainConfig(BrainConfig):
             subtracted.
     """
 
-    POSITIVE: ClassVar[tuple[str, ...]] = ("max_velocity", "max_acceleration")
-    """Parameters that must be positive."""
-
-    max_velocity: float = 2.0
-    max_acceleration: float = 8.0
-    attempts: int = 3
+    max_velocity: Annotated[float, Range(f"(0, {MAX_JOINT_SPEED}]")] = 2.0
+    max_acceleration: Positive = 8.0
+    attempts: Count = 3
     camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
-        check_positive("brain", self, self.POSITIVE)
-        if self.max_velocity > MAX_JOINT_SPEED:
-            raise ConfigError(
-                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
-            )
-        if self.attempts < 1:
-            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        super().__post_init__()
         check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError, PerceptionError
+from bhd_lerobot.options.declared import Count, Positive
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 from bhd_lerobot.policies.manipulation.grasp import (
@@ -41,13 +42,11 @@ class PickBrainConfig(GoalBrainConfig):
         lift_m: height that it lifts to [m].
     """
 
-    POSITIVE: ClassVar[tuple[str, ...]] = (*GoalBrainConfig.POSITIVE, "line_velocity", "line_acceleration", "lift_m")
-
-    max_acceleration: float = 6.0
-    attempts: int = 2
-    line_velocity: float = 0.25
-    line_acceleration: float = 1.0
-    lift_m: float = 0.15
+    max_acceleration: Positive = 6.0
+    attempts: Count = 2
+    line_velocity: Positive = 0.25
+    line_acceleration: Positive = 1.0
+    lift_m: Positive = 0.15
 
 
 @dataclass

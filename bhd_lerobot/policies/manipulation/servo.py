@@ -8,7 +8,7 @@ can learn it there (`dataset.expert_action`). They remember nothing, so a networ
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated
 
 import numpy as np
 import scipy
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import Pose
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Positive, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
 from bhd_lerobot.policies.manipulation.pick import SQUEEZE, TRAVEL
@@ -53,16 +54,12 @@ class ServoConfig(BrainConfig):
             subtracted.
     """
 
-    POSITIVE: ClassVar[tuple[str, ...]] = ("lead_m", "lead_rad")
-
-    lead_m: float = 0.025
-    lead_rad: float = 0.2
+    lead_m: Positive = 0.025
+    lead_rad: Annotated[float, Range(f"(0, {math.pi})")] = 0.2
     camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
-        check_positive("brain", self, self.POSITIVE)
-        if self.lead_rad >= math.pi:
-            raise ConfigError(f"brain.lead_rad is {self.lead_rad}; it must be below pi [rad].")
+        super().__post_init__()
         check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 
@@ -84,16 +81,9 @@ class PickServoConfig(ServoConfig):
             objects leave room for that [m]; for policies that learn from it and know it less exactly.
     """
 
-    POSITIVE: ClassVar[tuple[str, ...]] = (*ServoConfig.POSITIVE, "lift_m", "down_m")
-
-    lift_m: float = 0.15
-    down_m: float = 0.01
-    wider_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.wider_m <= MAX_OPENING:
-            raise ConfigError(f"brain.wider_m is {self.wider_m}; it must be 0 to {MAX_OPENING} [m].")
+    lift_m: Positive = 0.15
+    down_m: Positive = 0.01
+    wider_m: Annotated[float, Range(f"[0, {MAX_OPENING}]")] = 0.0
 
 
 class _ServoBrain(ConfiguredBrain):

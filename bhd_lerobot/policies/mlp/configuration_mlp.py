@@ -1,26 +1,21 @@
 """Configuration of `bhd_mlp`: numbers in, a chunk of actions out."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Range, Whole
 from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, object_columns
 from bhd_lerobot.policies.trained import TOOL, TrainedConfig, names_of
 
-ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
-LOSSES = ("l1", "mse", "huber", "nll")
-SCAN_TRANSFORMS = ("none", "inverse", "log")
-SCHEDULES = ("cosine", "constant")
-
 
 @dataclass
-class ScanConfig:
+class ScanConfig(Options, prefix="policy.scan."):
     """How the beams of a range finder become inputs.
 
     What decides whether a robot has to turn is near, and normalised metres tell near things badly apart: 0.2 m and
@@ -38,32 +33,25 @@ class ScanConfig:
         stride: step of each convolution [beams].
     """
 
-    transform: str = "none"
-    start: int | None = None
-    beams: int = 0
-    scale: float = 0.5
-    minimum: float = 0.05
-    channels: list[int] = field(default_factory=list)
-    kernel_size: int = 5
-    stride: int = 2
+    transform: Annotated[str, OneOf(("none", "inverse", "log"))] = "none"
+    start: Whole | None = None
+    beams: Whole = 0
+    scale: Positive = 0.5
+    minimum: Positive = 0.05
+    channels: list[Count] = field(default_factory=list)
+    kernel_size: Count = 5
+    stride: Count = 2
 
     @property
     def is_used(self) -> bool:
         """Whether the beams are treated otherwise than the other numbers."""
         return self.transform != "none" or bool(self.channels)
 
-    def check(self) -> None:
-        """Refuse values that cannot be honoured."""
-        if self.transform not in SCAN_TRANSFORMS:
-            raise ConfigError(unknown_name("policy.scan.transform", self.transform, SCAN_TRANSFORMS))
-        for name in ("scale", "minimum"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"policy.scan.{name} is {getattr(self, name)}; it must be a positive range [m].")
-        if self.kernel_size < 1 or self.kernel_size % 2 == 0:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kernel_size % 2 == 0:
             raise ConfigError(f"policy.scan.kernel_size is {self.kernel_size}; it must be odd: 1, 3, 5, …")
-        if self.stride < 1 or min(self.channels, default=1) < 1:
-            raise ConfigError(f"policy.scan: stride {self.stride} and channels {self.channels} must be at least 1.")
-        if self.beams < 0 or (self.start or 0) < 0 or (self.start is None) != (self.beams == 0):
+        if (self.start is None) != (self.beams == 0):
             raise ConfigError(
                 f"policy.scan.start is {self.start} and policy.scan.beams is {self.beams}; give both or neither. "
                 "Without them the beams are found by their names in the dataset."
@@ -84,7 +72,7 @@ class MlpConfig(TrainedConfig):
         chunk_size: actions that it predicts, one a frame.
         n_action_steps: how many of them are carried out before it looks again.
         hidden_dims: widths of the hidden layers.
-        activation: ``"relu"``, ``"tanh"``, ``"gelu"``, ``"silu"`` or ``"elu"``.
+        activation: of the hidden layers.
         layer_norm: normalise each hidden layer before its activation.
         dropout: share of hidden values that are dropped in training.
         feature_clip: normalised inputs beyond ± this count as this: a number that never changed in the dataset has no
@@ -92,8 +80,7 @@ class MlpConfig(TrainedConfig):
         min_std: least standard deviation that an input or an action is divided by, in its own unit: what varies by less
             than a millimetre or a milliradian is noise, and would be blown up to the size of everything else. An input
             that stays within twice of it in the whole dataset has no influence.
-        loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if not set, ``"nll"`` with `gaussian` and
-            ``"l1"`` without.
+        loss: if not set, ``"nll"``, which needs `gaussian`, with it and ``"l1"`` without.
         huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.
         modes: chunks that it predicts, of which it carries out the likeliest: where a rule passes something now on the
             left and now on the right, the mean of both is neither.
@@ -130,26 +117,26 @@ class MlpConfig(TrainedConfig):
         scheduler_warmup_steps: steps of the warm-up.
     """
 
-    n_obs_steps: int = 1
-    obs_stride: int = 1
-    chunk_size: int = 8
-    n_action_steps: int = 1
-    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
-    activation: str = "relu"
+    n_obs_steps: Count = 1
+    obs_stride: Count = 1
+    chunk_size: Count = 8
+    n_action_steps: Count = 1
+    hidden_dims: list[Count] = field(default_factory=lambda: [256, 256])
+    activation: Annotated[str, OneOf(("relu", "tanh", "gelu", "silu", "elu"))] = "relu"
     layer_norm: bool = False
-    dropout: float = 0.0
-    feature_clip: float | None = 10.0
-    min_std: float = 1e-3
-    loss: str | None = None
-    huber_delta: float = 0.5
-    modes: int = 1
+    dropout: Annotated[float, Range("[0, 1)")] = 0.0
+    feature_clip: Annotated[float, Range("(0, inf]")] | None = 10.0
+    min_std: NotNegative = 1e-3
+    loss: Annotated[str, OneOf(("l1", "mse", "huber", "nll"))] | None = None
+    huber_delta: Positive = 0.5
+    modes: Count = 1
     gaussian: bool = False
     initial_log_std: float = 0.0
     sample: bool = False
     scan: ScanConfig = field(default_factory=ScanConfig)
     ignore: list[str] = field(default_factory=list)
     ignored_columns: list[int] = field(default_factory=list)
-    yaw_harmonics: int = 0
+    yaw_harmonics: Whole = 0
     state_quaternions: list[int] = field(default_factory=list)
     environment_quaternions: list[int] = field(default_factory=list)
     residual: list[str] = field(default_factory=list)
@@ -171,31 +158,16 @@ class MlpConfig(TrainedConfig):
     optimizer_eps: float = 1e-8
     optimizer_weight_decay: float = 1e-4
     optimizer_grad_clip_norm: float = 1.0
-    scheduler: str = "cosine"
+    scheduler: Annotated[str, OneOf(("cosine", "constant"))] = "cosine"
     scheduler_warmup_steps: int = 100
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
         super().__post_init__()
-        positive = ("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps", "modes", "hidden_dims")
-        self.check_numbers("at least 1", lambda number: number >= 1, *positive)
-        self.check_numbers("0 or more", lambda number: number >= 0, "yaw_harmonics")
-        self.check_numbers("in [0, 1)", lambda number: 0 <= number < 1, "dropout")
-        self.check_numbers("positive, or null", lambda number: number > 0, "feature_clip")
-        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, "min_std")
-        self.check_numbers("positive and finite", lambda number: 0 < number < math.inf, "huber_delta")
         self.check_chunk()
-        for name, value, valid in (
-            ("activation", self.activation, ACTIVATIONS),
-            ("loss", self.loss, (None, *LOSSES)),
-            ("scheduler", self.scheduler, SCHEDULES),
-        ):
-            if value not in valid:
-                raise ConfigError(unknown_name(f"policy.{name}", value, [option for option in valid if option]))
         for name, is_set in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):
             if is_set and not self.gaussian:
                 raise ConfigError(f"policy.{name} needs a distribution; set --policy.gaussian=true.")
-        self.scan.check()
 
     @property
     def sight_size(self) -> int:

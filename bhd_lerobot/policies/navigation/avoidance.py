@@ -1,13 +1,13 @@
 """A rule: drive until something is near in front, then turn left."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Finite, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns, find_scan
 
 _ROUNDING = 1e-6  # [m]
@@ -34,19 +34,12 @@ class AvoidanceConfig(BrainConfig):
         "angular_speed": "turn_speed",
     }
 
-    front_sector_deg: float = 30.0
-    safe_distance_m: float = 0.5
-    forward_speed: float = 0.2
-    turn_speed: float = 0.5
-    range_min_m: float = 0.12
-    range_max_m: float = 3.5
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not math.isfinite(value):
-                raise ConfigError(f"brain.{name} is {value}; it must be finite.")
-        if not 0 < self.front_sector_deg <= 180:
-            raise ConfigError(f"brain.front_sector_deg is {self.front_sector_deg}; it must be in (0, 180].")
+    front_sector_deg: Annotated[float, Range("(0, 180]")] = 30.0
+    safe_distance_m: Finite = 0.5
+    forward_speed: Finite = 0.2
+    turn_speed: Finite = 0.5
+    range_min_m: Finite = 0.12
+    range_max_m: Finite = 3.5
 
 
 class AvoidanceBrain(ConfiguredBrain):

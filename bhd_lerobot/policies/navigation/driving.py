@@ -1,13 +1,14 @@
 """What brains have in common that drive along free paths: parameters, inputs and the twist."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import MobileBase
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Positive, Range, Share
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import LONGEST, Footprint, Paths, make_paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
@@ -35,28 +36,22 @@ class DrivingConfig(BrainConfig):
         range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
     """
 
-    forward_speed: float = 0.22
-    rim_speed: float = 0.2272
-    turn_speed: float = 2.0
-    settle_s: float = 0.35
-    margin_m: float = 0.05
-    stop_m: float = 0.35
-    horizon_m: float = 3.4
-    range_min_m: float = 0.12
-    range_max_m: float = 3.5
+    forward_speed: Positive = 0.22
+    rim_speed: Positive = 0.2272
+    turn_speed: Positive = 2.0
+    settle_s: Positive = 0.35
+    margin_m: NotNegative = 0.05
+    stop_m: Share = 0.35
+    horizon_m: Annotated[float, Range(f"[{PLACE_SPACING}, {LONGEST}]")] = 3.4
+    range_min_m: NotNegative = 0.12
+    range_max_m: Positive = 3.5
 
     def __post_init__(self) -> None:
-        """Check the parameters; no parameter of a brain that drives is negative."""
-        check_positive("brain", self, ("forward_speed", "rim_speed", "turn_speed", "settle_s", "range_max_m"))
-        check_positive("brain", self, asdict(self), or_zero=True)
+        super().__post_init__()
         if self.forward_speed > self.rim_speed:
             raise ConfigError(
                 f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
             )
-        if not PLACE_SPACING <= self.horizon_m <= LONGEST:
-            raise ConfigError(f"brain.horizon_m is {self.horizon_m}; it must be in [{PLACE_SPACING}, {LONGEST}].")
-        if self.stop_m > 1:
-            raise ConfigError(f"brain.stop_m is {self.stop_m}; it must be at most 1.")
         if self.range_min_m >= self.range_max_m:
             raise ConfigError(
                 f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."

@@ -14,12 +14,12 @@ Three published ideas together:
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.options.declared import NotNegative, Positive, Range
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.clearance import QUANTUM, SPACING, Paths
 from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
@@ -50,17 +50,11 @@ class GapFollowerConfig(DrivingConfig):
         commit_weight: price of leaving the heading chosen before.
     """
 
-    discount: float = 0.9
-    memory_s: float = 120.0
-    turn_weight: float = 1.0
-    clear_weight: float = 0.3
-    commit_weight: float = 0.15
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive("brain", self, ("memory_s",))
-        if not 0 < self.discount <= 1:
-            raise ConfigError(f"brain.discount is {self.discount}; it must be in (0, 1].")
+    discount: Annotated[float, Range("(0, 1]")] = 0.9
+    memory_s: Positive = 120.0
+    turn_weight: NotNegative = 1.0
+    clear_weight: NotNegative = 0.3
+    commit_weight: NotNegative = 0.15
 
 
 class GapFollowerBrain(DrivingBrain):

@@ -12,11 +12,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Positive, Range, Share
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import (
     HEADINGS,
@@ -61,19 +63,15 @@ class NavigatorConfig(DrivingConfig):
         arrive_rad: angle at which it rests [rad].
     """
 
-    margin_m: float = 0.04
-    stop_m: float = 0.25
-    horizon_m: float = 2.4
-    turn_weight: float = 0.5
-    commit_m: float = 0.05
-    replan_s: float = 2.0
-    approach_m: float = 0.8
-    arrive_m: float = 0.04
-    arrive_rad: float = 0.04
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive("brain", self, ("arrive_m", "arrive_rad"))
+    margin_m: NotNegative = 0.04
+    stop_m: Share = 0.25
+    horizon_m: Annotated[float, Range(f"[{PLACE_SPACING}, {LONGEST}]")] = 2.4
+    turn_weight: NotNegative = 0.5
+    commit_m: NotNegative = 0.05
+    replan_s: NotNegative = 2.0
+    approach_m: NotNegative = 0.8
+    arrive_m: Positive = 0.04
+    arrive_rad: Positive = 0.04
 
 
 class NavigatorBrain(DrivingBrain):

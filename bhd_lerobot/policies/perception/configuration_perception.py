@@ -1,15 +1,15 @@
 """Configuration of `bhd_perception`: an image in, the objects on the table out."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, Finite, Positive, Range
 from bhd_lerobot.policies.perception.camera import Projection, Region
 from bhd_lerobot.policies.trained import TrainedConfig, names_of
 
@@ -52,21 +52,21 @@ class PerceptionConfig(TrainedConfig):
     learns_true_poses: ClassVar[bool] = True
 
     camera: str = "scene"
-    camera_position: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.position))
-    camera_target: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.target))
-    camera_fovy: float = SCENE_CAMERA.fovy
+    camera_position: list[Finite] = field(default_factory=lambda: list(SCENE_CAMERA.position))
+    camera_target: list[Finite] = field(default_factory=lambda: list(SCENE_CAMERA.target))
+    camera_fovy: Annotated[float, Range("(0, 180)")] = SCENE_CAMERA.fovy
     camera_roll: float = SCENE_CAMERA.roll
-    area: list[float] = field(default_factory=lambda: [0.35, -0.30, 0.65, 0.30])
-    object_height: float = 0.13
-    margin: float = 0.06
-    channels: int = 32
-    hidden: int = 48
-    context: int = 64
-    brightness: float = 0.2
-    recolour: float = 0.5
-    tint: float = 0.3
-    zoom: float = 0.5
-    least_presence: float = 0.3
+    area: list[Finite] = field(default_factory=lambda: [0.35, -0.30, 0.65, 0.30])
+    object_height: Positive = 0.13
+    margin: Annotated[float, Range("[0, 1)")] = 0.06
+    channels: Count = 32
+    hidden: Count = 48
+    context: Count = 64
+    brightness: Annotated[float, Range("[0, 1)")] = 0.2
+    recolour: Annotated[float, Range("[0, 1)")] = 0.5
+    tint: Annotated[float, Range("[0, 1)")] = 0.3
+    zoom: Annotated[float, Range("[0, 1)")] = 0.5
+    least_presence: Annotated[float, Range("(0, 1)")] = 0.3
 
     n_obs_steps: int = 1
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -82,7 +82,7 @@ class PerceptionConfig(TrainedConfig):
         super().__post_init__()
         for name, count in (("camera_position", 3), ("camera_target", 3), ("area", 4)):
             values = getattr(self, name)
-            if len(values) != count or not all(map(math.isfinite, values)):
+            if len(values) != count:
                 raise ConfigError(f"policy.{name} is {values}; it must be {count} finite numbers [m].")
         if not (self.area[0] < self.area[2] and self.area[1] < self.area[3]):
             raise ConfigError(f"policy.area is {self.area}; it must be smallest x, smallest y, largest x, largest y.")
@@ -91,12 +91,6 @@ class PerceptionConfig(TrainedConfig):
                 f"policy.camera_position is {self.camera_position} and policy.camera_target {self.camera_target}; the "
                 "camera must stand above the table, and not look straight down."
             )
-        self.check_numbers("between 0 and 180", lambda number: 0 < number < 180, "camera_fovy")
-        self.check_numbers("positive and finite", lambda number: 0 < number < math.inf, "object_height")
-        self.check_numbers("between 0 and 1", lambda number: 0 < number < 1, "least_presence")
-        shares = ("margin", "brightness", "recolour", "tint", "zoom")
-        self.check_numbers("from 0 to below 1", lambda number: 0 <= number < 1, *shares)
-        self.check_numbers("at least 1", lambda number: number >= 1, "channels", "hidden", "context")
 
     @property
     def view(self) -> CameraView:

@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import COLOURS
 from bhd_lerobot.errors import ConfigError, PerceptionError
+from bhd_lerobot.options.declared import Count, Options, Positive, Range
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.manipulation.grasp import SeenObject
@@ -22,7 +23,7 @@ _DARK, _FLAT = 8, 3.0
 
 
 @dataclass
-class PerceptionOptions:
+class PerceptionOptions(Options, prefix="brain.perception."):
     """How a brain sees.
 
     Attributes:
@@ -37,17 +38,9 @@ class PerceptionOptions:
 
     path: str = ""
     device: str = "cpu"
-    max_error_m: float = 0.03
-    min_certainty: float = 0.1
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_error_m < float("inf"):
-            raise ConfigError(f"brain.perception.max_error_m is {self.max_error_m}; it must be positive [m].")
-        if not 0 <= self.min_certainty < 1:
-            raise ConfigError(f"brain.perception.min_certainty is {self.min_certainty}; it must be from 0 to below 1.")
-        if self.threads < 1:
-            raise ConfigError(f"brain.perception.threads is {self.threads}; it must be at least 1.")
+    max_error_m: Positive = 0.03
+    min_certainty: Annotated[float, Range("[0, 1)")] = 0.1
+    threads: Count = 1
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Configuration of `bhd_pixels`: an episode's first image, an instruction and the robot's state in, actions out."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,6 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, NotNegative
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.policies.trained import TOOL, names_of
 
@@ -49,21 +49,21 @@ class PixelsConfig(PerceptionConfig):
 
     perception: str | None = None
     freeze: bool = True
-    chunk_size: int = 8
-    n_action_steps: int = 8
-    longest_instruction: int = 128
-    text_dim: int = 64
-    n_cells: int = 96
-    n_heads: int = 4
-    hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
+    chunk_size: Count = 8
+    n_action_steps: Count = 8
+    longest_instruction: Count = 128
+    text_dim: Count = 64
+    n_cells: Count = 96
+    n_heads: Count = 4
+    hidden_dims: list[Count] = field(default_factory=lambda: [512, 512, 512])
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
     ignored_columns: list[int] = field(default_factory=list)
     residual: list[str] = field(default_factory=list)
     residual_columns: list[int] = field(default_factory=list)
     tool_columns: list[int] = field(default_factory=list)
-    min_std: float = 1e-3
-    pointing_weight: float = 0.2
-    perception_weight: float = 0.1
+    min_std: NotNegative = 1e-3
+    pointing_weight: NotNegative = 0.2
+    perception_weight: NotNegative = 0.1
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -77,10 +77,6 @@ class PixelsConfig(PerceptionConfig):
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
         super().__post_init__()
-        sizes = ("longest_instruction", "text_dim", "n_cells", "n_heads", "hidden_dims")
-        self.check_numbers("at least 1", lambda number: number >= 1, "chunk_size", "n_action_steps", *sizes)
-        weights = ("min_std", "pointing_weight", "perception_weight")
-        self.check_numbers("0 or positive, and finite", lambda number: 0 <= number < math.inf, *weights)
         self.check_chunk()
 
     @property

@@ -7,6 +7,7 @@ import draccus
 from lerobot.teleoperators.config import TeleoperatorConfig
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Positive
 from bhd_lerobot.policies.brain import BrainConfig
 
 if TYPE_CHECKING:
@@ -59,11 +60,10 @@ class TeleopConfig(BrainConfig):
     teleop: PersonConfig
     map: dict[str, Any] = field(default_factory=dict)
     processor: str = ""
-    timeout_s: float = 5.0
+    timeout_s: Positive = 5.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.timeout_s < float("inf"):
-            raise ConfigError(f"brain.timeout_s is {self.timeout_s}; it must be positive and finite [s].")
+        super().__post_init__()
         if self.map and self.processor:
             raise ConfigError(
                 "map and processor are both set, and both give the robot's actions: leave one of them out; a processor "

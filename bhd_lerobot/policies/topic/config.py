@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Positive
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.ros2.live.network import NetworkConfig
 
@@ -23,10 +23,5 @@ class TopicConfig(BrainConfig):
 
     mapping: str = ""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    command_timeout_s: float = 0.5
-    timeout_s: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name in ("command_timeout_s", "timeout_s"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite [s].")
+    command_timeout_s: Positive = 0.5
+    timeout_s: Positive = 10.0

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Options, Positive
 from bhd_lerobot.options.dotted import flattened
 
 FPS = 30
@@ -12,7 +13,7 @@ FPS = 30
 
 
 @dataclass
-class GateConfig:
+class GateConfig(Options, prefix="gate."):
     """What is let through to a robot that is not ours; without effect on ours, which have a cerebellum.
 
     Attributes:
@@ -27,14 +28,12 @@ class GateConfig:
 
     range: dict[str, Any] = field(default_factory=dict)
     max_change: Any = None
-    brain_timeout_s: float = 0.5
-    end_timeout_s: float = 5.0
-    call_timeout_s: float = 1.0
+    brain_timeout_s: Positive = 0.5
+    end_timeout_s: Positive = 5.0
+    call_timeout_s: Positive = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("brain_timeout_s", "end_timeout_s", "call_timeout_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"gate.{name} is {getattr(self, name)}; it must be positive and finite [s].")
+        super().__post_init__()
         for name, pair in flattened(self.range).items():
             if not (
                 isinstance(pair, list | tuple) and len(pair) == 2 and all(map(_is_number, pair)) and pair[0] < pair[1]

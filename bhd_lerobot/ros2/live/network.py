@@ -3,9 +3,10 @@
 import os
 import re
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
-from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
+from bhd_lerobot.errors import ConfigError, install_extra
+from bhd_lerobot.options.declared import Finite, NotNegative, OneOf, Options, Positive, Range
 
 _MOST_LATENCY_S = 1.0  # [s] later than this nobody notices in time that a robot does not follow
 _DOMAINS = 233  # the ports of further ones lie beyond 65535
@@ -15,7 +16,7 @@ DISTROS = ("humble", "jazzy")
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Options):
     """The network of ROS 2 nodes.
 
     Attributes:
@@ -26,19 +27,16 @@ class NetworkConfig:
         distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
     """
 
-    domain: int | None = None
+    domain: Annotated[int, Range(f"[0, {_DOMAINS - 1}]")] | None = None
     interface: str = "lo"
     peers: list[str] = field(default_factory=list)
-    distro: str = "jazzy"
+    distro: Annotated[str, OneOf(DISTROS)] = "jazzy"
 
     def __post_init__(self) -> None:
-        if self.domain is not None and not 0 <= self.domain < _DOMAINS:
-            raise ConfigError(f"The ROS domain is {self.domain}; domains are numbered from 0 to {_DOMAINS - 1}.")
+        super().__post_init__()
         for name in (self.interface, *self.peers):
             if not _ADDRESS.fullmatch(name):
                 raise ConfigError(f"{name!r} is neither a network interface nor an address.")
-        if self.distro not in DISTROS:
-            raise ConfigError(unknown_name("distro", self.distro, DISTROS))
 
     @property
     def domain_number(self) -> int:
@@ -84,7 +82,7 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
-class Ros2Config(NetworkConfig):
+class Ros2Config(NetworkConfig, prefix="robot.ros2."):
     """A robot on the network.
 
     Attributes:
@@ -103,14 +101,14 @@ class Ros2Config(NetworkConfig):
         scan_yaw: where the scanner's zero points [rad], 0 is straight ahead; by default as ``/tf_static`` states.
     """
 
-    command_hz: float = 0.0
-    timeout_s: float = 0.2
-    silence_s: float | None = None
+    command_hz: NotNegative = 0.0
+    timeout_s: Positive = 0.2
+    silence_s: Positive | None = None
     synchronised: bool = False
-    latency_s: float | None = None
+    latency_s: Annotated[float, Range(f"[0, {_MOST_LATENCY_S}]")] | None = None
     namespace: str = ""
     scan_frame: str = "base_scan"
-    scan_yaw: float | None = None
+    scan_yaw: Finite | None = None
 
     @property
     def silent_s(self) -> float:
@@ -121,19 +119,6 @@ class Ros2Config(NetworkConfig):
         """Return a topic's full name."""
         topic = f"/{topic.lstrip('/')}"
         return f"/{self.namespace.strip('/')}{topic}" if self.namespace.strip("/") else topic
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.command_hz < float("inf"):
-            raise ConfigError(f"robot.ros2.command_hz is {self.command_hz}; it is finite and not negative.")
-        if self.latency_s is not None and not 0 <= self.latency_s <= _MOST_LATENCY_S:
-            raise ConfigError(f"robot.ros2.latency_s is {self.latency_s}; it is from 0 to {_MOST_LATENCY_S:g}.")
-        for name in ("timeout_s", "silence_s"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ConfigError(f"robot.ros2.{name} is {value}; it is positive and finite.")
-        if self.scan_yaw is not None and not abs(self.scan_yaw) < float("inf"):
-            raise ConfigError(f"robot.ros2.scan_yaw is {self.scan_yaw}; it is an angle in rad.")
 
 
 @dataclass(frozen=True)

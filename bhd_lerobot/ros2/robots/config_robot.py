@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Positive, check_options
 from bhd_lerobot.ros2.live.network import Ros2Config
 
 
@@ -24,7 +25,7 @@ class Ros2RobotConfig(RobotConfig):
     mapping: str
     ros2: Ros2Config = field(default_factory=Ros2Config)
     stop: dict[str, float] = field(default_factory=dict)
-    topic_timeout_s: float = 1.0
+    topic_timeout_s: Positive = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -38,5 +39,4 @@ class Ros2RobotConfig(RobotConfig):
                 f"robot.ros2.latency_s is {self.ros2.latency_s}; it is of robots with --robot.plant=ros2. Whether a "
                 "robot of the type ros2 follows its commands is not supervised."
             )
-        if not 0 < self.topic_timeout_s < float("inf"):
-            raise ConfigError(f"robot.topic_timeout_s is {self.topic_timeout_s}; it is positive and finite.")
+        check_options(self, "robot.")

@@ -3,12 +3,13 @@
 import threading
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Range
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.viewer.viewer import prepare_view
@@ -49,17 +50,13 @@ class ServeConfig(ServiceConfig):
         foxglove_port: serve all topics to the Foxglove app on this TCP port of this machine; 0: off.
     """
 
-    joint_states_hz: float = float(JOINT_STATES_HZ)
+    joint_states_hz: Annotated[float, Range("(0, 1000]")] = float(JOINT_STATES_HZ)
     clock: bool = False
     view: bool = False
-    foxglove_port: int = 0
+    foxglove_port: Annotated[int, Range("[0, 65535]")] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.joint_states_hz <= 1000:
-            raise ConfigError(f"joint_states_hz is {self.joint_states_hz}; it is above 0 and at most 1000 Hz.")
-        if not 0 <= self.foxglove_port <= 65535:
-            raise ConfigError(f"foxglove_port is {self.foxglove_port}; it is from 1 to 65535, or 0 for no Foxglove.")
         robot: Any = self.robot
         if not hasattr(robot, "plant") or robot.plant:
             raise ConfigError(

@@ -5,13 +5,13 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
 from rich.console import Console
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Options, Range
 from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.viewer.viewer import viewed
@@ -21,7 +21,7 @@ from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
 
 
 @dataclass
-class ServiceConfig:
+class ServiceConfig(Options):
     """A robot on the wall clock with a node, until it is ended.
 
     Attributes:
@@ -37,15 +37,9 @@ class ServiceConfig:
     robot: RobotConfig
     network: NetworkConfig = field(default_factory=NetworkConfig)
     namespace: str = "/"
-    state_hz: float = 50.0
-    duration_s: float = 0.0
+    state_hz: Annotated[float, Range("(0, 1000]")] = 50.0
+    duration_s: NotNegative = 0.0
     articles: bool | str = False
-
-    def __post_init__(self) -> None:
-        if not 0 < self.state_hz <= 1000:
-            raise ConfigError(f"state_hz is {self.state_hz}; it is above 0 and at most 1000 Hz.")
-        if not 0 <= self.duration_s < float("inf"):
-            raise ConfigError(f"duration_s is {self.duration_s}; it is a time in s, or 0 for no end.")
 
 
 def run_service(

@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options import parse as configuration
+from bhd_lerobot.options.declared import Count, OneOf, Options, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
@@ -41,7 +42,7 @@ class StageConfig:
 
 
 @dataclass
-class AggregationConfig:
+class AggregationConfig(Options):
     """Dataset aggregation (S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning", AISTATS 2011).
 
     Round 0 learns from an expert that drives alone. In every further round the last policy drives, the expert takes
@@ -66,18 +67,18 @@ class AggregationConfig:
         seed: seed of the training and of the recordings; each round has its own episodes.
     """
 
-    algorithm: str = ALGORITHM
+    algorithm: Annotated[str, OneOf((ALGORITHM,))] = ALGORITHM
     expert: StageConfig = field(default_factory=StageConfig)
     learner: StageConfig = field(default_factory=StageConfig)
     policy: StageConfig = field(default_factory=StageConfig)
     evaluation: StageConfig = field(default_factory=StageConfig)
     data: list[str] = field(default_factory=list)
     output_dir: str = ""
-    rounds: int = 2
-    expert_episodes: int = 400
-    episodes: int = 200
-    validation_episodes: int = 200
-    seed: int = 0
+    rounds: Whole = 2
+    expert_episodes: Count = 400
+    episodes: Count = 200
+    validation_episodes: Count = 200
+    seed: Whole = 0
 
     @property
     def stages(self) -> tuple[StageConfig, ...]:
@@ -85,14 +86,7 @@ class AggregationConfig:
         return self.expert, self.learner, self.policy, self.evaluation
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured."""
-        if self.algorithm != ALGORITHM:
-            raise ConfigError(unknown_name("algorithm", self.algorithm, (ALGORITHM, "ppo")))
-        for name, least in (
-            *(("rounds", 0), ("expert_episodes", 1), ("episodes", 1), ("validation_episodes", 1), ("seed", 0)),
-        ):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+        super().__post_init__()
         if not self.output_dir:
             raise ConfigError("output_dir is empty; name the folder in which the rounds are kept: --output_dir=FOLDER.")
         for name in ("expert", "learner", "policy", "evaluation"):

@@ -1,59 +1,28 @@
 """Configuration of reinforcement learning, and how `bhd-train` recognises it."""
 
 import copy
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
+from typing import Annotated
 
 from lerobot.robots.config import RobotConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.options.declared import Count, Finite, NotNegative, OneOf, Options, Positive, Range, Share, Whole
 from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 from bhd_lerobot.registry import is_for, kind_of_robot, robot_of_task, robots_of
 from bhd_lerobot.tasks.task import Event, TaskConfig
 
-_CHOICES = {
-    "algorithm": ("ppo",),
-    "ppo.lr_schedule": ("linear", "constant"),
-    "reward.potential": ("none", "pose"),
-    "validation.select": ("score", "success", "return"),
-}
 # Not among them: that an expert drives ends nothing, and of a failure without a cause only a person says so.
 _EVENTS = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION, Event.FAILURE))
-# What numbers must be, and which of them.
-_RANGES = (
-    (
-        "at least 1",
-        lambda number: number >= 1,
-        (
-            *("steps", "threads", "env.n_envs", "env.threads", "ppo.n_epochs", "policy.critic_dims"),
-            *("validation.freq", "validation.n_episodes", "validation.n_envs"),
-        ),
-    ),
-    ("at least 2", lambda number: number >= 2, ("ppo.n_steps", "ppo.batch_size")),
-    ("at least 0", lambda number: number >= 0, ("seed", "validation.seed", "critic_warmup")),
-    ("between 0 and 1", lambda number: 0 <= number <= 1, ("ppo.gamma", "ppo.gae_lambda")),
-    (
-        "positive and finite",
-        lambda number: 0 < number < math.inf,
-        ("ppo.lr", "ppo.clip_range", "ppo.max_grad_norm", "ppo.target_kl", "reward.scale", "max_minutes"),
-    ),
-    (
-        "0 or positive, and finite",
-        lambda number: 0 <= number < math.inf,
-        ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad"),
-    ),
-    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame", "reward.events")),
-)
 
 
 @dataclass
-class RlEnvConfig:
+class RlEnvConfig(Options, prefix="env."):
     """The environments that are learned in.
 
     Attributes:
@@ -61,12 +30,12 @@ class RlEnvConfig:
         threads: threads that step the physics; all processors if not set.
     """
 
-    n_envs: int = 64
-    threads: int | None = None
+    n_envs: Count = 64
+    threads: Count | None = None
 
 
 @dataclass
-class RlPolicyConfig:
+class RlPolicyConfig(Options, prefix="policy."):
     """Actor and critic. The actor is a `bhd_mlp`; with `start_from` the checkpoint states which.
 
     Attributes:
@@ -90,7 +59,7 @@ class RlPolicyConfig:
     layer_norm: bool = False
     feature_clip: float | None = 10.0
     scan: ScanConfig = field(default_factory=ScanConfig)
-    critic_dims: list[int] = field(default_factory=lambda: [256, 256])
+    critic_dims: list[Count] = field(default_factory=lambda: [256, 256])
     privileged_critic: bool = False
 
     def actor(self) -> MlpConfig:
@@ -100,7 +69,7 @@ class RlPolicyConfig:
 
 
 @dataclass
-class PpoConfig:
+class PpoConfig(Options, prefix="ppo."):
     """Proximal policy optimisation; the names are those of stable-baselines3.
 
     Attributes:
@@ -120,23 +89,23 @@ class PpoConfig:
             checkpoint's own, or 0, if not set.
     """
 
-    n_steps: int = 64
-    batch_size: int = 1024
-    n_epochs: int = 5
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    lr: float = 3e-4
-    lr_schedule: str = "linear"
-    target_kl: float | None = None
-    log_std_init: float | None = None
+    n_steps: Annotated[int, Range("[2, inf]")] = 64
+    batch_size: Annotated[int, Range("[2, inf]")] = 1024
+    n_epochs: Count = 5
+    gamma: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip_range: Positive = 0.2
+    ent_coef: NotNegative = 0.0
+    vf_coef: NotNegative = 0.5
+    max_grad_norm: Positive = 0.5
+    lr: Positive = 3e-4
+    lr_schedule: Annotated[str, OneOf(("linear", "constant"))] = "linear"
+    target_kl: Positive | None = None
+    log_std_init: Finite | None = None
 
 
 @dataclass
-class RewardConfig:
+class RewardConfig(Options, prefix="reward."):
     """What the learner gets for what the task gives; what is reported is always the task's own reward.
 
     Attributes:
@@ -150,16 +119,16 @@ class RewardConfig:
         per_rad: weight of the angle in that potential [1/rad].
     """
 
-    scale: float = 1.0
-    events: dict[str, float] = field(default_factory=dict)
-    frame: float = 0.0
-    potential: str = "none"
-    per_m: float = 2.0
-    per_rad: float = 0.5
+    scale: Positive = 1.0
+    events: dict[str, Finite] = field(default_factory=dict)
+    frame: Finite = 0.0
+    potential: Annotated[str, OneOf(("none", "pose"))] = "none"
+    per_m: NotNegative = 2.0
+    per_rad: NotNegative = 0.5
 
 
 @dataclass
-class ValidationConfig:
+class ValidationConfig(Options, prefix="validation."):
     """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
 
     The best checkpoint is the one that was best on them, the policy that the run started with included.
@@ -173,16 +142,16 @@ class ValidationConfig:
         rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if not set.
     """
 
-    freq: int = 200_000
-    n_episodes: int = 64
-    n_envs: int = 64
-    seed: int = 777_001
-    select: str = "score"
+    freq: Count = 200_000
+    n_episodes: Count = 64
+    n_envs: Count = 64
+    seed: Whole = 777_001
+    select: Annotated[str, OneOf(("score", "success", "return"))] = "score"
     rule: BrainConfig | None = None
 
 
 @dataclass
-class RlConfig:
+class RlConfig(Options):
     """Learn by trial and error: PPO of stable-baselines3 on many simulations side by side, into a `bhd_mlp`.
 
     Attributes:
@@ -211,27 +180,27 @@ class RlConfig:
 
     robot: RobotConfig
     task: TaskConfig
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, OneOf(("ppo",))] = "ppo"
     env: RlEnvConfig = field(default_factory=RlEnvConfig)
     policy: RlPolicyConfig = field(default_factory=RlPolicyConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
-    steps: int = 1_000_000
-    max_minutes: float | None = None
+    steps: Count = 1_000_000
+    max_minutes: Positive | None = None
     start_from: str | None = None
     see_ignored: bool = False
     see_history: bool = False
-    critic_warmup: int = 0
+    critic_warmup: Whole = 0
     output_dir: str | None = None
     resume: bool = False
-    seed: int = 0
-    threads: int | None = None
+    seed: Whole = 0
+    threads: Count | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured."""
-        self._check_names()
-        self._check_numbers()
+        super().__post_init__()
+        self._check_reward()
         _ = self.policy.actor()
         if not is_for(wanted := robot_of_task(self.task), self.robot.type):
             raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {' or '.join(robots_of(wanted))}.")
@@ -260,25 +229,12 @@ class RlConfig:
         task = self.task.get_choice_name(type(self.task))
         return next(name for name, pair in ENVIRONMENTS.items() if pair == (self.robot.type, task))
 
-    def _check_names(self) -> None:
-        for name, valid in _CHOICES.items():
-            if attrgetter(name)(self) not in valid:
-                raise ConfigError(unknown_name(name, attrgetter(name)(self), valid))
+    def _check_reward(self) -> None:
         for event in self.reward.events:
             if event not in _EVENTS:
                 raise ConfigError(unknown_name("event in reward.events", event, _EVENTS))
         if self.reward.potential == "pose" and kind_of_robot(self.robot.type) != "arm":
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
-
-    def _check_numbers(self) -> None:
-        for what, is_valid, names in _RANGES:
-            for name in names:
-                value = attrgetter(name)(self)
-                several = value if isinstance(value, dict) else dict.fromkeys([""], value)
-                for key, one in several.items():
-                    for number in one if isinstance(one, list) else [one]:
-                        if number is not None and not is_valid(number):
-                            raise ConfigError(f"{name}{key and '.'}{key} is {number}; it must be {what}.")
 
 
 def parse_rl(arguments: Sequence[str] | CommandLine) -> RlConfig:

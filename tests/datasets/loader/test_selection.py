@@ -230,19 +230,8 @@ def test_policies_that_drop_more_than_there_is(plain: Path) -> None:
 def test_wrong_fields_of_the_configuration_are_named() -> None:
     for fields, message in (
         ({"batchsize": 4}, "field of LoaderConfig 'batchsize'. Did you mean 'batch_size'.* Valid: .*world_size"),
-        ({"batch_size": 0}, "batch_size is 0; it must be at least 1"),
         ({"batch_size": math.nan}, "batch_size is nan; it must be a whole number, at least 1"),
-        ({"num_workers": 1.5}, r"num_workers is 1\.5; it must be a whole number"),
-        ({"seed": -1}, "seed is -1"),
         ({"rank": 2, "world_size": 2}, "rank is 2; it must be from 0 to world_size - 1 = 1"),
-        ({"eval_split": 1}, "eval_split is 1; it must be from 0 to below 1"),
-        ({"eval_split": math.nan}, "eval_split is nan"),
-        ({"hold_out": "episodes"}, "'episodes'. Did you mean 'episode'"),
-        ({"intervention_weight": -1}, "intervention_weight is -1"),
-        ({"intervention_weight": math.inf}, "intervention_weight is inf"),
-        ({"tolerance_s": 0}, "tolerance_s is 0"),
-        ({"budget_gib": 0}, "budget_gib is 0"),
-        ({"drop_n_last_frames": -1}, "drop_n_last_frames is -1"),
     ):
         values: dict[str, Any] = {"batch_size": 4, **fields}
         with pytest.raises(ConfigError, match=message):

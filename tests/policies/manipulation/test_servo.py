@@ -16,7 +16,6 @@ from bhd_lerobot.policies.manipulation.servo import (
     PickServoBrain,
     PickServoConfig,
     ReachServoBrain,
-    ReachServoConfig,
     ServoConfig,
 )
 from bhd_lerobot.robots.arm_host import TOOL_NAMES
@@ -161,20 +160,9 @@ def test_as_an_expert_it_says_in_every_frame_what_it_would_do() -> None:
     assert np.array_equal(brain.advice(), pick().act(seen))
 
 
-@each_case(
-    ("make", "message"),
-    [
-        (lambda: PickServoConfig(lead_m=0.0), "lead_m"),
-        (lambda: PickServoConfig(down_m=-1.0), "down_m"),
-        (lambda: PickServoConfig(wider_m=-0.001), r"wider_m is -0.001; it must be 0 to 0.085"),
-        (lambda: PickServoConfig(wider_m=float("nan")), "wider_m"),
-        (lambda: ReachServoConfig(lead_rad=4.0), "below pi"),
-        (lambda: ServoConfig(camera_error_m=[0.0, 1.0, 0.0]), "camera_error_m"),
-    ],
-)
-def test_values_that_cannot_be_honoured_are_refused(make: Any, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        make()
+def test_an_error_of_the_camera_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ConfigError, match="camera_error_m"):
+        ServoConfig(camera_error_m=[0.0, 1.0, 0.0])
 
 
 def test_a_robot_that_takes_joint_positions_is_refused() -> None:

@@ -152,8 +152,6 @@ def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> Non
         (["--robot.type=ur5"], "robot.plant is not given; a bridge is in front of a robot"),
         (["--robot.type=ur5", "--robot.plant=ros2", "--robot.action_space=tool"], "robot.action_space is 'tool'"),
         (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant is not given"),
-        (["--robot.type=ur5", "--robot.plant=ros2", "--state_hz=0"], "state_hz is 0"),
-        (["--robot.type=ur5", "--robot.plant=ros2", "--duration_s=-1"], "duration_s is -1"),
     ],
 )
 def test_a_bridge_in_front_of_nothing_is_refused(

@@ -195,7 +195,6 @@ def test_a_robot_that_is_not_there_leaves_no_dataset(domain: int, tmp_path: Path
     [
         (["--record.root=/proc/none/dataset"], "/proc/none"),
         (["--record.root=data", "--record.idle_s=0"], "record.idle_s is 0"),
-        (["--record.root=data", "--record.episode_time_s=-1"], "record.episode_time_s is -1"),
         (["--record.root=data", "--record.task=''"], "record.task is empty"),
     ],
 )

@@ -191,9 +191,6 @@ def test_a_port_in_use_is_named_with_the_remedy(foxglove: FoxgloveServer, port: 
 
 
 def test_what_cannot_be_served_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    for number in (-1, 65536):
-        with pytest.raises(ConfigError, match=f"foxglove_port is {number}; it is from 1 to 65535"):
-            ServeConfig(robot=TurtleBot3Config(), foxglove_port=number)
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(ConfigError, match="--foxglove_port=8765 needs the package foxglove-sdk"):
         FoxgloveServer("robot", 8765)

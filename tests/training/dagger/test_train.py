@@ -322,7 +322,6 @@ def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_l
 @each_case(
     ("changed", "message"),
     [
-        ({"rounds": -1}, "rounds is -1; it must be at least 0"),
         ({"output_dir": ""}, "output_dir is empty"),
         ({"data": ["nowhere"]}, "nowhere"),
         ({"policy": {"config": "", "options": []}}, "policy.config is empty; name a configuration file"),

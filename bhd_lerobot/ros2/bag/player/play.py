@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import NotNegative, Options, Positive
 from bhd_lerobot.ros2.bag.player.offer import described, offers_of
 from bhd_lerobot.ros2.bag.storage.read import Bag
 from bhd_lerobot.ros2.live.node import Node, Publisher
@@ -18,7 +19,7 @@ _MOST_KEPT = 100  # of what a latched topic sent before the start
 
 
 @dataclass(frozen=True)
-class PlayOptions:
+class PlayOptions(Options, prefix="--"):
     """How a bag is published.
 
     Attributes:
@@ -33,16 +34,10 @@ class PlayOptions:
     """
 
     topics: tuple[str, ...] = ()
-    rate: float = 1.0
-    start: float = 0.0
+    rate: Positive = 1.0
+    start: NotNegative = 0.0
     loop: bool = False
-    wait: float = 3.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.rate < float("inf"):
-            raise ConfigError(f"--rate is {self.rate}; it must be positive and finite.")
-        if not 0 <= self.start < float("inf"):
-            raise ConfigError(f"--start is {self.start}; it is a time in the bag [s], and not negative.")
+    wait: Positive = 3.0
 
 
 @dataclass

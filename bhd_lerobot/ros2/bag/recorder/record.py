@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from bhd_lerobot.datasets.storage.disk import write_errors
-from bhd_lerobot.errors import ConfigError, DatasetWriteError, unknown_name
+from bhd_lerobot.errors import ConfigError, DatasetWriteError
+from bhd_lerobot.options.declared import OneOf, Options, Range
 from bhd_lerobot.ros2.bag.recorder.receive import DEPTH, TopicReceiver
 from bhd_lerobot.ros2.bag.storage.place import refuse_existing
 from bhd_lerobot.ros2.bag.storage.write import FORMATS, BagWriter, profile
@@ -28,7 +29,7 @@ LEAST_FREE = 64 << 20
 
 
 @dataclass(frozen=True)
-class RecordOptions:
+class RecordOptions(Options, prefix="--"):
     """What is recorded, and where to.
 
     Attributes:
@@ -45,18 +46,15 @@ class RecordOptions:
     output: Path
     topics: tuple[str, ...] = ()
     exclude: str | None = None
-    storage: str = "mcap"
-    seconds: float | None = None
+    storage: Annotated[str, OneOf(FORMATS)] = "mcap"
+    seconds: Annotated[float, Range("(0, inf]")] | None = None
 
     def __post_init__(self) -> None:
-        if self.storage not in FORMATS:
-            raise ConfigError(unknown_name("storage", self.storage, FORMATS))
+        super().__post_init__()
         if self.output.suffix in (".mcap", ".db3"):
             raise ConfigError(
                 f"--output is {self.output}; a bag is a folder, in which the file lies. Leave out {self.output.suffix}."
             )
-        if self.seconds is not None and not self.seconds > 0:
-            raise ConfigError(f"--seconds is {self.seconds}; it must be positive.")
         try:
             re.compile(self.exclude or "")
         except re.error as error:
