@@ -1,3 +1,3 @@
 """Episodes on many machines."""
 
-__all__ = ["cluster", "config", "job", "loop", "pool", "remote", "task", "worker"]
+__all__ = ["cluster", "config", "job", "loop", "pool", "remote"]

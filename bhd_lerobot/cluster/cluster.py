@@ -42,7 +42,7 @@ def connected(config: RayConfig) -> Iterator[str]:
     if ray.is_initialized():  # by a program that uses us: it decides about its cluster
         yield address
         return
-    options: dict[str, Any] = {"address": address, "log_to_driver": False, "logging_level": "ERROR"}
+    options: dict[str, Any] = {"address": address, "log_to_driver": True, "logging_level": "ERROR"}
     if address == _LOCAL:
         wanted = (config.num_workers or 1) * config.cpus_per_worker
         options |= {
@@ -52,18 +52,21 @@ def connected(config: RayConfig) -> Iterator[str]:
         }
     elif address != "auto":
         _knock(address)
-    with _without_notices():
-        try:
-            with _errors(address):
-                if address == _LOCAL:
-                    # Not in a thread: the system ends the cluster's processes with the thread that started them.
-                    with _own_handlers():
-                        ray.init(**options)
-                else:
-                    _join(lambda: ray.init(**options), address, config.timeout_s)
-            yield address
-        finally:
-            ray.shutdown()
+    try:
+        with _errors(address):
+            if address == _LOCAL:
+                # Not in a thread: the system ends the cluster's processes with the thread that started them.
+                former = signal.getsignal(signal.SIGTERM)  # in whose place Ray puts its own
+                try:
+                    ray.init(**options)
+                finally:
+                    if threading.current_thread() is threading.main_thread():
+                        signal.signal(signal.SIGTERM, former)
+            else:
+                _join(lambda: ray.init(**options), address, config.timeout_s)
+        yield address
+    finally:
+        ray.shutdown()
 
 
 def _join(join: Callable[[], Any], address: str, timeout_s: float) -> None:
@@ -110,54 +113,14 @@ def _errors(address: str) -> Iterator[None]:
         ) from error
 
 
-@contextmanager
-def _own_handlers() -> Iterator[None]:
-    """Keep our handlers of signals: Ray puts its own in the place of the one for SIGTERM."""
-    former = signal.getsignal(signal.SIGTERM)
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, former)
-
-
 def _knock(address: str) -> None:
-    """See that what answers at an address could be Ray's head, before Ray tries it for minutes."""
+    """See that something answers at an address, before Ray tries it for minutes."""
     host, _, port = address.rpartition(":")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S) as connection:
-            if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
-                return
-            # gRPC speaks HTTP/2: a client's greeting with empty settings is answered with the server's settings.
-            connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0]))
-            answer = b""
-            while len(answer) < 4 and (part := connection.recv(9)):
-                answer += part
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S).close()
     except OSError as error:
         what = "does not answer" if isinstance(error, TimeoutError) else f"cannot be reached: {error.strerror or error}"
         raise ClusterError(f"The Ray cluster at {address!r} {what}. {_REMEDY}") from error
-    if answer[3:4] != b"\x04":
-        raise ClusterError(f"The server at {address!r} is not a Ray cluster. {_REMEDY}")
-
-
-@contextmanager
-def _without_notices() -> Iterator[None]:
-    """Keep Ray from printing the end of a dead machine's log, forty lines that say less than we do.
-
-    It has no option for that.
-    """
-    import ray._private.worker as internals
-
-    name = "print_to_stdstream"
-    former = getattr(internals, name, None)
-    if former is None:
-        yield
-        return
-    setattr(internals, name, lambda *_, **__: None)
-    try:
-        yield
-    finally:
-        setattr(internals, name, former)
 
 
 def free_places(config: RayConfig) -> int:

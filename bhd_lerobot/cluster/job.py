@@ -6,7 +6,7 @@ import os
 import pickle
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
 from bhd_lerobot.policies.perception.perceiver import PerceptionOptions
-from bhd_lerobot.registry import make_simulation, make_task
+from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 
@@ -51,11 +51,6 @@ class Job:
     threads: int
     video: VideoSettings | None = None
     checkpoints: dict[str, dict[str, bytes]] = field(default_factory=dict)
-
-    @property
-    def has_policy(self) -> bool:
-        """Whether a trained policy takes part."""
-        return bool(self.checkpoints)
 
 
 @dataclass(frozen=True)
@@ -206,3 +201,41 @@ def fingerprint(robot: Any, task: Any, fps: int) -> str:
         pass
     simulation.close()
     return brain.digest.hexdigest()
+
+
+class EpisodeServer:
+    """Runs the episodes of one job in a worker."""
+
+    def __init__(self, content: bytes) -> None:
+        self._job = job = pickle.loads(content)
+        self.fingerprint = fingerprint(job.robot, job.task, job.fps)
+        simulation = make_simulation(job.robot, job.n, job.threads)
+        with unpacked(job) as brain_config:
+            brain = make_brain(brain_config)
+        task = make_task(job.task, job.n, job.fps, simulation.body)
+        self._loop = EpisodeLoop(simulation, task, brain, job.tolerance)
+        if simulation.camera_names and (job.video is not None or brain.uses_images):
+            simulation.start_rendering()
+
+    def run(self, specs: list[tuple[int, int]]) -> dict[str, Any]:
+        """Run episodes.
+
+        Returns:
+            `episodes`: those that were finished, in order, packed; `times`: durations of the brain's calls [s]; and, if
+            something ended the run early, `error`.
+        """
+        answer: dict[str, Any] = {"episodes": [], "times": self._loop.act_times}
+        self._loop.act_times.clear()
+        sink = None if self._job.video is None else self._make_sink
+        try:
+            with closing(self._loop.run([EpisodeSpec(*spec) for spec in specs], open_images=sink)) as run:
+                for episode in run:
+                    videos = {} if episode.writer is None else episode.writer.finish()
+                    answer["episodes"].append(pack(episode, videos))
+        except Exception as error:  # the episodes before it are good
+            answer["error"] = error
+        return answer
+
+    def _make_sink(self) -> VideoSink:
+        job = self._job
+        return VideoSink(job.fps, (job.robot.camera_height, job.robot.camera_width), job.video)

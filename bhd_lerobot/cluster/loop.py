@@ -11,7 +11,7 @@ from bhd_lerobot.cluster.cluster import connected
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
 from bhd_lerobot.cluster.pool import CONTINUE, WorkerPool
-from bhd_lerobot.cluster.task import Task as ClusterTask
+from bhd_lerobot.cluster.pool import Task as ClusterTask
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import ClusterError
@@ -77,10 +77,9 @@ class ClusterLoop(EpisodeLoop):
         if not specs:
             return
         per_task = self._per_task(len(specs))
-        tasks = [
-            ClusterTask(first, [(spec.index, spec.seed) for spec in specs[first : first + per_task]])
-            for first in range(0, len(specs), per_task)
-        ]
+        pairs = [(spec.index, spec.seed) for spec in specs]
+        parts = [pairs[first : first + per_task] for first in range(0, len(pairs), per_task)]
+        tasks = [ClusterTask(number, part) for number, part in enumerate(parts)]
         video = None
         if open_images is not None and self.robots.camera_shapes:
             writer = open_images()

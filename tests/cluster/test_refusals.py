@@ -2,40 +2,15 @@
 
 import os
 import socket
-import subprocess
-import sys
-import threading
-from importlib import metadata
 from types import SimpleNamespace
 
 import pytest
 
 from bhd_lerobot.cluster import cluster as cluster_module
-from bhd_lerobot.cluster import config, remote
+from bhd_lerobot.cluster import config
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.errors import ClusterError, ConfigError
 from tests.recording.support import run_record
-
-
-def test_a_machine_without_the_package_reports_it(tmp_path):
-    cloudpickle = pytest.importorskip("ray.cloudpickle")
-    cloudpickle.register_pickle_by_value(remote)
-    try:
-        (tmp_path / "worker").write_bytes(cloudpickle.dumps(remote.RemoteWorker))
-    finally:
-        cloudpickle.unregister_pickle_by_value(remote)
-    program = (
-        "import sys; sys.modules['bhd_lerobot'] = None\n"
-        "import importlib.util, pickle; importlib.util.find_spec = lambda name: None\n"
-        "worker = pickle.load(open(sys.argv[1], 'rb'))()\n"
-        "print(worker.describe(('numpy', 'no_such_package'))['facts'])\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "worker")], capture_output=True, text=True, check=True
-    )
-    facts = eval(done.stdout)  # what was printed by the line above
-    assert facts["numpy"] == metadata.version("numpy")
-    assert facts["no_such_package"] == facts["source of bhd_lerobot"] == "not installed"
 
 
 def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
@@ -61,30 +36,15 @@ def test_without_ray_the_message_names_the_command_that_installs_it(tmp_path, mo
         run_record(tmp_path / "data", engine="ray")
 
 
-def test_a_cluster_that_does_not_exist_is_reported_soon(tmp_path, monkeypatch):
+def test_a_cluster_that_does_not_exist_is_reported_soon(tmp_path):
     pytest.importorskip("ray")
-    monkeypatch.setattr(cluster_module, "_KNOCK_S", 0.3)
-    with socket.create_server(("127.0.0.1", 0)) as mute, socket.create_server(("127.0.0.1", 0)) as other:
-
-        def answer() -> None:
-            connection, _ = other.accept()
-            with connection:
-                connection.recv(100)
-                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-
-        threading.Thread(target=answer, daemon=True).start()
-        with socket.create_server(("127.0.0.1", 0)) as closed:
-            unused = closed.getsockname()[1]
-        for address, message in (
-            (f"127.0.0.1:{unused}", "cannot be reached"),
-            (f"127.0.0.1:{mute.getsockname()[1]}", "does not answer"),
-            (f"127.0.0.1:{other.getsockname()[1]}", "is not a Ray cluster"),
-            ("no-such-host.invalid:6379", "cannot be reached"),
-        ):
-            with pytest.raises(ClusterError, match=message) as error:
-                run_record(tmp_path / "data", engine="ray", ray__address=address)
-            assert address in str(error.value)
-            assert "ray start --head" in str(error.value)
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        unused = closed.getsockname()[1]
+    for address in (f"127.0.0.1:{unused}", "no-such-host.invalid:6379"):
+        with pytest.raises(ClusterError, match="cannot be reached") as error:
+            run_record(tmp_path / "data", engine="ray", ray__address=address)
+        assert address in str(error.value)
+        assert "ray start --head" in str(error.value)
     assert not (tmp_path / "data").exists()
 
 
