@@ -15,8 +15,9 @@ from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec
-from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
 from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, topics_of
+from bhd_lerobot.ros2.messages.presets import entries
+from bhd_lerobot.ros2.messages.table import STAMPED_TWIST, TWIST_TYPE
 
 BASE_TOPIC, TOPIC = "/brain/cmd_vel", "/brain/commands"
 _DISCOVERY_S = 5.0  # that it may take until a node of Fast DDS sends to one that has just come
@@ -53,17 +54,14 @@ class TopicBrain(ConfiguredBrain):
         topics = topics_of(mapping.action, mapping.types)
         names = list(mapping.action)
         self._columns = [[robot.action_names.index(names[column]) for column in topic.columns] for topic in topics]
-        inputs = tuple(
-            InputSpec(topic.topic, topic.msgtype, topic, SENSOR_DATA, self.config.timeout_s / 2) for topic in topics
-        )
+        inputs = tuple(InputSpec.of(topic, SENSOR_DATA, self.config.timeout_s / 2) for topic in topics)
         self._link = NodeLink(NodeSpec(f"bhd_brain_{os.getpid()}", self.config.network, inputs))
         self._link.open(patience_s=None)
 
     def _default(self, robot: RobotFeatures) -> MappingConfig:
         if isinstance(robot.body, MobileBase):
-            part = TwistPart if self.config.network.distro != "humble" else BareTwistPart
-            pairs = zip(robot.action_names, part.fields, strict=True)
-            return MappingConfig(action={name: FieldConfig(BASE_TOPIC, part.msgtype, place) for name, place in pairs})
+            msgtype = TWIST_TYPE if self.config.network.distro == "humble" else STAMPED_TWIST
+            return MappingConfig(action=entries(BASE_TOPIC, msgtype, robot.action_names))
         numbered = enumerate(robot.action_names)
         return MappingConfig(action={name: FieldConfig(TOPIC, _FLOATS, f"data[{k}]") for k, name in numbered})
 

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos
+from bhd_lerobot.ros2.messages.mapping import TopicFields
 
 
 def silence_text(topic: str, silent_s: float) -> str:
@@ -58,6 +59,11 @@ class InputSpec:
     qos: Qos = field(default_factory=Qos)
     silence_s: float = 1.0
 
+    @classmethod
+    def of(cls, fields: TopicFields, qos: Qos | None = None, silence_s: float = 1.0) -> Self:
+        """Return the input of a topic of which fields are read."""
+        return cls(fields.topic, fields.msgtype, fields, qos or Qos(), silence_s)
+
     @property
     def is_required(self) -> bool:
         """Whether it is waited for."""
@@ -84,6 +90,11 @@ class OutputSpec:
     is_required: bool = True
     remedy: str = ""
     stop: tuple[float, ...] | None = None
+
+    @classmethod
+    def of(cls, fields: TopicFields, qos: Qos | None = None, **options: Any) -> Self:
+        """Return the output of a topic whose fields are written."""
+        return cls(fields.topic, fields.msgtype, fields, qos or Qos(), **options)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Messages and what they mean for a robot."""
 
 __all__ = [
-    "arm",
     "base",
     "definitions",
     "fields",
@@ -13,6 +12,7 @@ __all__ = [
     "scan",
     "serialize",
     "split",
+    "table",
     "types",
     "ur",
     "views",

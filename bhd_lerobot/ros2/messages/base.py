@@ -1,4 +1,4 @@
-"""The messages of a base with a scanner: LaserScan, Odometry, Imu, TwistStamped and Twist."""
+"""The messages of a base with a scanner that are more than fields: Odometry and LaserScan."""
 
 import math
 from collections.abc import Sequence
@@ -8,14 +8,9 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.ros2.messages.parts import NANO, Array, FieldsPart, Frames, Part, header
+from bhd_lerobot.ros2.messages.parts import NANO, Array, Frames, Part, header
 from bhd_lerobot.ros2.messages.serialize import encode
-
-TWIST = ("x.vel", "theta.vel")
-ODOMETRY = ("x.pos", "y.pos", "theta.pos")
-GYRO = ("imu_x.vel", "imu_y.vel", "imu_z.vel")
-
-ODOM_FRAME, FOOTPRINT_FRAME, SCAN_FRAME, IMU_FRAME = "odom", "base_footprint", "base_scan", "imu_link"
+from bhd_lerobot.ros2.messages.table import FOOTPRINT_FRAME, ODOM_FRAME, ODOMETRY_TYPE, SCAN, SCAN_FRAME, TWIST
 
 
 @dataclass(frozen=True)
@@ -35,21 +30,6 @@ class BaseNoise:
     speed: float
     turn: float
     gyro: float
-
-
-class TwistPart(FieldsPart):
-    """A command of a base."""
-
-    msgtype = "geometry_msgs/msg/TwistStamped"
-    fields = ("twist.linear.x", "twist.angular.z")
-    frame = FOOTPRINT_FRAME
-
-
-class BareTwistPart(FieldsPart):
-    """A command of a base, without a stamp: what ROS 2 Humble's robots take."""
-
-    msgtype = "geometry_msgs/msg/Twist"
-    fields = ("linear.x", "angular.z")
 
 
 def twists(messages: Sequence[Any]) -> Array:
@@ -73,9 +53,8 @@ class OdometryPart(Part):
         noise: if it is known; only needed to write.
     """
 
+    msgtype: str = ODOMETRY_TYPE
     noise: BaseNoise | None = None
-
-    msgtype = "nav_msgs/msg/Odometry"
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
@@ -149,34 +128,6 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class GyroPart(FieldsPart):
-    """A gyroscope; orientation and acceleration are marked as unknown, as ROS specifies.
-
-    Attributes:
-        noise: if it is known; only needed to write.
-    """
-
-    noise: BaseNoise | None = None
-
-    msgtype = "sensor_msgs/msg/Imu"
-    fields = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
-    frame = IMU_FRAME
-
-    @override
-    def rest(self) -> dict[str, Any]:
-        unknown = np.array([-1.0, *[0.0] * 8])
-        known = (
-            {} if self.noise is None else {"angular_velocity_covariance": np.eye(3).reshape(-1) * self.noise.gyro**2}
-        )
-        return {
-            "orientation": {"w": 1.0},
-            "orientation_covariance": unknown,
-            "linear_acceleration_covariance": unknown,
-            **known,
-        }
-
-
-@dataclass(frozen=True)
 class ScanPart(Part):
     """A scan. Without a return, ROS has infinity and the dataset the maximum range.
 
@@ -184,9 +135,8 @@ class ScanPart(Part):
         lidar: its ranges and rate; only needed to write.
     """
 
+    msgtype: str = SCAN
     lidar: LidarSpec | None = None
-
-    msgtype = "sensor_msgs/msg/LaserScan"
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:

@@ -43,9 +43,12 @@ class _Step:
         if not self.key:
             return found
         keys = [getattr(one, self.key) for one in found] if self.is_message else list(getattr(message, self.key))
-        if self.value not in keys or keys.index(self.value) >= len(found):
+        if self.value not in keys:
             raise DatasetError(f"{self.key} has no {self.value!r}; it has {', '.join(map(repr, keys)) or 'nothing'}.")
-        return found[keys.index(self.value)]
+        place = keys.index(self.value)
+        if not place < len(found) <= len(keys):
+            raise DatasetError(f"{self.name} has {len(found)} elements, and {self.key} has {len(keys)}.")
+        return found[place]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Which field of which topic is which feature of a robot: one description for bags and for robots on the network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
@@ -15,13 +15,12 @@ from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.fields import Field, elements_of
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.table import JOINTS, SCAN
 from bhd_lerobot.ros2.messages.types import type_store
 
 QUATERNION = "geometry_msgs/msg/Quaternion"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 HEADER = "std_msgs/msg/Header"
-SCAN = "sensor_msgs/msg/LaserScan"
-JOINTS = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True)
@@ -315,6 +314,16 @@ def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> l
         if names.count(topic) > 1:
             kinds = ", ".join(one.msgtype for one in found if one.topic == topic)
             raise ConfigError(f"{topic} is mapped with several types: {kinds}. A topic has one.")
+    return found
+
+
+def fields_of(topic: str, msgtype: str, paths: Iterable[str]) -> TopicFields:
+    """Return what reads and writes some fields of a topic's messages, in order.
+
+    Raises:
+        ConfigError: as for `topics_of`.
+    """
+    [found] = topics_of({path: FieldConfig(topic, msgtype, path) for path in paths}, {})
     return found
 
 

@@ -1,14 +1,15 @@
-"""What a topic carries of a feature: numbers that become messages, and come back as they were.
+"""What a topic carries of a feature: numbers that become messages.
 
 Numbers are float64 in the messages, and ranges float32, as they are in the dataset.
 """
 
+import dataclasses
 import re
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, override
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.table import path_of
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000
@@ -71,60 +73,68 @@ class Part(ABC):
     """Numbers of a feature that one topic carries.
 
     Attributes:
-        names: of the numbers, in the order in which they are given and taken.
+        names: of the numbers, in the order in which they are given.
     """
 
     topic: str
     names: tuple[str, ...]
+    msgtype: str
 
-    msgtype: ClassVar[str]
+    @property
+    def kind(self) -> str:
+        """What it is called in an exported bag."""
+        return type(self).__name__
 
     @abstractmethod
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
         """Return messages of values, shape (n, len(names))."""
 
-    def __len__(self) -> int:
-        """Return how many numbers it carries."""
-        return len(self.names)
 
-
+@dataclass(frozen=True)
 class FieldsPart(Part):
-    """Numbers of which each is a field of a standard message."""
+    """Numbers of which each is a field of a standard message, as the table has it.
 
-    fields: ClassVar[tuple[str, ...]]
-    """Where each of the names is in a message."""
+    Attributes:
+        name: what it is called in an exported bag.
+        frame: of the header; None of messages without one.
+        rest: the other fields that are not zero.
+    """
 
-    frame: ClassVar[str | None] = None
-    """Of the header; None of messages without one."""
+    name: str = ""
+    frame: str | None = None
+    rest: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    @override
+    def kind(self) -> str:
+        return self.name
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        tree = self.rest()
+        tree = dict(self.rest)
         if self.frame is not None:
             tree["header"] = header(frames.stamps, self.frame)
-        for field, column in zip(self.fields, values.T, strict=True):
-            Field(self.msgtype, field).put(tree, column)
+        for name, column in zip(self.names, values.T, strict=True):
+            Field(self.msgtype, path_of(self.msgtype, name)).put(tree, column)
         return encode(self.msgtype, tree, len(values))
 
-    def rest(self) -> dict[str, Any]:
-        """Return the other fields that are not zero."""
-        return {}
 
-
+@dataclass(frozen=True)
 class NumbersPart(Part):
     """Numbers that no standard message is made for."""
 
-    msgtype = types.NUMBERS
+    msgtype: str = types.NUMBERS
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
         return encode(self.msgtype, {**frames.fields(), "names": list(self.names), "values": values}, len(values))
 
 
+@dataclass(frozen=True)
 class IntegersPart(NumbersPart):
     """Whole numbers, or truths."""
 
-    msgtype = types.INTEGERS
+    msgtype: str = types.INTEGERS
 
 
 def own_topic(key: str) -> str:

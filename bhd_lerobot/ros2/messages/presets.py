@@ -1,15 +1,33 @@
 """Mappings of the robots that this package has."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
-from bhd_lerobot.ros2.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, OdometryPart, TwistPart
 from bhd_lerobot.ros2.messages.images import IMAGE
-from bhd_lerobot.ros2.messages.mapping import SCAN, FieldConfig, ImageConfig, MappingConfig
-from bhd_lerobot.ros2.messages.views import JOINT_STATE
+from bhd_lerobot.ros2.messages.mapping import FieldConfig, ImageConfig, MappingConfig, TopicFields, fields_of
+from bhd_lerobot.ros2.messages.table import (
+    GYRO,
+    IMU_TYPE,
+    JOINTS,
+    ODOMETRY,
+    ODOMETRY_TYPE,
+    SCAN,
+    STAMPED_TWIST,
+    TWIST,
+    TWIST_TYPE,
+    path_of,
+)
 
-_POSE = ("position.x", "position.y", "orientation")
+
+def entries(topic: str, msgtype: str, columns: Iterable[str]) -> dict[str, FieldConfig]:
+    """Return the entries of a mapping for columns that messages of a type carry, as the table has it."""
+    return {name: FieldConfig(topic, msgtype, path_of(msgtype, name)) for name in columns}
+
+
+def columns(topic: str, msgtype: str, names: Iterable[str]) -> TopicFields:
+    """Return what reads and writes columns that a topic carries, as the table has it."""
+    return fields_of(topic, msgtype, [path_of(msgtype, name) for name in names])
 
 
 def turtlebot3(
@@ -36,38 +54,26 @@ def turtlebot3(
     assert lidar is not None
     observation: dict[str, FieldConfig] = {}
     if odom is not None:
-        kind = OdometryPart.msgtype
-        fields = [f"twist.{field}" for field in TwistPart.fields]
-        observation |= {name: FieldConfig(odom, kind, field) for name, field in zip(TWIST, fields, strict=True)}
+        observation |= entries(odom, ODOMETRY_TYPE, TWIST)
     observation["scan"] = FieldConfig(
         scan, SCAN, "ranges", beams=beams, range_min=lidar.range_min, range_max=lidar.range_max
     )
     if odom is not None and pose:
-        fields = [f"pose.pose.{field}" for field in _POSE]
-        observation |= {name: FieldConfig(odom, kind, field) for name, field in zip(ODOMETRY, fields, strict=True)}
+        observation |= entries(odom, ODOMETRY_TYPE, ODOMETRY)
     if imu is not None:
-        kind = GyroPart.msgtype
-        observation |= {name: FieldConfig(imu, kind, field) for name, field in zip(GYRO, GyroPart.fields, strict=True)}
-    part = TwistPart if stamped else BareTwistPart
-    action = {name: FieldConfig(cmd, part.msgtype, field) for name, field in zip(TWIST, part.fields, strict=True)}
+        observation |= entries(imu, IMU_TYPE, GYRO)
+    action = entries(cmd, STAMPED_TWIST if stamped else TWIST_TYPE, TWIST)
     images = {name: ImageConfig(topic, type=IMAGE) for name, topic in (cameras or {}).items()}
     return MappingConfig(observation, action, images)
 
 
 def ur5() -> MappingConfig:
     """Return the mapping of a UR5 with a gripper, as `bhd-data export` writes it: joints by name."""
-    joints = [name.removesuffix(".pos") for name in ur5_body().limits.names]
-    place = {joint: f"[name={joint}_joint]" for joint in joints}
-    observed = {"pos": "position", "vel": "velocity"}
+    joints = ur5_body().limits.names
+    speeds = [f"{name.removesuffix('.pos')}.vel" for name in joints]
     return MappingConfig(
-        observation={
-            f"{joint}.{end}": FieldConfig("/joint_states", JOINT_STATE, f"{field}{place[joint]}")
-            for end, field in observed.items()
-            for joint in joints
-        },
-        action={
-            f"{joint}.pos": FieldConfig("/joint_command", JOINT_STATE, f"position{place[joint]}") for joint in joints
-        },
+        observation=entries("/joint_states", JOINTS, (*joints, *speeds)),
+        action=entries("/joint_command", JOINTS, joints),
     )
 
 

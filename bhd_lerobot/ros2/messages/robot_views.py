@@ -13,8 +13,8 @@ from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME, TOOL_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
+from bhd_lerobot.ros2.messages.base import BaseNoise
+from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, TOOL_FRAME
 from bhd_lerobot.ros2.messages.views import JointFrame, RobotView, StaticFrame
 
 _BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, SCAN_FRAME
 from bhd_lerobot.ros2.messages.serialize import decode
+from bhd_lerobot.ros2.messages.table import FOOTPRINT_FRAME, SCAN_FRAME
 from bhd_lerobot.ros2.messages.views import TF
 
 Array = NDArray[np.float64]

@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME, TOOL, TOOL_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, ODOM_FRAME, BaseNoise, OdometryPart
+from bhd_lerobot.ros2.messages.base import BaseNoise, OdometryPart
 from bhd_lerobot.ros2.messages.parts import Array, Frames, header, stamp_tree
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME, JOINTS, ODOM_FRAME, TOOL, TOOL_FRAME
 
 TF = "tf2_msgs/msg/TFMessage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ def wheel_states(
         "position": angles,
         "velocity": speeds,
     }
-    return encode(JOINT_STATE, fields, len(angles))
+    return encode(JOINTS, fields, len(angles))
 
 
 def camera_info(frames: Frames, frame_id: str, size: tuple[int, int], fovy: float) -> list[bytes]:

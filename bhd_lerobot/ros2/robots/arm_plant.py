@@ -1,7 +1,6 @@
 """An arm of Universal Robots behind `ur_robot_driver`, below the cerebellum."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,64 +8,18 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages import ur
-from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.messages.views import JOINT_STATE
+from bhd_lerobot.ros2.messages.definitions import find_type
+from bhd_lerobot.ros2.messages.mapping import fields_of
+from bhd_lerobot.ros2.messages.presets import columns
+from bhd_lerobot.ros2.messages.table import JOINTS
 from bhd_lerobot.ros2.robots.plant import Ros2Plant
 
 _SILENCE_S = 0.2  # of joints at 125 Hz
 _FOREVER = float("inf")
-
-
-@dataclass(frozen=True)
-class JointReader:
-    """Angles [rad] and speeds [rad/s] of joints, which are found by name."""
-
-    joints: tuple[str, ...]
-
-    @property
-    def width(self) -> int:
-        """Twice the number of joints."""
-        return 2 * len(self.joints)
-
-    def read(self, message: Any) -> NDArray[np.float64]:
-        """Return the angles and then the speeds, shape (width,)."""
-        names = list(message.name)
-        if missing := [joint for joint in self.joints if joint not in names]:
-            raise DatasetError(f"it has no {', '.join(missing)}; it has {', '.join(names) or 'no joint'}")
-        for what, values in (("positions", message.position), ("velocities", message.velocity)):
-            if len(values) != len(names):
-                raise DatasetError(
-                    f"it has {len(values)} {what} of {len(names)} joints; both are needed of every joint"
-                )
-        order = [names.index(joint) for joint in self.joints]
-        return np.concatenate([message.position[order], message.velocity[order]])
-
-
-@dataclass(frozen=True)
-class NumberReader:
-    """The one number of a message."""
-
-    field: str
-    width: int = 1
-
-    def read(self, message: Any) -> NDArray[np.float64]:
-        """Return the number, shape (1,)."""
-        return np.array([getattr(message, self.field)], np.float64)
-
-
-@dataclass(frozen=True)
-class FloatsWriter:
-    """Numbers as a Float64MultiArray."""
-
-    width: int
-
-    def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
-        """Return the message; it has no stamp."""
-        return encode(ur.FLOATS, {"data": features[None]}, 1)[0]
 
 
 class ArmPlant(Ros2Plant):
@@ -88,21 +41,21 @@ class ArmPlant(Ros2Plant):
     def __init__(self, config: Any, body: Arm) -> None:
         if config.ros2.scan_yaw is not None:
             raise ConfigError(f"robot.ros2.scan_yaw is {config.ros2.scan_yaw}; an arm has no scanner.")
-        joints = tuple(f"{joint}_joint" for joint in body.chain.joints)
+        joints = body.chain.joints
         self._count = len(joints)
         self._opening = body.home[-1]
         self._rest: NDArray[np.float64] | None = None  # the joints at the first command
+        find_type(ur.SAFETY_MODE)
+        states = columns("/joint_states", JOINTS, [f"{joint}.{end}" for end in ("pos", "vel") for joint in joints])
+        silence_s = max(_SILENCE_S, config.ros2.silent_s)
         inputs = (
-            InputSpec(
-                "/joint_states", JOINT_STATE, JointReader(joints), SENSOR_DATA, max(_SILENCE_S, config.ros2.silent_s)
-            ),
-            InputSpec(ur.SCALING_TOPIC, ur.FLOAT, NumberReader("data"), SENSOR_DATA, _FOREVER),
-            InputSpec(ur.SAFETY_TOPIC, ur.SAFETY_MODE, NumberReader("mode"), LATCHED, silence_s=_FOREVER),
+            InputSpec.of(states, SENSOR_DATA, silence_s),
+            InputSpec.of(fields_of(ur.SCALING_TOPIC, ur.FLOAT, ["data"]), SENSOR_DATA, _FOREVER),
+            InputSpec.of(fields_of(ur.SAFETY_TOPIC, ur.SAFETY_MODE, ["mode"]), LATCHED, _FOREVER),
         )
-        outputs = (
-            OutputSpec(ur.POSITION_TOPIC, ur.FLOATS, FloatsWriter(self._count), Qos(1)),
-            OutputSpec(ur.GRIPPER_TOPIC, ur.FLOATS, FloatsWriter(1), Qos(1), is_required=False),
-        )
+        positions = fields_of(ur.POSITION_TOPIC, ur.FLOATS, [f"data[{k}]" for k in range(self._count)])
+        opening = fields_of(ur.GRIPPER_TOPIC, ur.FLOATS, ["data[0]"])
+        outputs = (OutputSpec.of(positions, Qos(1)), OutputSpec.of(opening, Qos(1), is_required=False))
         super().__init__(body.name, config, inputs, outputs)
         self.hint += " A controller that is not active takes none (ros2 control list_controllers)."
 

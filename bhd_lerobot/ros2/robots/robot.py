@@ -18,7 +18,6 @@ from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import CameraSpec, InputSpec, NodeSpec, OutputSpec
 from bhd_lerobot.ros2.messages.mapping import (
-    SCAN,
     FieldsReader,
     MappingConfig,
     TopicFields,
@@ -26,6 +25,7 @@ from bhd_lerobot.ros2.messages.mapping import (
     sendable_topics,
     topics_of,
 )
+from bhd_lerobot.ros2.messages.table import SCAN
 from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
 from bhd_lerobot.ros2.robots.plant import scan_reader
 

@@ -19,6 +19,7 @@ from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import ur, views
 from bhd_lerobot.ros2.messages.parts import Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.table import JOINTS
 from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 
@@ -54,7 +55,7 @@ class ArmTopics(Topics):
         self._next: tuple[Any, int] | None = None  # the trajectory that takes its place, and when [ns]
         self._period_ns = NANOSECONDS // host.rates.fps
         self._sent_ns = 0
-        self._joint_states = node.publisher("/joint_states", views.JOINT_STATE)
+        self._joint_states = node.publisher("/joint_states", JOINTS)
         self._scaling = node.publisher(ur.SCALING_TOPIC, ur.FLOAT)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
@@ -96,7 +97,7 @@ class ArmTopics(Topics):
             "velocity": record["joint_velocities"][:, :count],
             "effort": record["joint_efforts"][:, :count],
         }
-        self._joint_states.send(encode(views.JOINT_STATE, fields, 1)[0])
+        self._joint_states.send(encode(JOINTS, fields, 1)[0])
 
     def _publish_transforms(self, state: State) -> None:
         angles = state.record["joint_positions"][0]

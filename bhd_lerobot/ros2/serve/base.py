@@ -15,15 +15,11 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import views
-from bhd_lerobot.ros2.messages.base import (
-    GYRO,
-    TWIST,
-    GyroPart,
-    OdometryPart,
-    ScanPart,
-)
-from bhd_lerobot.ros2.messages.parts import Frames, header
+from bhd_lerobot.ros2.messages.base import OdometryPart, ScanPart
+from bhd_lerobot.ros2.messages.parts import FieldsPart, Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.split import gyro_message
+from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, ODOMETRY, TWIST
 from bhd_lerobot.ros2.serve.server import Output, State, Topics
 
 NODE_HZ = 20  # of turtlebot3_node's timer
@@ -52,15 +48,15 @@ class BaseTopics(Topics):
         names = list(host.observation_names)
         self._gyro = [names.index(name) for name in GYRO]
         self._ranges = slice(names.index("scan_000.pos"), names.index("scan_000.pos") + beams)
-        self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), body.lidar)
-        self._odometry_part = OdometryPart("/odom", (*TWIST, "x.pos", "y.pos", "theta.pos"))
-        self._gyro_part = GyroPart("/imu", GYRO)
+        self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=body.lidar)
+        self._odometry_part = OdometryPart("/odom", (*TWIST, *ODOMETRY))
+        self._gyro_part = FieldsPart("/imu", GYRO, **gyro_message())
         self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
         self._odometry = node.publisher("/odom", OdometryPart.msgtype)
-        self._imu = node.publisher("/imu", GyroPart.msgtype)
-        self._joints = node.publisher("/joint_states", views.JOINT_STATE)
+        self._imu = node.publisher("/imu", IMU_TYPE)
+        self._joints = node.publisher("/joint_states", JOINTS)
         self._battery = node.publisher("/battery_state", _BATTERY)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
@@ -86,7 +82,7 @@ class BaseTopics(Topics):
         }
         self._odometry.send(self._odometry_part.encode(frames, moved)[0])
         self._imu.send(self._gyro_part.encode(frames, record["observation"][:, self._gyro])[0])
-        self._joints.send(encode(views.JOINT_STATE, joints, 1)[0])
+        self._joints.send(encode(JOINTS, joints, 1)[0])
         battery = {
             "header": header(stamps),
             **{"voltage": _VOLTAGE, "temperature": math.nan, "current": math.nan, "charge": math.nan},

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.ros2.live.network import LATCHED
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME
 from bhd_lerobot.ros2.messages.views import JointFrame, RobotView
 from bhd_lerobot.sim.description import Part, Solid
 

@@ -11,8 +11,7 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
 from bhd_lerobot.robots.host.realtime import LiveHost
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME
-from bhd_lerobot.ros2.messages.base import FOOTPRINT_FRAME, ODOM_FRAME
+from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME, ODOM_FRAME
 from bhd_lerobot.ros2.serve.server import NEVER_NS
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.1, math.radians(10.0)  # as the task navigate has them

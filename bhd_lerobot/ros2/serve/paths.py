@@ -14,10 +14,9 @@ from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.messages.arm import ARM_FRAME
-from bhd_lerobot.ros2.messages.base import ODOM_FRAME
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import decode, encode
+from bhd_lerobot.ros2.messages.table import ARM_FRAME, ODOM_FRAME
 from bhd_lerobot.ros2.messages.types import type_store
 from bhd_lerobot.ros2.serve.server import Output, State, Topics
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory

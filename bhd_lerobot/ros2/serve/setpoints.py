@@ -10,7 +10,7 @@ from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import ur
-from bhd_lerobot.ros2.messages.base import BareTwistPart, TwistPart
+from bhd_lerobot.ros2.messages.table import STAMPED_TWIST, TWIST_TYPE
 from bhd_lerobot.ros2.serve.server import Counts, Input, Topics
 
 
@@ -29,7 +29,7 @@ class Setpoints(Topics):
         self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
         is_arm = isinstance(host.body, Arm)
         # Twists of Jazzy, and those of Humble and of most tutorials.
-        types = (ur.FLOATS,) if is_arm else (TwistPart.msgtype, BareTwistPart.msgtype)
+        types = (ur.FLOATS,) if is_arm else (STAMPED_TWIST, TWIST_TYPE)
         take = self._move if is_arm else self._drive
         self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
 

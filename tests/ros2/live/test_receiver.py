@@ -12,9 +12,9 @@ from bhd_lerobot.ros2.live.network import NetworkConfig
 from bhd_lerobot.ros2.live.node import Received
 from bhd_lerobot.ros2.live.process import Receiver
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec
+from bhd_lerobot.ros2.messages.mapping import fields_of
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode
-from bhd_lerobot.ros2.robots.arm_plant import NumberReader
 
 BATTERY = "sensor_msgs/msg/BatteryState"
 
@@ -30,7 +30,11 @@ def taken(stamps: list[float]) -> list[float]:
     ]
     topic: Any = SimpleNamespace(take=lambda: [arrived.pop(0)] if arrived else [])
     node: Any = SimpleNamespace(subscription=lambda *_: topic, graph=SimpleNamespace(endpoints=list))
-    spec = NodeSpec("test", NetworkConfig(), (InputSpec("/battery", BATTERY, NumberReader("voltage")),))
+    spec = NodeSpec(
+        "test",
+        NetworkConfig(),
+        (InputSpec.of(fields_of("/battery", BATTERY, ["voltage"])),),
+    )
     channel = Channel(spec)
     receiver = Receiver(spec, channel, node)
     found = []

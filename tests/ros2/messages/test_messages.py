@@ -85,7 +85,7 @@ def test_of_an_unknown_robot_everything_is_plain_numbers():
     names = ["x.vel", "theta.vel", "shoulder.pos"]
     (part,) = parts_of("observation.state", names, "so100", lidar=None)
     assert (part.msgtype, part.topic, part.names) == (types.NUMBERS, "/bhd/observation_state", tuple(names))
-    kinds = [type(one).__name__ for one in parts_of("observation.state", names, "ur5", lidar=None)]
+    kinds = [one.kind for one in parts_of("observation.state", names, "ur5", lidar=None)]
     assert kinds == ["OdometryPart", "JointsPart"]
 
 
@@ -111,7 +111,7 @@ def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
 def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
     """On the wall clock the age includes the way to the brain: 5 ms here, for a scan 1 ms after an observation."""
     lidar = turtlebot3_burger().lidar
-    part = ScanPart("/scan", tuple(f"scan_{beam:03d}.pos" for beam in range(4)), lidar)
+    part = ScanPart("/scan", tuple(f"scan_{beam:03d}.pos" for beam in range(4)), lidar=lidar)
     observed = np.array([0, 100, 200, 300]) * 10**6 + 10**18
     values = np.repeat([[1.0], [1.0], [2.0], [2.0]], 4, axis=1)
     age = np.array([0.005, 0.105, 0.104, 0.204], np.float32)

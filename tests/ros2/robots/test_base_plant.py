@@ -204,7 +204,7 @@ UNUSABLE: dict[str, tuple[str, dict[str, Any], dict[str, Any], str]] = {  # join
         "100000 ranges; at most 10000 are read",
     ),
     "another frame": (JOINTS, WHEELS, {"header": head("laser")}, "frame 'laser', whose rotation in the robot is not"),
-    "no joints": (JOINTS, {}, {}, "cannot be used: it has positions and velocities of no joint; needed"),
+    "no joints": (JOINTS, {}, {}, "cannot be used: name has no 'wheel_left_joint'; it has nothing"),
     "no JointState": (STRING, {}, {}, f"/robot is of type {STRING}; .* of {JOINTS}"),
 }
 

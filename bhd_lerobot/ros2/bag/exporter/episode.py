@@ -31,6 +31,7 @@ from bhd_lerobot.ros2.messages.parts import (
 )
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.split import check_topics, parts_of
+from bhd_lerobot.ros2.messages.table import JOINTS
 
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
 _LONGEST_S = 1e8  # three years, longer than any recording
@@ -155,7 +156,7 @@ class EpisodeTopics:
     ) -> list[Stream]:
         streams = []
         if wheels := views.wheel_states(self._view, frames, self._features, columns):
-            streams.append(_stream("/joint_states", views.JOINT_STATE, frames, wheels))
+            streams.append(_stream("/joint_states", JOINTS, frames, wheels))
         if links := views.moving_transforms(self._view, frames, motion):
             streams.append(_stream("/tf", views.TF, frames, links))
         return streams
@@ -183,7 +184,7 @@ class EpisodeTopics:
         identity = self._state.identity or {}
         metadata = {name.removeprefix(PREFIX): value for name, value in row.items() if name.startswith(PREFIX)}
         topics = [
-            {"feature": key, "topic": part.topic, "kind": type(part).__name__, "names": list(part.names)}
+            {"feature": key, "topic": part.topic, "kind": part.kind, "names": list(part.names)}
             for key, parts in self._parts.items()
             for part in parts
         ]
@@ -218,7 +219,7 @@ def image_topic(key: str, *, compressed: bool) -> str:
 def _split(
     feature: Mapping[str, Any], parts: Sequence[Part], values: NDArray[Any] | None
 ) -> Iterator[tuple[Part, NDArray[Any]]]:
-    """Yield the numbers of each part, shape (n, len(part)), as float64 or as integers."""
+    """Yield the numbers of each part, shape (n, len(part.names)), as float64 or as integers."""
     if not parts or values is None:
         return
     table = values.reshape(len(values), -1)

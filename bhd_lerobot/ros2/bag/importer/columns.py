@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import NANO, Times, newest, newest_before
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track
-from bhd_lerobot.ros2.messages.base import ODOMETRY, TWIST
+from bhd_lerobot.ros2.messages.table import ODOMETRY, TWIST
 from bhd_lerobot.tasks.task import Event
 
 MOST_UNEXPLAINED = 0.1

@@ -30,7 +30,7 @@ from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.ros2.bag.importer.video import CameraImages
 from bhd_lerobot.ros2.bag.storage.place import complete_or_not
 from bhd_lerobot.ros2.bag.storage.read import Bag
-from bhd_lerobot.ros2.messages.base import TWIST
+from bhd_lerobot.ros2.messages.table import TWIST
 from bhd_lerobot.tasks.task import Event
 
 _LISTED = 8  # sentences in an error; a damaged bag may give hundreds

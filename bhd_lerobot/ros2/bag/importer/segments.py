@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, clock_jumps
 from bhd_lerobot.ros2.bag.importer.tracks import Array, Track, seconds
-from bhd_lerobot.ros2.messages.base import ODOMETRY
+from bhd_lerobot.ros2.messages.table import ODOMETRY
 
 _LISTED = 5  # of the same kind, one by one
 _MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_LISTED`) no restart explains it

@@ -14,11 +14,12 @@ from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
 from bhd_lerobot.ros2.bag.storage.read import Messages
-from bhd_lerobot.ros2.messages.base import GyroPart, OdometryPart, odometry, unwrapped
+from bhd_lerobot.ros2.messages.base import odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
-from bhd_lerobot.ros2.messages.mapping import SCAN, MappingConfig, TopicFields, topics_of
+from bhd_lerobot.ros2.messages.mapping import MappingConfig, TopicFields, topics_of
 from bhd_lerobot.ros2.messages.parts import header_stamps
 from bhd_lerobot.ros2.messages.scan import ScanReader, Static
+from bhd_lerobot.ros2.messages.table import IMU_TYPE, ODOMETRY_TYPE, SCAN
 
 Array = NDArray[np.float64]
 
@@ -133,14 +134,14 @@ def base_sources(
     for source in mapped_sources(mapping, scan_frame, scan_yaw):
         (first, *_) = source.readers
         readers = {**source.readers, **bare_readers.get(source.feature, {})}
-        if first == OdometryPart.msgtype:
+        if first == ODOMETRY_TYPE:
             readers = {first: partial(_odometry, readers[first], odom_frame)}
         found.append(replace(source, readers=readers, option="--cmd" if source.is_action else _OPTIONS[first]))
     return found
 
 
 _IMAGES = (IMAGE, COMPRESSED)
-_OPTIONS = {SCAN: "--scan", OdometryPart.msgtype: "--odom", GyroPart.msgtype: "--imu", IMAGE: "--camera"}
+_OPTIONS = {SCAN: "--scan", ODOMETRY_TYPE: "--odom", IMU_TYPE: "--imu", IMAGE: "--camera"}
 
 
 def _places(reading: Reading) -> Array:

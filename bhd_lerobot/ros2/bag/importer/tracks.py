@@ -14,10 +14,11 @@ from bhd_lerobot.ros2.bag.importer.resample import Times, apart, message_times, 
 from bhd_lerobot.ros2.bag.importer.sources import Reading, Source
 from bhd_lerobot.ros2.bag.importer.topics import other_form, publisher_notes, wanted_topics
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
-from bhd_lerobot.ros2.messages.mapping import JOINTS, has_header
+from bhd_lerobot.ros2.messages.mapping import has_header
 from bhd_lerobot.ros2.messages.parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.ros2.messages.scan import static_frames, static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
+from bhd_lerobot.ros2.messages.table import JOINTS
 
 Array = NDArray[np.float64]
 
