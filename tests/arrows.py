@@ -60,7 +60,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.validate": (*_DATASETS, "control.geometry"),
     "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
     "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),
-    "datasets.remote": (*_DATASETS, "datasets.assembly", "datasets.edit"),
+    "datasets.remote": (*_DATASETS, "datasets.assembly"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": (*_DATASETS, "control"),
     "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),

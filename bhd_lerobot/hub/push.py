@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url, listed, megabytes
+from bhd_lerobot.datasets.remote.listing import listed, megabytes
+from bhd_lerobot.datasets.remote.place import check_repo_id, is_url, shown
 from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.hub.transfer import command_line, quiet_bars, remote_of
 
@@ -29,7 +30,6 @@ def push_dataset(
     """Upload a dataset, with its card."""
     from bhd_lerobot.datasets.format.state import DatasetState
     from bhd_lerobot.datasets.remote.push import Card, push
-    from bhd_lerobot.datasets.remote.url import shown
 
     def make(state: DatasetState, has_image: bool) -> Card:
         from bhd_lerobot.hub.card import CardOptions, make_card
@@ -61,7 +61,7 @@ def left_by_interrupt(root: Path, again: str) -> str:
 
 def check_pushable(repo_id: str) -> None:
     """Check what can be checked without asking the Hub: the name, and that there is a token."""
-    from bhd_lerobot.datasets.remote.hub_errors import require_token
+    from bhd_lerobot.datasets.remote.errors import require_token
 
     require_token(check_repo_id(repo_id))
 

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from bhd_lerobot.datasets.remote.hub_errors import hub_errors
+from bhd_lerobot.datasets.remote.errors import transfer_errors
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
@@ -118,7 +118,7 @@ class RunOutput:
         kept = "is not on this machine" if self.checkpoint is None else f"is complete at {self.checkpoint}"
         left = f"{what} {kept}. {again}".rstrip()
         try:
-            with prompt_interrupt(left), hub_errors(repo_id, "upload to"):
+            with prompt_interrupt(left), transfer_errors(repo_id, "upload to"):
                 yield
         except TransferError as error:
             raise TransferError(f"{error}\n{left}") from error

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url, megabytes
+from bhd_lerobot.datasets.remote.listing import megabytes
+from bhd_lerobot.datasets.remote.place import check_repo_id, is_url
 from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError, counted
 from bhd_lerobot.hub.transfer import (
     folder_of,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url
+from bhd_lerobot.datasets.remote.place import check_repo_id, is_url
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.hub.push import format_push_report, left_by_interrupt, push_dataset
 from bhd_lerobot.hub.transfer import (

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bhd_lerobot.datasets.remote.hub_errors import explain
+from bhd_lerobot.datasets.remote.errors import explain
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.pointers import check_fetched

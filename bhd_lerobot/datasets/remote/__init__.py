@@ -1,3 +1,3 @@
 """Transfer to the Hub and to object stores."""
 
-__all__ = ["hub", "hub_errors", "listing", "local", "pull", "push", "staging", "store", "subset", "url"]
+__all__ = ["errors", "hub", "listing", "local", "place", "pull", "push", "store"]

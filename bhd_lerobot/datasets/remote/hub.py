@@ -1,19 +1,13 @@
 """A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot expects."""
 
-import glob
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bhd_lerobot.datasets.remote.hub_errors import hub_errors, require_token
-from bhd_lerobot.datasets.remote.listing import (
-    Item,
-    RemoteFile,
-    check_repo_id,
-    listed,
-)
-from bhd_lerobot.datasets.remote.local import LocalDataset
+from bhd_lerobot.datasets.remote.errors import require_token, transfer_errors
+from bhd_lerobot.datasets.remote.listing import RemoteFile, listed
+from bhd_lerobot.datasets.remote.place import check_repo_id
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import TransferError
 
@@ -51,15 +45,17 @@ class HubDataset:
         self.name, self.revision = check_repo_id(repo_id), revision
         self.commit: str | None = None
         self._private, self._tag, self._create = private, tag, create
-        self._listed: dict[str, RemoteFile] = {}
+        self._branch = revision or MAIN
 
     def files(self) -> dict[str, RemoteFile]:
         """Return all files of the revision by path; makes the repository first if it was opened with `create`."""
         if self._create:
             self._make()
-        with hub_errors(self.name, "read", revision=self.revision):
-            api = self._api
-            info = api.repo_info(self.name, repo_type="dataset", revision=self._wanted())
+        with transfer_errors(self.name, "read", revision=self.revision):
+            wanted = self._branch
+            if not self._create and self.revision is None and VERSION_TAG in self._tags():
+                wanted = VERSION_TAG
+            info = self._api.repo_info(self.name, repo_type="dataset", revision=wanted)
             if self._create and self._private is not None and bool(info.private) != self._private:
                 is_now, wanted = ("private", "public") if info.private else ("public", "private")
                 raise TransferError(
@@ -67,40 +63,40 @@ class HubDataset:
                     "or choose another name."
                 )
             self.commit = info.sha
-            tree = api.list_repo_tree(self.name, repo_type="dataset", revision=self.commit, recursive=True)
-            self._listed = {entry.path: _file(entry) for entry in tree if hasattr(entry, "blob_id")}
-            return dict(self._listed)
+            tree = self._api.list_repo_tree(self.name, repo_type="dataset", revision=info.sha, recursive=True)
+            return {one.path: _file(one) for one in tree if hasattr(one, "blob_id")}
 
-    def read(self, path: str) -> bytes | None:
-        """Return a file of the listed commit; None if it has none of this name."""
-        from huggingface_hub import hf_hub_download
-
-        if path not in self._listed:
-            return None
-        with hub_errors(self.name, f"read {path} of", revision=self.revision), tempfile.TemporaryDirectory() as folder:
-            found = hf_hub_download(self.name, path, repo_type="dataset", revision=self.commit, local_dir=folder)
-            return Path(found).read_bytes()
+    def read(self, path: str) -> bytes:
+        """Return a file of the listed commit."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.fetch([path], Path(folder))
+            return Path(folder, path).read_bytes()
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Download files of the listed commit."""
+        import glob
+
         from huggingface_hub import snapshot_download
 
-        others = self._listed.keys() - set(paths)
-        wanted = ("allow_patterns", paths) if len(paths) < len(others) else ("ignore_patterns", others)
-        options: dict[str, Any] = {wanted[0]: [glob.escape(path) for path in wanted[1]], "local_dir": folder}
-        with hub_errors(self.name, "download", revision=self.revision):
-            snapshot_download(self.name, repo_type="dataset", revision=self.commit, **options)
+        patterns = [glob.escape(path) for path in paths]
+        with transfer_errors(self.name, "download", revision=self.revision):
+            snapshot_download(
+                self.name, repo_type="dataset", revision=self.commit, allow_patterns=patterns, local_dir=folder
+            )
 
-    def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
-        """Upload files and remove others in one commit, and set the tags."""
-        with hub_errors(self.name, "upload the dataset to", revision=self.revision):
+    def send(self, files: Mapping[str, Path], deleted: Sequence[str], check: Callable[[], None]) -> None:
+        """Upload files and remove others in one commit, and set the tags.
+
+        `HfApi.upload_folder` makes several commits of a large folder, between which a reader would find a mixture.
+        """
+        with transfer_errors(self.name, "upload the dataset to", revision=self.revision):
             found = self._tags().get(self._tag or "")
-            if found is not None and (items or deleted or found != self.commit):
+            if found is not None and (files or deleted or found != self.commit):
                 raise TransferError(
                     f"{self.name} has a tag {self._tag!r} already, which marks another version. Choose another."
                 )
-            if items or deleted:
-                self._commit(source, items, deleted)
+            if files or deleted:
+                self._commit(files, deleted, check)
             for tag in (VERSION_TAG if self._branch == MAIN else None, self._tag):
                 if tag is not None:
                     self._set_tag(tag)
@@ -111,34 +107,23 @@ class HubDataset:
 
         return HfApi(library_name="bhd_lerobot")
 
-    @property
-    def _branch(self) -> str:
-        return self.revision or MAIN
-
-    def _wanted(self) -> str:
-        """Return the revision to list: for a reader who names none, the one that stock LeRobot takes."""
-        if self._create or self.revision is not None:
-            return self._branch
-        return VERSION_TAG if VERSION_TAG in self._tags() else MAIN
-
     def _tags(self) -> dict[str, str]:
         refs = self._api.list_repo_refs(self.name, repo_type="dataset")
         return {tag.name: tag.target_commit for tag in refs.tags}
 
     def _make(self) -> None:
         require_token(self.name)
-        with hub_errors(self.name, "create the repository", revision=self.revision):
-            api = self._api
-            api.create_repo(self.name, repo_type="dataset", private=self._private, exist_ok=True)
+        with transfer_errors(self.name, "create the repository", revision=self.revision):
+            self._api.create_repo(self.name, repo_type="dataset", private=self._private, exist_ok=True)
             if self._branch in self._tags():
                 raise TransferError(f"Could not write to {self.name}: {self._branch!r} is a tag. Name a branch.")
             if self._branch != MAIN:
-                api.create_branch(self.name, branch=self._branch, repo_type="dataset", exist_ok=True)
+                self._api.create_branch(self.name, branch=self._branch, repo_type="dataset", exist_ok=True)
 
-    def _commit(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
+    def _commit(self, files: Mapping[str, Path], deleted: Sequence[str], check: Callable[[], None]) -> None:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-        additions = [CommitOperationAdd(item.path, item.content) for item in items]
+        additions = [CommitOperationAdd(path, str(file)) for path, file in files.items()]
         place: dict[str, Any] = {"repo_id": self.name, "repo_type": "dataset", "revision": self._branch}
         # At first all the content, which takes long and is not visible yet; what arrived is not sent again.
         self._api.preupload_lfs_files(additions=additions, free_memory=False, **place)
@@ -147,7 +132,7 @@ class HubDataset:
                 f"Could not upload the dataset to {self.name}: the repository's .gitignore names {listed(ignored)}, "
                 "and the Hub would leave them out. Change that file there; nothing was changed."
             )
-        source.check_unchanged()
+        check()
         removals = [CommitOperationDelete(path) for path in deleted]
         self.commit = self._api.create_commit(
             operations=[*removals, *additions], commit_message="Dataset", parent_commit=self.commit, **place
@@ -166,4 +151,4 @@ class HubDataset:
 def _file(entry: Any) -> RemoteFile:
     if entry.lfs is not None:
         return RemoteFile(entry.lfs.size, entry.lfs.sha256)
-    return RemoteFile(entry.size, entry.blob_id, "git")
+    return RemoteFile(entry.size, entry.blob_id)

@@ -1,134 +1,53 @@
-"""A copy of a dataset somewhere else, on the Hub or below a URL: what both have in common."""
+"""Files of a dataset on the Hub or below a URL: how they are named, compared and printed."""
 
 import hashlib
-import os
 import re
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bhd_lerobot.datasets.format.info import InfoError, checked_info, parse_object
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import ConfigError, DatasetError
-
-if TYPE_CHECKING:
-    from bhd_lerobot.datasets.remote.hub import HubDataset
-    from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.errors import DatasetError
 
 CARD = "README.md"
 PREVIEW = "preview.png"
 SUBSET = "meta/bhd_subset.json"
 """Names the episodes of a dataset that were requested, if files of it are missing. It is never uploaded."""
 
-MANIFEST = "bhd_files.json"
-"""Checksums that version 0.2 wrote below a URL. It is never copied, and a push removes it."""
-
-WORKERS = 4
-"""Files that are moved at a time. With more of them the threads of a fast connection mostly wait for each other."""
-
-_REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_CHUNK_FILE = r"chunk-\d+/file-\d+"
+_RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/]+/{_CHUNK_FILE}\.mp4")
 
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A file of a remote dataset.
-
-    Attributes:
-        size: its bytes.
-        digest: its checksum in hexadecimal; None if the place knows none.
-        algorithm: how the checksum is made: `sha256`, or `git`, the name that git gives to the content.
-    """
+    """A file: its bytes, and on the Hub the SHA-256 of its content or, if it is small, git's name of it."""
 
     size: int
-    digest: str | None
-    algorithm: str = "sha256"
+    digest: str | None = None
 
-    def matches(self, content: Path | bytes) -> bool:
-        """Return whether a file on this machine, or its bytes, are this file; without a checksum, its size decides."""
-        if isinstance(content, Path):
-            if not content.is_file() or content.stat().st_size != self.size:
-                return False
-            return self.digest is None or self.digest == self._digest(content)
-        return len(content) == self.size and self.digest in (None, self._hasher(content).hexdigest())
-
-    @classmethod
-    def of(cls, path: Path) -> "RemoteFile":
-        """Return the size and checksum of a file on this machine."""
-        file = cls(path.stat().st_size, None)
-        return cls(file.size, file._digest(path))
-
-    def _hasher(self, content: bytes = b"") -> Any:
-        if self.algorithm == "git":
-            return hashlib.sha1(b"blob %d\0" % self.size + content, usedforsecurity=False)
-        return hashlib.sha256(content)
-
-    def _digest(self, path: Path) -> str:
+    def matches(self, path: Path) -> bool:
+        """Return whether a file on this machine is this file; without a digest, its size decides."""
+        if not path.is_file() or path.stat().st_size != self.size or self.digest is None:
+            return path.is_file() and path.stat().st_size == self.size
+        git = hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+        hasher = git if len(self.digest) == 2 * git.digest_size else hashlib.sha256()
         with open(path, "rb", buffering=0) as file:
-            return hashlib.file_digest(file, self._hasher).hexdigest()
+            return hashlib.file_digest(file, lambda: hasher).hexdigest() == self.digest
 
 
-@dataclass(frozen=True)
-class Item:
-    """A file that is to lie in a remote dataset: at `path`, with slashes; `size` is in bytes."""
-
-    path: str
-    content: Path | bytes
-    size: int
-
-
-type Remote = HubDataset | StoreDataset
-"""A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
-
-Where `has_checksums` is on, files are listed with theirs, and an interrupted download can be resumed.
-"""
-
-
-def matching(contents: Mapping[str, Path | bytes], files: Mapping[str, RemoteFile]) -> set[str]:
-    """Return which contents on this machine, by path, are the listed files of these paths."""
-    with ThreadPoolExecutor(WORKERS) as pool:
-        same = pool.map(lambda path: path in files and files[path].matches(contents[path]), contents)
-        return {path for path, is_same in zip(contents, same, strict=True) if is_same}
-
-
-def refuse_overlap(root: Path, remote: Remote) -> None:
-    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced."""
-    if remote.folder is None:
-        return
-    here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
-    is_one = here.exists() and there.exists() and os.path.samefile(here, there)
-    if is_one or here.is_relative_to(there) or there.is_relative_to(here):
-        raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")
-
-
-def is_url(place: str) -> bool:
-    """Return whether a place is a URL, and not the name of a dataset on the Hub."""
-    return "://" in place
-
-
-def check_repo_id(name: str) -> str:
-    """Return a name on the Hub if it is one."""
-    if not _REPO_ID.fullmatch(name) or ".." in name or "--" in name or name.endswith((".git", ".", "-")):
-        raise ConfigError(
-            f"{name!r} is neither a name on the Hub, such as user/name, nor a URL, such as s3://bucket/folder or "
-            "file:///folder."
-        )
-    return name
+def matching(paths: Mapping[str, Path], files: Mapping[str, RemoteFile]) -> set[str]:
+    """Return which files on this machine are the remote files of the same names."""
+    with ThreadPoolExecutor(4) as pool:
+        same = pool.map(lambda name: name in files and files[name].matches(paths[name]), paths)
+        return {name for name, is_same in zip(paths, same, strict=True) if is_same}
 
 
 def is_recorded(path: str) -> bool:
     """Return whether a path is that of a data, video or episode-metadata file in LeRobot's layout."""
     return bool(_RECORDED.fullmatch(path))
-
-
-_CHUNK_FILE = r"chunk-\d+/file-\d+"
-_RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/]+/{_CHUNK_FILE}\.mp4")
-
-
-def total(items: Iterable[Item | RemoteFile]) -> int:
-    """Return the bytes of some files."""
-    return sum(item.size for item in items)
 
 
 def megabytes(size: int) -> str:

@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bhd_lerobot.datasets.format.state import DatasetState, load_state
-from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET, Item, is_recorded, listed
-from bhd_lerobot.datasets.remote.subset import is_subset
+from bhd_lerobot.datasets.remote.listing import SUBSET, is_recorded, listed
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.datasets.storage.disk import RootLock
@@ -18,29 +16,23 @@ from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.datasets.storage.pointers import check_fetched
 from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
 
-_TEMPORARY = ("images",)  # LeRobot's own, of frames whose video is not encoded yet
+_SKIPPED = {SUBSET, layout.UNREPORTED}
 
 
 @dataclass(frozen=True)
 class LocalDataset:
-    """A valid dataset on this machine; what is `left_out` belongs to no episode, and is not copied."""
+    """A valid dataset on this machine: its files by path; those `left_out` belong to no episode and are not copied."""
 
     root: Path
     state: DatasetState
-    items: list[Item]
+    files: dict[str, Path]
     left_out: list[str]
     _stamps: dict[str, tuple[int, ...]]
-
-    @property
-    def info(self) -> Item:
-        """Return its `meta/info.json`."""
-        return next(item for item in self.items if item.path == layout.INFO)
 
     def check_unchanged(self) -> None:
         """Check that nothing was written since the dataset was opened."""
         now = _stamps(self.root)
-        changed = {name for name in now.keys() | self._stamps.keys() if now.get(name) != self._stamps.get(name)}
-        if changed:
+        if changed := {name for name in now | self._stamps if now.get(name) != self._stamps.get(name)}:
             raise DatasetError(
                 f"{self.root} was changed by another program while it was being copied: {listed(changed)}. What was "
                 "sent is not shown to anybody. Wait until the other program ends."
@@ -59,49 +51,33 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
         raise DatasetLockedError(
             f"{root} is in use: it is being recorded, repaired or copied by another process. Wait until that ends."
         ) from error
-    try:
+    with contextlib.closing(lock):
         stamps = _stamps(root)
-        if is_subset(root):
+        if (root / SUBSET).exists():
             raise DatasetError(
                 f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all "
                 "of it first, or make a dataset of its own of these episodes."
             )
         check_fetched(root)
         state = load_state(root)
-        _refuse_unfinished(state)
-        names, left_out = _files(state, stamps)
-        items = [Item(name, root / name, stamps[name][0]) for name in names]
-        yield LocalDataset(root, state, items, left_out, stamps)
-    finally:
-        lock.release()
-
-
-def _refuse_unfinished(state: DatasetState) -> None:
-    root = state.root
-    if not state.num_episodes:
-        raise DatasetError(f"{root} has no episode, so there is nothing to copy. Record some with bhd-record.")
-    if has_unfinished_episodes(root):
-        raise DatasetError(
-            f"{root} is not finalised: its recording was interrupted. Run bhd-data repair {quoted(root)}."
-        )
-    if state.identity is not None and (state.without_stats or not (root / layout.STATS).is_file()):
-        raise DatasetError(f"{root} is not finalised: it has no statistics. Run bhd-data repair {quoted(root)}.")
-
-
-def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the files that belong to the dataset, and those that have names of its layout and belong to no episode."""
-    needed = state.files()
-    if unseen := sorted(needed - stamps.keys()):
-        raise DatasetError(
-            f"{state.root}: {listed(unseen)} lie behind a link to a folder, which is not followed. Copy the dataset "
-            "with `cp -rL`, and take the copy."
-        )
-    left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
-    skipped = {*left_out, SUBSET, MANIFEST, layout.UNREPORTED}
-    names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
-    for name in names:  # notes beside the dataset, too: a listing does not show that a file is only linked there
-        check_inside(state.root, state.root / name)
-    return names, left_out
+        if not state.num_episodes:
+            raise DatasetError(f"{root} has no episode, so there is nothing to copy. Record some with bhd-record.")
+        without = state.identity is not None and (state.without_stats or not (root / layout.STATS).is_file())
+        if has_unfinished_episodes(root) or without:
+            reason = "it has no statistics" if without else "its recording was interrupted"
+            raise DatasetError(f"{root} is not finalised: {reason}. Run bhd-data repair {quoted(root)}.")
+        if unseen := sorted(state.files() - stamps.keys()):
+            raise DatasetError(
+                f"{root}: {listed(unseen)} lie behind a link to a folder, which is not followed. Copy the dataset "
+                "with `cp -rL`, and take the copy."
+            )
+        left_out = sorted(name for name in stamps if is_recorded(name) and name not in state.files())
+        names = sorted(stamps.keys() - {*left_out, *_SKIPPED})
+        # `images` is LeRobot's own folder, of frames whose video is not encoded yet. Notes are checked like all files.
+        files = {name: root / name for name in names if not name.startswith("images/")}
+        for path in files.values():
+            check_inside(root, path)
+        yield LocalDataset(root, state, files, left_out, stamps)
 
 
 def _stamps(root: Path) -> dict[str, tuple[int, ...]]:

@@ -1,30 +1,18 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
 import hashlib
-import json
 import re
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.edit.edits import edits_of
 from bhd_lerobot.datasets.format.state import DatasetState
-from bhd_lerobot.datasets.remote.listing import (
-    CARD,
-    MANIFEST,
-    PREVIEW,
-    Item,
-    Remote,
-    RemoteFile,
-    is_recorded,
-    matching,
-    parse_info,
-    refuse_overlap,
-    total,
-)
+from bhd_lerobot.datasets.remote.listing import CARD, PREVIEW, RemoteFile, is_recorded, matching, parse_info
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
+from bhd_lerobot.datasets.remote.place import Remote, refuse_overlap
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, DatasetExistsError
 
@@ -72,27 +60,26 @@ def push(
     A `README.md` in the folder is its card. Without one a card is generated, unless there is one that was not.
     """
     refuse_overlap(Path(root), remote)
-    with open_local(Path(root)) as local:
+    with open_local(Path(root)) as local, tempfile.TemporaryDirectory() as scratch:
         there = remote.files()
         if not replace:
             _refuse_another(local, remote, there)
-        cards, kept_card = _cards(local, remote, make_card, there)
-        items = [item for item in local.items if item.path not in (CARD, PREVIEW)] + cards
+        card, kept_card = _card(local, remote, make_card, there, Path(scratch))
+        files = {path: file for path, file in local.files.items() if path not in (CARD, PREVIEW)} | card
         try:
-            same = matching({item.path: item.content for item in items}, there) if remote.has_checksums else set()
+            same = matching(files, there) if remote.has_checksums else set()
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
-        changed = [item for item in items if item.path not in same]
-        wanted = {item.path for item in items}
-        ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS, MANIFEST)
-        deleted = sorted(path for path in there if path not in wanted and (is_recorded(path) or path in ours))
-        remote.send(local, changed, deleted)
+        changed = {path: file for path, file in files.items() if path not in same}
+        ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS)
+        deleted = sorted(path for path in there if path not in files and (is_recorded(path) or path in ours))
+        remote.send(changed, deleted, local.check_unchanged)
         return PushReport(
             name=remote.name,
             episodes=local.state.num_episodes,
-            sent=[item.path for item in changed],
-            sent_bytes=total(changed),
-            kept=len(items) - len(changed),
+            sent=list(changed),
+            sent_bytes=sum(file.stat().st_size for file in changed.values()),
+            kept=len(same),
             deleted=deleted,
             left_out=local.left_out,
             kept_card=kept_card,
@@ -104,35 +91,38 @@ def sign(text: str) -> str:
     return f"{text}\n<!-- bhd-card {hashlib.sha256(text.encode()).hexdigest()} -->\n"
 
 
-def is_generated(content: bytes | None) -> bool:
+def is_generated(content: bytes) -> bool:
     """Return whether a card was signed by `sign`, and not edited since."""
-    text = (content or b"").decode(errors="replace").replace("\r\n", "\n")
+    text = content.decode(errors="replace").replace("\r\n", "\n")
     found = _SIGNATURE.search(text)
     return found is not None and hashlib.sha256(text[: found.start()].encode()).hexdigest() == found[1]
 
 
-def _cards(
-    local: LocalDataset, remote: Remote, make_card: MakeCard | None, there: Mapping[str, RemoteFile]
-) -> tuple[list[Item], bool]:
+def _card(
+    local: LocalDataset, remote: Remote, make_card: MakeCard | None, there: Mapping[str, RemoteFile], scratch: Path
+) -> tuple[dict[str, Path], bool]:
     """Return the card and its image as files to send, and whether a card there is not generated, and so kept."""
-    own = {item.path: item for item in local.items if item.path in (CARD, PREVIEW)}
+    own = {path: local.files[path] for path in (CARD, PREVIEW) if path in local.files}
     if CARD in own:
-        if not is_generated((local.root / CARD).read_bytes()):
-            return list(own.values()), False
+        if not is_generated(own[CARD].read_bytes()):
+            return own, False
         own = {}  # both were generated, and came with a pull
     if CARD in there and not is_generated(remote.read(CARD)):
-        return [], True
+        return {}, True
     if make_card is not None:
         card = make_card(local.state, PREVIEW in own)
         content = {CARD: card.text.encode(), PREVIEW: card.image}
-        own = {path: Item(path, one, len(one)) for path, one in content.items() if one is not None} | own
-    return list(own.values()), False
+        for path, one in content.items():
+            if one is not None:
+                (scratch / path).write_bytes(one)
+                own.setdefault(path, scratch / path)
+    return own, False
 
 
 def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
     """Refuse to overwrite what this dataset is no later version of; a store keeps no history."""
     name, info = remote.name, there.get(layout.INFO)
-    if info is None or (info.digest is not None and info.matches(local.root / layout.INFO)):
+    if info is None or (info.digest is not None and info.matches(local.files[layout.INFO])):
         return
     remedy = "or overwrite it with --replace."
     try:
@@ -144,24 +134,11 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
             f"{name} is another dataset: it has other columns, another rate, robot or format than {local.root}. Choose "
             f"another place, {remedy}"
         )
-    here, episodes = local.state.num_episodes, found["total_episodes"]
-    deleted = _deleted_since(local.root, remote.read(EDITS) if episodes > here and EDITS in there else b"")
-    if episodes > here + deleted:
-        since = f"{deleted} {'were' if deleted > 1 else 'was'}" if deleted else "none was"
+    if found["total_episodes"] > local.state.num_episodes:
         raise DatasetExistsError(
-            f"{name} has {episodes} episodes, {local.root} has {here} and {since} deleted from it since: it is an "
-            f"older one, or another. Pull that one, or complete that push, {remedy}"
+            f"{name} has {found['total_episodes']} episodes, {local.root} has {local.state.num_episodes}: it is an "
+            f"older one, or another, or some were deleted. Pull that one, or complete that push, {remedy}"
         )
-
-
-def _deleted_since(root: Path, there: bytes | None) -> int:
-    """Return how many episodes were deleted from a dataset since a copy of it was made."""
-    try:
-        edits, former = edits_of(root), [json.loads(line) for line in (there or b"").splitlines()]
-        known = len(former) if edits[: len(former)] == former else 0
-        return sum(len(edit["episodes"]) for edit in edits[known:] if edit["edit"] == "delete")
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0  # not known, so none
 
 
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:

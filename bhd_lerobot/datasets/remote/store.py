@@ -5,18 +5,15 @@ dataset or none.
 """
 
 import contextlib
-import errno
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.remote.listing import WORKERS, Item, RemoteFile, listed
-from bhd_lerobot.datasets.remote.local import LocalDataset
-from bhd_lerobot.datasets.remote.url import LOCAL, open_place, shown
+from bhd_lerobot.datasets.remote.errors import transfer_errors
+from bhd_lerobot.datasets.remote.listing import RemoteFile, listed
+from bhd_lerobot.datasets.remote.place import LOCAL, open_url, shown
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import BhdError, TransferError
+from bhd_lerobot.errors import TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
@@ -32,134 +29,73 @@ class StoreDataset:
 
     def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
         self.name = shown(url)
-        self._fs, self._root = open_place(url, storage_options)
-        kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)
+        self._fs, self._root = open_url(url, storage_options)
+        kinds = {self._fs.protocol} if isinstance(self._fs.protocol, str) else {*self._fs.protocol}
         self._has_folders = not _FOLDERS.isdisjoint(kinds)
         self.folder: Path | None = Path(self._root) if not LOCAL.isdisjoint(kinds) else None
-        # Others, such as FTP, have one connection for all threads.
-        self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
         self._versions: dict[str, dict[str, Any]] = {}
 
     def files(self) -> dict[str, RemoteFile]:
         """Return all files by path, without checksums."""
         self._versions = self._list()
-        return {path: RemoteFile(int(about["size"] or 0), None) for path, about in self._versions.items()}
+        return {path: RemoteFile(int(about["size"] or 0)) for path, about in self._versions.items()}
 
-    def read(self, path: str) -> bytes | None:
-        """Return a file; None if there is none of this name."""
-        with store_errors(self.name, f"read {path} of"):
-            try:
-                return bytes(self._fs.cat_file(self._at(path)))
-            except FileNotFoundError:
-                return None
+    def read(self, path: str) -> bytes:
+        """Return a file."""
+        with transfer_errors(self.name, f"read {path} of"):
+            return bytes(self._fs.cat_file(self._at(path)))
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files into an empty folder, and check that none was written meanwhile."""
-
-        def fetch_one(path: str) -> None:
+        for path in paths:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            self._fs.get_file(self._at(path), str(folder / path))
-
-        with store_errors(self.name, "download"):
-            self._each(fetch_one, paths)
+        with transfer_errors(self.name, "download"):
+            self._fs.get([self._at(path) for path in paths], [str(folder / path) for path in paths])
         now = self._list()
         if changed := [path for path in paths if now.get(path) != self._versions[path]]:
             raise TransferError(f"{self.name} was changed while it was read: {listed(changed)}. Pull it again.")
 
-    def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
+    def send(self, files: Mapping[str, Path], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Remove `meta/info.json`, write files and remove others, and write `meta/info.json` when all are there."""
-        sent = {item.path: item for item in items}
-        info = sent.pop(layout.INFO)
-        with store_errors(self.name, "upload the dataset to"):
-            self._remove(layout.INFO)
+        others = {path: file for path, file in files.items() if path != layout.INFO}
+        with transfer_errors(self.name, "upload the dataset to"):
             # In a folder, what is written anew is removed first: a snapshot made of hard links stays as it was.
-            self._each(self._remove, [*deleted, *(sent if self.folder is not None else ())])
-            self._each(lambda path: self._write(sent[path]), sent)
-            source.check_unchanged()
+            self._remove([layout.INFO, *deleted, *(others if self.folder is not None else ())])
+            self._put(others)
+            check()
             there = self.files()
-            if lost := [path for path, one in sent.items() if path not in there or there[path].size != one.size]:
+            if lost := [path for path, file in others.items() if path not in there or not there[path].matches(file)]:
                 raise TransferError(f"{self.name} lacks files that were sent: {listed(lost)}.")
-            self._write(info)
+            self._put({layout.INFO: files[layout.INFO]})
 
     def _list(self) -> dict[str, dict[str, Any]]:
-        with store_errors(self.name, "read"):
+        with transfer_errors(self.name, "read"):
             self._fs.invalidate_cache()
             try:
                 found = self._fs.find(self._root, detail=True)
             except (FileNotFoundError, NotADirectoryError):
                 return {}  # a folder or a prefix that is not written yet; a missing bucket fails when it is written
             root = self._fs._strip_protocol(self._root).rstrip("/")
-        paths = {name[len(root) :].removeprefix("/"): about for name, about in found.items()}
         # Consoles of object stores make folders by empty objects whose names end in a slash, or have no name at all
         # below the root.
         return {
             path: {name: about[name] for name in _VERSION if name in about}
-            for path, about in paths.items()
+            for path, about in ((name[len(root) :].removeprefix("/"), about) for name, about in found.items())
             if about.get("type") != "directory" and path[-1:] not in ("", "/")
         }
 
-    def _each(self, work: Callable[[str], None], paths: Collection[str]) -> None:
-        """Do something for every path, in threads; none is begun after one has failed."""
-        with ThreadPoolExecutor(self._workers) as pool:
-            for _ in pool.map(work, paths):
-                pass
-
-    def _write(self, item: Item) -> None:
-        target = self._at(item.path)
+    def _put(self, files: Mapping[str, Path]) -> None:
+        targets = [self._at(path) for path in files]
         if self._has_folders:
-            self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
-        if isinstance(item.content, Path):
-            self._fs.put_file(str(item.content), target)
-        else:
-            self._fs.pipe_file(target, item.content)
+            for folder in {target.rpartition("/")[0] for target in targets}:
+                self._fs.makedirs(folder, exist_ok=True)
+        self._fs.put([str(file) for file in files.values()], targets)
 
-    def _remove(self, path: str) -> None:
+    def _remove(self, paths: Iterable[str]) -> None:
         # One by one: `rm` takes brackets and stars in a name for a pattern, and removes what it fits.
-        with contextlib.suppress(FileNotFoundError):
-            self._fs.rm_file(self._at(path))
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):
+                self._fs.rm_file(self._at(path))
 
     def _at(self, path: str) -> str:
         return f"{self._root.rstrip('/')}/{path}"
-
-
-@contextmanager
-def store_errors(url: str, action: str) -> Iterator[None]:
-    """Turn what goes wrong between this machine and a store into a `TransferError`."""
-    try:
-        yield
-    except BhdError:
-        raise
-    except Exception as error:  # of fsspec, of the store's own client: each has its own tree
-        raise TransferError(f"Could not {action} {url}: {_explain(error)}") from error
-
-
-def _explain(error: BaseException) -> str:
-    kind, text = type(error).__name__, " ".join(str(error).split())[:300].rstrip(".")
-    said = text or kind
-    meanings = [
-        (
-            "Credentials" in kind or "Unable to locate credentials" in text,
-            f"no credentials were found ({said}). Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
-        ),
-        (
-            "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in text,
-            f"the store cannot be reached ({said}). Check the connection, and AWS_ENDPOINT_URL of your own store.",
-        ),
-        (
-            isinstance(error, FileNotFoundError),
-            f"it does not exist ({said}). Check the name; a bucket must be made first.",
-        ),
-        (
-            isinstance(error, PermissionError),
-            f"no permission ({said}). The key may be wrong or have expired, or may not be used for this.",
-        ),
-        (
-            isinstance(error, TimeoutError) or "Timeout" in kind,
-            f"the store did not answer in time ({said}). Check the connection.",
-        ),
-        (
-            isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
-            f"the disk is full ({said}). Free some space on it.",
-        ),
-    ]
-    return next((meaning for holds, meaning in meanings if holds), f"{text or 'no reason given'} ({kind}).")

@@ -85,13 +85,13 @@ class Workspace:
         lock, self._lock = self._lock, None
         return lock
 
-    def publish(self, done: str) -> None:
-        """Move the folder to its place, or its content to the places of the same names.
+    def publish(self, done: str, goes: Collection[str] = ()) -> None:
+        """Move the folder to its place, or its content to the places of the same names; names that `goes` has go, too.
 
         Signals that would end the process wait until it is done.
         """
         if self._is_inside:
-            move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new)
+            move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new, goes=goes)
             return
         with uninterrupted():
             self._disk.move(self.folder, self.place)  # fails if another program has created it meanwhile

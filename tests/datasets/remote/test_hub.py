@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
-from bhd_lerobot.datasets.remote.subset import files_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import (
     ConfigError,
@@ -210,9 +210,9 @@ def test_loading_by_name_downloads_only_the_wanted_episodes(
     recorded = {path for path in content(root) if path.startswith(("data/", "videos/"))}
     meta = local_metadata("me/d", tmp_path / "one", episodes=[0])
     assert meta.total_episodes == EPISODES
-    assert set(content(tmp_path / "one")) & recorded == files_of(root, [0]) & recorded
+    assert set(content(tmp_path / "one")) & recorded == load_state(root).files([0]) & recorded
     local_metadata("me/d", tmp_path / "two", select=lambda found: [EPISODES - 1])
-    assert set(content(tmp_path / "two")) & recorded == files_of(root, [EPISODES - 1]) & recorded
+    assert set(content(tmp_path / "two")) & recorded == load_state(root).files([EPISODES - 1]) & recorded
 
 
 def test_a_tag_of_a_release_does_not_move(hub: FakeHub, root: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.datasets.edit.edits import delete
+from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.remote import pull as remote_pull
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
-from bhd_lerobot.datasets.remote.subset import files_of, is_subset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import (
@@ -34,7 +34,7 @@ def test_some_episodes_bring_only_their_files_and_load(hub: FakeHub, root: Path,
     report = pull(HubDataset("me/d"), target, select=lambda folder: [0, 1])
     assert report.episodes == [0, 1]
     data = {path for path in content(target) if path.startswith(("data/", "videos/"))}
-    assert data < files_of(root, [0, 1]) < layout.recorded_files(root)
+    assert data < load_state(root).files([0, 1]) < layout.recorded_files(root)
     hub.reset()
     dataset = LeRobotDataset("t/t", root=target, episodes=[0, 1], video_backend="pyav")
     assert len(dataset) == support.length(0) + support.length(1)
@@ -138,7 +138,6 @@ def test_files_that_hold_all_episodes_are_the_dataset(hub: FakeHub, tmp_path: Pa
     report = pull(HubDataset("me/d"), target, select=lambda folder: [1])
     assert (report.episodes, report.is_whole) == ([1], True)
     assert content(target) == content(packed)
-    assert not is_subset(target)
     assert pull(HubDataset("me/d"), target, select=lambda folder: [2]).episodes == [2]
     assert content(target) == content(packed)
 
@@ -187,7 +186,7 @@ def test_episodes_of_a_replaced_dataset_are_not_requested(hub: FakeHub, root: Pa
     pull(HubDataset("me/d"), target, select=lambda folder: [5])
     target.chmod(0o700)
     delete(root, [0, 1, 2])
-    send(root)
+    send(root, replace=True)
     report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
     assert report.episodes == [0]
     assert target.stat().st_mode & 0o777 == 0o700  # the permissions are kept

@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.datasets.remote.hub import HubDataset
-from bhd_lerobot.datasets.remote.listing import MANIFEST
 from bhd_lerobot.datasets.remote.pull import pull
-from bhd_lerobot.datasets.remote.push import Card, MakeCard, is_generated, push, sign
-from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.datasets.remote.push import Card, MakeCard, is_generated, sign
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import (
@@ -165,14 +163,3 @@ def test_a_link_within_the_dataset_is_followed(hub: FakeHub, root: Path, tmp_pat
     root.symlink_to(tmp_path / "real")  # the folder itself may be a link
     send(root)
     assert stored(hub)["same.txt"] == b"mine"
-
-
-def test_the_checksums_of_version_0_2_are_not_copied_and_go(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    shelf = tmp_path / "shelf"
-    push(root, StoreDataset(f"file://{shelf}"))
-    (shelf / MANIFEST).write_text("{}")
-    assert MANIFEST not in send(shelf).sent
-    assert stored(hub) == content(root)
-    pull(StoreDataset(f"file://{shelf}"), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
-    assert push(root, StoreDataset(f"file://{shelf}")).deleted == [MANIFEST]

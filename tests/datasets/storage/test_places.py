@@ -114,7 +114,7 @@ class Listing:
         self._paths = paths
 
     def files(self) -> dict[str, RemoteFile]:
-        return {path: RemoteFile(1, None) for path in (layout.INFO, *self._paths)}
+        return {path: RemoteFile(1) for path in (layout.INFO, *self._paths)}
 
 
 def test_file_names_of_a_remote_place_are_checked(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.cli.data import main as data
-from bhd_lerobot.datasets.remote import staging
+from bhd_lerobot.datasets.remote import pull
 from bhd_lerobot.datasets.storage import atomic, disk
 from tests.datasets import support
 
@@ -91,7 +91,7 @@ def run(argv: list[str], watched: Path, counted: Path, *, place: str, target: Pa
     if place == "fixed":
         target.mkdir(parents=True, exist_ok=True)
         atomic.is_fixed = lambda place: Path(place) == target
-        staging.is_fixed = atomic.is_fixed
+        pull.is_fixed = atomic.is_fixed
     elif place == "no exchange":
 
         def swap(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""What the Hub's client, the network and the disk say, in sentences with a remedy."""
+"""What clients of the Hub and of stores, the network and the disk report, in sentences with a remedy."""
 
 import errno
 import os
@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from bhd_lerobot.errors import BhdError, TransferError
 
 _LOGIN = "Log in with `hf auth login`, or set the environment variable HF_TOKEN"
-_CONNECTION = "Check the connection"
 _CHANGED = "it was changed by another client at the same time. Check what is there now."
 
 _STATUS = {
@@ -22,13 +21,13 @@ _STATUS = {
 
 
 @contextmanager
-def hub_errors(name: str, action: str, *, revision: str | None = None) -> Iterator[None]:
-    """Turn what goes wrong between this machine and the Hub into a `TransferError`."""
+def transfer_errors(name: str, action: str, *, revision: str | None = None) -> Iterator[None]:
+    """Turn what goes wrong between this machine and another place into a `TransferError`."""
     try:
         yield
     except BhdError:
         raise
-    except Exception as error:  # of the Hub's client, of its threads, of httpx, of hf_xet: each has its own tree
+    except Exception as error:  # of the client, its threads, httpx, hf_xet, fsspec, a store: each has its own tree
         raise TransferError(f"Could not {action} {name}: {explain(error, name, revision)}") from error
 
 
@@ -39,10 +38,9 @@ def explain(error: BaseException, name: str, revision: str | None = None) -> str
     while cause is not None and cause not in chain:
         chain.append(cause)
         cause = cause.__cause__ or cause.__context__
-    for cause in chain:
-        if meaning := _meaning(cause, name, revision):
-            return meaning
-    is_xet = any("xet" in str(cause).lower() for cause in chain)
+    if meaning := next(filter(None, (_meaning(one, name, revision) for one in chain)), ""):
+        return meaning
+    is_xet = any("xet" in str(one).lower() for one in chain)
     hint = " If this Hub does not know the Xet protocol, set HF_HUB_DISABLE_XET=1." if is_xet else ""
     return f"{_short(error, 400) or 'no reason given'} ({type(error).__name__}).{hint}"
 
@@ -61,7 +59,7 @@ def _meaning(error: BaseException, name: str, revision: str | None) -> str:
     from huggingface_hub import constants, errors
 
     short, kind = _short(error), type(error).__name__
-    meanings: list[tuple[type, str]] = [  # the more special ones first
+    meanings: list[tuple[type | bool, str]] = [  # the more special ones first
         (errors.OfflineModeIsEnabled, "HF_HUB_OFFLINE is set, so nothing may be sent or fetched. Unset it."),
         (errors.LocalTokenNotFoundError, f"no token of the Hub was found. {_LOGIN}."),
         (errors.GatedRepoError, "it is gated: its owner grants access on request. Request it on its page on the Hub."),
@@ -71,13 +69,26 @@ def _meaning(error: BaseException, name: str, revision: str | None) -> str:
         (errors.HFValidationError, f"{short}. A name on the Hub looks like user/name."),
         (
             httpx.ConnectError,
-            f"the Hub at {constants.ENDPOINT} cannot be reached ({short}). {_CONNECTION}, and HF_ENDPOINT.",
+            f"the Hub at {constants.ENDPOINT} cannot be reached ({short}). Check the connection, and HF_ENDPOINT.",
         ),
-        (httpx.TimeoutException, f"the Hub did not answer in time ({kind}). {_CONNECTION}."),
-        (httpx.TransportError, f"the connection was lost ({short or kind}). {_CONNECTION}."),
+        (httpx.TimeoutException, f"the Hub did not answer in time ({kind}). Check the connection."),
+        (httpx.TransportError, f"the connection was lost ({short or kind}). Check the connection."),
+        (
+            "Credentials" in kind or "Unable to locate credentials" in short,
+            f"no credentials were found ({short}). Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
+        ),
+        (
+            "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in short,
+            f"the store cannot be reached ({short}). Check the connection, and AWS_ENDPOINT_URL of your own store.",
+        ),
+        (
+            isinstance(error, TimeoutError) or "Timeout" in kind,
+            f"the store did not answer in time ({short or kind}). Check the connection.",
+        ),
+        (FileNotFoundError, f"it does not exist ({short}). Check the name; a bucket must be made first."),
         (OSError, _system(error) if isinstance(error, OSError) else ""),
     ]
-    return next((meaning for one, meaning in meanings if isinstance(error, one)), "")
+    return next((text for one, text in meanings if (one if isinstance(one, bool) else isinstance(error, one))), "")
 
 
 def _system(error: OSError) -> str:
@@ -85,10 +96,10 @@ def _system(error: OSError) -> str:
     place = f" ({where})" if where else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return f"{os.strerror(error.errno)}{place}. Free some space on this disk."
-    if isinstance(error, PermissionError) and where:
-        return f"{error.strerror}{place}. Check the permissions of this path."
+    if isinstance(error, PermissionError):
+        return f"no permission ({_short(error)}). Check the key, or the permissions of this path."
     if "Consistency check failed" in str(error):
-        return f"the connection was lost in the middle of a file. {_CONNECTION}."
+        return "the connection was lost in the middle of a file. Check the connection."
     return ""
 
 
