@@ -17,7 +17,6 @@ from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 COUNTERS = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
 _MOST = 2**31 - 1  # the highest number of a file or chunk
 _TEXT: Sequence[Callable[[pa.DataType], bool]] = (types.is_string, types.is_large_string)
-_INTEGER = (types.is_integer,)
 _NUMBER = (types.is_integer, types.is_floating)
 _KINDS = {"float": _NUMBER, "int": _NUMBER, "uint": _NUMBER, "bool": (types.is_boolean,), "string": _TEXT}
 
@@ -96,24 +95,6 @@ def wrong_array(array: pa.Array) -> str:
 def is_listed(kind: pa.DataType) -> bool:
     """Return whether a type is one of Arrow's lists."""
     return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
-
-
-def wrong_types(schema: pa.Schema, cameras: Sequence[str]) -> str:
-    """Return which of the columns that say where an episode lies is of another type, of those that are there."""
-    if twice := repeated(schema):
-        return twice
-    places = ("data", *(f"videos/{key}" for key in cameras))
-    wanted = {
-        **dict.fromkeys(
-            (*COUNTERS, *(f"{kind}/{one}_index" for kind in places for one in ("chunk", "file"))), _INTEGER
-        ),
-        **dict.fromkeys((f"videos/{key}/{one}_timestamp" for key in cameras for one in ("from", "to")), _NUMBER),
-        "tasks": (lambda kind: is_listed(kind) and any(is_one(kind.value_type) for is_one in _TEXT),),
-    }
-    for name, family in wanted.items():
-        if name in schema.names and not any(is_one(schema.field(name).type) for is_one in family):
-            return f"its column {name!r} is {schema.field(name).type}"
-    return ""
 
 
 def wrong_row(row: Mapping[str, Any], cameras: Sequence[str]) -> str:

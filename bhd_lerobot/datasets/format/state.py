@@ -3,7 +3,7 @@
 An episode exists if and only if ``info.json`` counts it. Files of other episodes are leftovers of an interrupted save.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -71,10 +71,10 @@ class DatasetState:
     def files(self, episodes: Iterable[int] | None = None) -> set[str]:
         """Return all files of some committed episodes, or of all, relative to the root."""
         rows = self.rows if episodes is None else [self.rows[episode] for episode in episodes]
-        names = {layout.data_file(slot_of(row, "data")) for row in rows}
-        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in rows}
+        names = {layout.data_file(slot) for slot in ordered_slots(rows, "data")}
+        names |= {layout.episodes_file(slot) for slot in ordered_slots(rows, "meta/episodes")}
         for key in self.video_keys:
-            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in rows}
+            names |= {layout.video_file(key, slot) for slot in ordered_slots(rows, f"videos/{key}")}
         return names
 
 
@@ -122,6 +122,15 @@ def corrupt(path: Path, reason: object) -> DatasetError:
     return DamagedFileError(f"{wrong}. {remedy}", path, wrong)
 
 
+type Report = Callable[[str, Path, object], None]
+"""Takes the name of a check, a file and what is wrong with it; unless it raises, the reader goes on without that."""
+
+
+def refuse(_: str, path: Path, reason: object) -> None:
+    """Raise the error for a file that cannot be trusted; the report of a reader that stops there."""
+    raise corrupt(path, reason)
+
+
 def repair_with_info(root: Path) -> str:
     """Return what to do if `info.json` cannot be used, as text."""
     return (
@@ -165,7 +174,7 @@ def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: 
         state.tasks = read_tasks(root / layout.TASKS)
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
-        _read_rows(state)
+        read_rows(state)
         if files:
             _check_files(state, videos, counted)
     return state
@@ -224,40 +233,67 @@ def read_tasks(path: Path) -> list[str]:
     return [tasks[index] for index in range(len(tasks))]
 
 
-def _read_rows(state: DatasetState) -> None:
+def read_rows(state: DatasetState, report: Report = refuse, *, is_full: bool = False) -> list[int]:
+    """Read the rows of the committed episodes into `state.rows`; with `is_full`, every page of their files.
+
+    Returns:
+        The number of the episode of each row, in the order of the files.
+    """
     total = state.info["total_episodes"]
     by_index: dict[int, Row] = {}
+    described: list[int] = []
     for path in sorted((state.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
         try:
-            file = pq.ParquetFile(path)
+            file = pq.ParquetFile(path, page_checksum_verification=is_full)
             names = file.schema_arrow.names
             light = [name for name in names if not name.startswith("stats/")]
-            rows = file.read(columns=light, use_threads=False).to_pylist()
+            table = file.read(columns=None if is_full else light, use_threads=is_full)
+            rows = table.select([i for i, name in enumerate(table.column_names) if name in light]).to_pylist()
             slot = layout.slot_in(path)
         except UNREADABLE as error:
-            raise corrupt(path, error) from error
+            report("files", path, error)
+            continue
         if wrong := repeated(file.schema_arrow):
-            raise corrupt(path, wrong)
-        has_stats = "stats/index/mean" in names
+            report("schema", path, wrong)
+            continue
+        is_reported = False
         for row in rows:
             index = row.get("episode_index")
+            described.append(index)
             if index is None or (isinstance(index, int) and index >= total):
                 continue  # a save that was interrupted before it counted
             if wrong := wrong_row(row, state.video_keys):
-                raise corrupt(path, f"episode {index!r} {wrong}")
-            if index in by_index:
-                raise corrupt(path, f"episode {index} is in another file as well")
-            by_index[index] = row | slot_columns("meta/episodes", slot)  # the file knows better than its row
-            if not has_stats:
-                state.without_stats.add(index)
+                if not is_reported:
+                    report("schema", path, f"episode {index!r} {wrong}")
+                is_reported = True
+            elif index in by_index:
+                report("counts", path, f"episode {index} is described twice")
+            else:
+                by_index[index] = row | slot_columns("meta/episodes", slot)  # the file knows better than its row
+                if "stats/index/mean" not in names:
+                    state.without_stats.add(index)
         own, extra = column_types(file.schema_arrow)
         state.metadata_types = {**own, **state.metadata_types}
         state.extra_types = {**extra, **state.extra_types}
-    for index in range(total):
-        if index not in by_index:
-            what = f"info.json counts {total} episodes, but episode {index} is not described"
-            raise corrupt(state.root / "meta/episodes", what)
-    state.rows = [by_index[index] for index in range(total)]
+    if missing := [index for index in range(total) if index not in by_index]:
+        what = f"{len(missing)} episodes are not described, {missing[0]} first; meta/info.json counts {total}"
+        report("counts", state.root / "meta/episodes", what)
+    state.rows = [by_index[index] for index in sorted(by_index)]
+    return described
+
+
+def check_places(state: DatasetState, report: Report = refuse) -> int:
+    """Check that the frames of each episode follow those of the one before; return how many frames there are."""
+    start, wrong = 0, []
+    for row in state.rows:
+        first, last = row["dataset_from_index"], row["dataset_to_index"]
+        if first != start or last != first + row["length"]:
+            wrong.append((row, f"has {row['length']} frames, from {first} to {last}, and begins at {start}"))
+        start = last
+    for row, what in wrong[:3]:
+        path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))
+        report("counts", path, f"episode {row['episode_index']} {what}")
+    return sum(row["length"] for row in state.rows)
 
 
 def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
@@ -285,15 +321,10 @@ _STRUCTURE = ("episode_index", "tasks", "length", "dataset_from_index", "dataset
 
 
 def _check_files(state: DatasetState, videos: bool, counted: bool) -> None:
-    start = 0
-    for row in state.rows:
-        if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
-            path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))
-            raise corrupt(path, f"episode {row['episode_index']} does not start at frame {start}")
-        start += row["length"]
-    if counted and start != state.info["total_frames"]:
+    frames = check_places(state)
+    if counted and frames != state.info["total_frames"]:
         raise DatasetCorruptError(
-            f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
+            f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {frames}. "
             f"`bhd-data check {quoted(state.root)} --fix` corrects the count. Nothing was changed."
         )
     for slot, rows in ordered_slots(state.rows, "data").items():

@@ -155,10 +155,10 @@ def _in_order(root: Path, disk: Disk, lock: RootLock, report: RepairReport) -> R
     """Put files, rows, frames and instructions in the order of their numbers, if they are in another one."""
     findings = Findings()
     files = read_files(root, findings)
-    for slot, positions in files.slots("data").items():
+    for slot, rows in ordered_slots(files.rows, "data").items():
         path = root / layout.data_file(slot)
         table = read_frames(path, [*NUMBERS, "task_index"])
-        check_numbers(path, table, files.rows(positions), files.tasks, findings)
+        check_numbers(path, table, rows, files.tasks, findings)
     if not any(is_fixable(finding) and finding.check != "stats" for finding in findings):
         return report
     return replace(report, completed=(*report.completed, *rebuild(load_state(root), disk, lock, order=True)))

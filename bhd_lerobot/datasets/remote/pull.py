@@ -164,7 +164,6 @@ class _Pull:
         for path in self._same & set(paths):
             (folder / path).unlink(missing_ok=True)
             _link(self._root / path, folder / path)
-        missing -= matching({path: folder / path for path in missing}, there)
         if not missing:
             return
         need, free = sum(there[path].size for path in missing), shutil.disk_usage(folder).free
@@ -174,13 +173,8 @@ class _Pull:
                 f"has {megabytes(free)} free. Free some space, or name another --root."
             )
         self._remote.fetch(sorted(missing), folder)
-        if wrong := missing - matching({path: folder / path for path in missing}, there):
-            for path in wrong:
-                (folder / path).unlink(missing_ok=True)
-            raise TransferError(
-                f"Could not download {self._remote.name}: {listed(wrong)} differs from what is listed. It was "
-                "changed meanwhile, or lost or damaged on the way."
-            )
+        if wrong := [path for path in missing if (folder / path).stat().st_size != there[path].size]:
+            raise TransferError(f"Could not download {self._remote.name}: {listed(wrong)} did not arrive whole.")
         self._fetched |= missing
 
     def _wanted(self, select: Select) -> tuple[list[int], set[str]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.format.state import ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.pointers import check_fetched
@@ -86,18 +87,19 @@ def check_dataset(
     if videos:
         _check_videos(files, findings)
     _judge_outcomes(files, findings)
-    return DatasetCheck(files.root, len(files.episodes.get("episode_index", ())), values.frames, tuple(findings))
+    return DatasetCheck(files.root, files.num_episodes, values.frames, tuple(findings))
 
 
 def _check_videos(files: Files, findings: Findings) -> None:
-    fps = files.fps
-    for key in files.cameras:
-        for slot, positions in files.slots(f"videos/{key}").items():
+    fps = float(files.info["fps"])
+    for key in files.video_keys:
+        rows_by_time = sorted(files.rows, key=lambda row: row[f"videos/{key}/from_timestamp"])
+        for slot, rows in ordered_slots(rows_by_time, f"videos/{key}").items():
             name = layout.video_file(key, slot)
             path = files.root / name
             if not path.is_file():
                 continue  # reported already
-            lengths = np.array([files.episodes["length"][i] for i in positions])
+            lengths = np.array([row["length"] for row in rows])
             try:
                 found = video.count_frames(path)
             except OSError as error:
@@ -108,16 +110,12 @@ def _check_videos(files: Files, findings: Findings) -> None:
                 if found > lengths.sum():
                     what += ": of a discarded take, for example; images behind them are of other rows"
                 findings.error("video", name, what, RESTORE)
-            begin = np.array([files.episodes[f"videos/{key}/from_timestamp"][i] for i in positions])
-            end = np.array([files.episodes[f"videos/{key}/to_timestamp"][i] for i in positions])
-            order = np.argsort(begin, kind="stable")  # whichever it is: they are found by their times
-            numbers = np.array([files.episodes["episode_index"][i] for i in positions])[order]
-            begin, end, lengths = begin[order], end[order], lengths[order]
+            begin, end = (np.array([row[f"videos/{key}/{at}_timestamp"] for row in rows]) for at in ("from", "to"))
             expected = (np.cumsum(lengths) - lengths) / fps
             off = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
             for position in np.flatnonzero(off)[:3]:
                 what = (
-                    f"episode {numbers[position]} has the place from "
+                    f"episode {rows[position]['episode_index']} has the place from "
                     f"{begin[position]:.3f} to {end[position]:.3f} s, and its {lengths[position]} frames begin at "
                     f"{expected[position]:.3f} s"
                 )
@@ -125,12 +123,12 @@ def _check_videos(files: Files, findings: Findings) -> None:
 
 
 def _judge_outcomes(files: Files, findings: Findings) -> None:
-    outcomes = files.episodes.get(f"{PREFIX}outcome")
-    if not outcomes:
+    outcomes = [row.get(f"{PREFIX}outcome") for row in files.rows]
+    if "outcome" not in files.metadata_types or not outcomes:
         return
     counts = Counter("unknown" if outcome is None else str(outcome) for outcome in outcomes)
     summary = ", ".join(f"{name} {count}" for name, count in counts.most_common())
-    brains = {json.loads(text).get("type") for text in files.episodes.get(f"{PREFIX}brain", ()) if text}
+    brains = {json.loads(row[f"{PREFIX}brain"]).get("type") for row in files.rows if row.get(f"{PREFIX}brain")}
     if counts.get("success") or brains == {"noop"}:  # which attempts nothing
         findings.note("outcome", f"{len(outcomes)} episodes", summary)
     else:

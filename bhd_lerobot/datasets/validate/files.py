@@ -1,7 +1,7 @@
 """Whether the files of a dataset are there, can be read, and agree on what they count.
 
-`state.load_state` checks the same and stops at the first contradiction, because a recorder must not continue from it.
-Here all of them are reported, in datasets of other programs, too.
+The reader is that of `state.load_state`, which stops at the first contradiction, because a recorder must not continue
+from it. Here all of them are reported, in datasets of other programs, too.
 """
 
 import contextlib
@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.expected import wrong_types
 from bhd_lerobot.datasets.format.features import names_of
 from bhd_lerobot.datasets.format.info import InfoError, parse_object, read_info, wrong_feature
 from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import (
-    UNREADABLE,
     DamagedFileError,
-    Row,
+    DatasetState,
+    check_places,
     no_dataset,
     numbered_tasks,
+    read_rows,
     repair_with_info,
+    slot_of,
 )
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, is_decided
@@ -38,37 +38,20 @@ from bhd_lerobot.errors import DatasetError
 _COPY = "Restore it from a copy, or try bhd-data repair."
 RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
 _RECORD = "Restore it from a copy; bhd-data repair continues without the data that is lost with it."
-_LIGHT = (
-    *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
-    "tasks",
-)
-_SLOT = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 _STATISTICS = ("min", "max", "mean", "std", "count")
 
 
 @dataclass
-class Files:
-    """What the small files of a dataset say.
+class Files(DatasetState):
+    """What can be read of the small files of a dataset; `rows` has the episodes that are described.
 
     Attributes:
-        root: the dataset.
-        info: `meta/info.json`.
-        episodes: columns of `meta/episodes` by name, one entry for each episode, in order, without statistics.
         described: the number of the episode of each row of `meta/episodes`, in the order of the files.
         stats: `meta/stats.json`, by feature and name, flat; what is missing there, or no numbers, is not here.
-        tasks: the instructions in the order of their numbers; none if these are not those of a list.
-        is_ours: whether this package recorded it.
-        has_stats: whether the statistics of every single episode are stored.
     """
 
-    root: Path
-    info: dict[str, Any]
-    episodes: dict[str, list[Any]] = field(default_factory=dict)
     described: list[int] = field(default_factory=list)
     stats: dict[str, dict[str, NDArray[np.float64]]] = field(default_factory=dict)
-    tasks: list[str] = field(default_factory=list)
-    is_ours: bool = False
-    has_stats: bool = True
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -76,42 +59,31 @@ class Files:
         return self.info["features"]
 
     @property
-    def fps(self) -> float:
-        """Frames a second."""
-        return float(self.info["fps"])
-
-    @property
-    def cameras(self) -> list[str]:
-        """Features that are videos."""
-        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
-
-    def places(self, kind: str) -> list[layout.Slot]:
-        """Return the file of each episode, of one kind: `data` or `videos/KEY`."""
-        chunks, files = (self.episodes.get(f"{kind}/{name}_index", []) for name in ("chunk", "file"))
-        return list(zip(chunks, files, strict=True))
-
-    def rows(self, positions: NDArray[np.int64]) -> list[Row]:
-        """Return what `meta/episodes` says of some episodes' frames."""
-        names = ("episode_index", "length", "dataset_from_index", "tasks")
-        return [{name: self.episodes[name][position] for name in names} for position in positions]
-
-    def slots(self, kind: str) -> dict[layout.Slot, NDArray[np.int64]]:
-        """Return the files of one kind, `data` or `videos/KEY`, each with the positions of its episodes."""
-        places: dict[layout.Slot, list[int]] = {}
-        for position, slot in enumerate(self.places(kind)):
-            places.setdefault(slot, []).append(position)
-        return {slot: np.array(found) for slot, found in places.items()}
+    def is_ours(self) -> bool:
+        """Whether this package recorded it."""
+        return (self.root / layout.IDENTITY).is_file()
 
 
 def read_files(root: Path, findings: Findings) -> Files:
     """Read the small files, and check them."""
-    files = Files(root, _read_info(root), is_ours=(root / layout.IDENTITY).is_file())
+
+    def report(check: str, path: Path, what: object) -> None:
+        where = path.relative_to(root).as_posix()
+        findings.error(check, where, f"it cannot be read: {one_line(what)}" if check == "files" else str(what), _COPY)
+
+    files = Files(root, _read_info(root), None)
     _check_features(files, findings)
     _read_tasks(files, findings)
-    _read_episodes(files, findings)
-    _check_counts(files, findings)
+    files.described = read_rows(files, report, is_full=True)
+    frames = check_places(files, report)
+    if files.rows and frames != files.info["total_frames"]:
+        what = f"it counts {files.info['total_frames']} frames; the episodes have {frames}"
+        findings.error("counts", layout.INFO, what, f"{FIX} counts them.")
+    if files.without_stats and not files.is_ours:
+        what = "episodes have no statistics of their own, without which nothing can be edited"
+        findings.warning("stats", "meta/episodes", what, stats_remedy(files))
     _check_names(files, findings)
-    check_order(root, files.places("data"), files.described, findings)
+    check_order(root, [slot_of(row, "data") for row in files.rows], files.described, findings)
     _read_stats(files, findings)
     return files
 
@@ -169,79 +141,9 @@ def _read_tasks(files: Files, findings: Findings) -> None:
         findings.error("counts", layout.TASKS, what, _COPY)
 
 
-def _read_episodes(files: Files, findings: Findings) -> None:
-    parts: list[dict[str, list[Any]]] = []
-    for path in sorted((files.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        name = path.relative_to(files.root).as_posix()
-        try:
-            file = pq.ParquetFile(path, page_checksum_verification=True)
-            columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
-            files.has_stats &= "stats/index/mean" in file.schema_arrow.names
-            if len(columns) == len(file.schema_arrow.names) and not files.is_ours:
-                what = "it has no statistics of single episodes, without which nothing can be edited"
-                findings.warning("stats", name, what, stats_remedy(files))
-            if wrong := wrong_types(file.schema_arrow, files.cameras):
-                findings.error("schema", name, wrong, _COPY)
-                continue
-            part = file.read().select(columns).to_pydict()
-        except UNREADABLE as error:
-            findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
-            continue
-        wanted = [*_LIGHT, *(f"videos/{key}/{part}" for key in files.cameras for part in _SLOT)]
-        missing = [column for column in wanted if column not in part or None in part[column]]
-        if missing:
-            findings.error("schema", name, f"it lacks {few(missing)}, or some of them", _COPY)
-            continue
-        parts.append(part)
-    if not parts:
-        if files.info["total_episodes"]:
-            what = f"no episode is described; meta/info.json counts {files.info['total_episodes']}"
-            findings.error("counts", "meta/episodes", what, _COPY)
-        return
-    # An episode that info.json does not count yet was being saved when the recording was cut off.
-    keep = set.intersection(*(set(part) for part in parts))
-    rows: dict[int, tuple[dict[str, list[Any]], int]] = {}
-    files.described = [index for part in parts for index in part["episode_index"]]
-    for part in parts:
-        for position, index in enumerate(part["episode_index"]):
-            if index in rows:
-                findings.error("counts", "meta/episodes", f"episode {index} is described twice", _COPY)
-            elif index < files.info["total_episodes"]:
-                rows[index] = part, position
-    order = sorted(rows)
-    files.episodes = {name: [rows[index][0][name][rows[index][1]] for index in order] for name in sorted(keep)}
-    total = files.info["total_episodes"]
-    if len(rows) < total:
-        first = next(index for index in range(total) if index not in rows)
-        what = f"{total - len(rows)} episodes are not described, {first} first; meta/info.json counts {total}"
-        findings.error("counts", "meta/episodes", what, _COPY)
-
-
-def _check_counts(files: Files, findings: Findings) -> None:
-    episodes = files.episodes
-    if not episodes:
-        return
-    length, first, last = (
-        np.array(episodes[name], np.int64) for name in ("length", "dataset_from_index", "dataset_to_index")
-    )
-    for index in np.flatnonzero((last - first != length) | (length < 1))[:3]:
-        number = episodes["episode_index"][index]
-        what = f"episode {number} has {length[index]} frames, from {first[index]} to {last[index]}"
-        findings.error("counts", "meta/episodes", what, _COPY)
-    begins = np.concatenate([[0], last[:-1]])
-    for index in np.flatnonzero(first != begins)[:3]:
-        what = f"episode {episodes['episode_index'][index]} starts at frame {first[index]}, not at {begins[index]}"
-        findings.error("counts", "meta/episodes", what, _COPY)
-    if length.sum() != files.info["total_frames"]:
-        what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
-        findings.error("counts", layout.INFO, what, f"{FIX} counts them.")
-
-
 def _check_names(files: Files, findings: Findings) -> None:
     """Compare the files that there are with those that the episodes name."""
-    wanted = {layout.data_file(slot) for slot in files.slots("data")}
-    for key in files.cameras:
-        wanted |= {layout.video_file(key, slot) for slot in files.slots(f"videos/{key}")}
+    wanted = {name for name in files.files() if not name.startswith("meta/")}
     there = {name for name in layout.recorded_files(files.root) if not name.startswith("meta/")}
     try:
         check_links(files.root)
@@ -250,8 +152,7 @@ def _check_names(files: Files, findings: Findings) -> None:
     for name in sorted(wanted - there):
         findings.error("files", name, "it is missing", _RECORD)
     leftovers = sorted(there - wanted)
-    described = len(files.episodes.get("episode_index", ()))
-    if described < files.info["total_episodes"]:
+    if len(files.rows) < files.info["total_episodes"]:
         remedy = "It may hold an episode that is not described: bhd-data repair recovers those that are whole."
     elif files.is_ours:
         remedy = "bhd-data repair removes it."
@@ -274,7 +175,7 @@ def _interrupted(files: Files) -> tuple[str, str]:
             "an edit, or the merging of a recording's files, was interrupted at its end",
             "bhd-data repair completes it.",
         )
-    is_whole = not files.is_ours or (bool(files.episodes) and files.has_stats)
+    is_whole = not files.is_ours or (bool(files.rows) and not files.without_stats)
     if is_whole and not has_unfinished_episodes(files.root):
         # A recording whose files are being merged has episodes without statistics.
         return "an edit was interrupted before it changed anything", "bhd-data repair drops it. Repeat the edit."
@@ -289,7 +190,7 @@ def stats_remedy(files: Files) -> str:
 
 def _read_stats(files: Files, findings: Findings) -> None:
     path, name = files.root / layout.STATS, layout.STATS
-    if not files.episodes:
+    if not files.rows:
         return
     remedy = stats_remedy(files)
     if not path.is_file():

@@ -83,6 +83,6 @@ def name_of(feature: Mapping[str, Any], element: int) -> str:
     return names[element] if element < len(names) else f"number {element}"
 
 
-def one_line(error: BaseException) -> str:
+def one_line(error: object) -> str:
     """Return the message of an error on one line."""
     return " ".join(str(error).split()).rstrip(".")

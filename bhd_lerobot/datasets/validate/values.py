@@ -5,7 +5,7 @@ Data files are read one after the other, so that memory holds two of them.
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.expected import wrong_columns
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
+from bhd_lerobot.datasets.format.state import Row, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
 from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
@@ -52,18 +53,18 @@ class ValueCheck:
     def run(self) -> None:
         """Read everything."""
         slots = [
-            (layout.data_file(slot), positions)
-            for slot, positions in self._files.slots("data").items()
+            (layout.data_file(slot), rows)
+            for slot, rows in ordered_slots(self._files.rows, "data").items()
             if (self._files.root / layout.data_file(slot)).is_file()
         ]
         # The next file is read while one is checked. Findings are added to a list, which is thread-safe.
         with ThreadPoolExecutor(1) as reader:
             tables = deque(reader.submit(self._read, name) for name, _ in slots[:1])
-            for (name, positions), following in zip(slots, [*slots[1:], None], strict=False):
+            for (name, rows), following in zip(slots, [*slots[1:], None], strict=False):
                 table = tables.popleft().result()
                 if following is not None:
                     tables.append(reader.submit(self._read, following[0]))
-                if table is not None and (table := self._in_order(name, table, positions)) is not None:
+                if table is not None and (table := self._in_order(name, table, rows)) is not None:
                     self._check_table(table.select([key for key in table.column_names if key in self._files.features]))
         self._judge_columns()
         self._frozen.judge(self._findings)
@@ -102,11 +103,8 @@ class ValueCheck:
             self._findings.error("files", name, f"it cannot be read: {one_line(error)}", RESTORE)
             return None
 
-    def _in_order(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> pa.Table | None:
+    def _in_order(self, name: str, table: pa.Table, rows: Sequence[Row]) -> pa.Table | None:
         """Return the frames in the order of their numbers; None if they are not those of these episodes."""
-        rows = self._files.rows(positions)
-        if any(row["length"] < 1 for row in rows):
-            return None  # reported already, of meta/episodes
         order = check_numbers(self._files.root / name, table, rows, self._files.tasks, self._findings)
         if order is None:
             return None
@@ -119,7 +117,7 @@ class ValueCheck:
 
     def _check_times(self, name: str, table: pa.Table) -> None:
         frame, seconds = table["frame_index"].to_numpy(), table["timestamp"].to_numpy()
-        due = frame / self._files.fps
+        due = frame / float(self._files.info["fps"])
         # Single precision cannot say it better after a while.
         wrong = np.flatnonzero(~(np.abs(seconds - due) <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * due)))
         if len(wrong):

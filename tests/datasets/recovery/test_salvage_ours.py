@@ -86,7 +86,7 @@ def test_episodes_without_rows_are_recovered_and_lost_columns_are_named(
     remedies = [finding.remedy for finding in check_dataset(root).findings]
     assert any("bhd-data repair" in remedy for remedy in remedies)
     assert not any("removes" in remedy for remedy in remedies)
-    with pytest.raises(DatasetCorruptError, match=r"episode 0 is not described|magic bytes"):
+    with pytest.raises(DatasetCorruptError, match=r"episodes are not described, 0 first|magic bytes"):
         dataset_info(root)
     report = repair(root)
     assert report.episodes == 4

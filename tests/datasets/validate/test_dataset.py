@@ -279,8 +279,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "names": (lambda root: names(root, *"abc"), "schema", "meta/info.json: action", "3 names for 2 numbers"),
     "shape": (no_shape, "schema", "meta/info.json: action", "it has the shape None"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
-    "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
-    "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
+    "no place": (row("data/file_index", None), "schema", "meta/episodes", "episode 2 has None as data/file_index"),
+    "no frame": (row("length", 0), "schema", "meta/episodes", "episode 2 has no frames"),
     "twice": (row("episode_index", 1), "counts", "meta/episodes", "episode 1 is described twice"),
 }
 

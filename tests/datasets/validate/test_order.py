@@ -116,7 +116,7 @@ CASES: dict[str, tuple[Damage, str, str, bool, bool]] = {
     "no instruction": (changed(ROWS, put("tasks", [[], *LISTS[1:]])), "counts", "meta/episodes", True, True),
     "numbers of instructions": (numbered(5, 15, 25), "counts", TASKS, False, True),
     "negative numbers": (changed(DATA, put("index", list(range(-3, 10)))), "counts", DATA, True, True),
-    "frames that do not begin at 0": (changed(ROWS, later), "counts", "meta/episodes", False, True),
+    "frames that do not begin at 0": (changed(ROWS, later), "counts", ROWS, False, True),
     "episodes in each other's file": (
         lambda root: foreign.edit(foreign.write(root, (4, 4, 4), (0, 1, 2)) / ROWS, put("data/file_index", [1, 0, 2])),
         "counts", DATA, False, True,
