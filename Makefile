@@ -14,7 +14,7 @@ help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-15s %s\n", $$1, $$2}' Makefile
 
 demo: venv ## record, replay, train and evaluate both robots
-	$(PYTHON_IN_VENV) -m bhd_lerobot.cli.demo
+	PATH="$(CURDIR)/.venv/bin:$$PATH" scripts/demo.sh
 
 quick: venv ## run the laws of every package, in a minute; CHANGED=1: what the changes since the last commit touch
 	$(PYTHON_IN_VENV) -m pytest --numprocesses=2 --dist=worksteal --thorough=no --quick=$(if $(CHANGED),changed,all) $(PYTEST_ARGS)

@@ -136,7 +136,6 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "realtime",
         "datasets.format",
     ),
-    "apps.demo": ("options", "rollout", "recording", "evaluation", "training"),
     "api": (
         *("options", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
     ),

@@ -1,3 +1,3 @@
-"""Programs for people: the viewer, the monitor, the doctor and the demo."""
+"""Programs for people: the viewer, the monitor and the doctor."""
 
-__all__ = ["demo", "doctor", "monitor", "view"]
+__all__ = ["doctor", "monitor", "view"]

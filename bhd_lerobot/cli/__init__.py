@@ -3,7 +3,6 @@
 __all__ = [
     "bag",
     "data",
-    "demo",
     "doctor",
     "evaluate",
     "monitor",
