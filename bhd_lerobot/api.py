@@ -103,12 +103,12 @@ def train(
         from bhd_lerobot.training.rl.train import train as run_rl
 
         return run_rl(_configured(RlConfig, cast("RlConfig | None", config), options), console)  # refuses another
-    from bhd_lerobot.training.arguments import Request, request_of
+    from bhd_lerobot.training.arguments import config_of
     from bhd_lerobot.training.train import train as run_train
 
     load_plugins()
     _refuse_both(config, options)
-    return run_train(request_of(from_options(options)) if config is None else Request(config), console)
+    return run_train(config_of(from_options(options)) if config is None else config, console)
 
 
 def make_robot(robot: "str | RobotConfig", **options: Any) -> Robot:

@@ -6,7 +6,6 @@ configuration that lies in a checkpoint.
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +22,8 @@ from bhd_lerobot.policies.learned.contract import find_checkpoint
 from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig
 
 
-@dataclass(frozen=True)
-class Request:
-    """What a command line asks for.
-
-    Attributes:
-        config: the configuration, not validated.
-        contract: folder or name of the checkpoint whose contract the dataset must fit; None if there is none.
-    """
-
-    config: BhdTrainConfig
-    contract: str | None = None
-
-
-def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> Request:
-    """Return what a command line asks for.
+def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> BhdTrainConfig:
+    """Return the configuration that a command line describes, not validated.
 
     With `--resume=true`, its `--config_path` is a checkpoint's `train_config.json`, or the folder of a checkpoint or of
     a run.
@@ -54,12 +40,7 @@ def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> Request
         values = line.file
     if any(key.startswith("policy.") for key in line.options) and not isinstance(values.get("policy"), dict):
         values["policy"] = {}
-    return _decoded(line.over(values), checkpoint)
-
-
-def request_of(values: dict[str, Any]) -> Request:
-    """Return what plain values, nested, ask for."""
-    return _decoded(values, None)
+    return config_of(line.over(values), checkpoint)
 
 
 def _resumed(path: Path, output_dir: Any) -> Path:
@@ -97,7 +78,8 @@ def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
     return values
 
 
-def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
+def config_of(values: dict[str, Any], checkpoint: Path | None = None) -> BhdTrainConfig:
+    """Return the configuration that plain values, nested, stand for, to go on with a checkpoint if there is one."""
     values.pop("checkpoint_path", None)
     dataset = values.get("dataset") or {}
     known = {name for name, _, _ in configuration.options_of(BhdTrainConfig)}
@@ -106,7 +88,7 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
         raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
     if isinstance(dataset, dict) and dataset.get("root") and not dataset.get("repo_id"):
         values["dataset"] = {**dataset, "repo_id": local_name(dataset["root"])}
-    contract = _start_from(values, resume=checkpoint is not None)
+    _start_from(values, resume=checkpoint is not None)
     selection = values.get("selection")
     if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):
         selection["outcome"] = [selection["outcome"]]
@@ -115,7 +97,7 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     if checkpoint is not None:
         config.checkpoint_path = checkpoint
         config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL_DIR
-    return Request(config, contract)
+    return config
 
 
 def _drop_defaults(config_class: type, values: dict[str, Any]) -> None:
@@ -138,8 +120,8 @@ def _is_same(value: Any, default: Any) -> bool:
     return type(value) is type(default) and bool(value == default)
 
 
-def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
-    """Complete the policy's configuration from the checkpoint that a new run starts from; return that checkpoint."""
+def _start_from(values: dict[str, Any], *, resume: bool) -> None:
+    """Complete the policy's configuration from the checkpoint that a new run starts from."""
     policy = values.get("policy")
     if policy is not None and not isinstance(policy, dict):
         raise ConfigError(f"policy is {policy!r}; it has keys of its own, such as policy.type.")
@@ -154,7 +136,7 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
         if policy:
             policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
             values["policy"] = policy
-        return None
+        return
     if fine_tune and path and fine_tune != path:
         raise ConfigError(f"fine_tune is {fine_tune!r} and policy.path is {path!r}; give one of them.")
     folder = str(find_checkpoint(source).resolve())  # `last` may move on
@@ -164,7 +146,6 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
         raise ConfigError(f"policy.type is {wanted!r}, but the checkpoint {source} is of type {own['type']!r}.")
     policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
     values["policy"] = {**own, "repo_id": None, **policy, "pretrained_path": folder}
-    return folder if fine_tune else None
 
 
 def _policy_values(source: str) -> dict[str, Any]:

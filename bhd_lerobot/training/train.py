@@ -15,7 +15,7 @@ from bhd_lerobot.options.command import Program
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training import checkpoint as train_checkpoint
-from bhd_lerobot.training.arguments import Request, parse_train
+from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.checkpoint import TrainingParts, resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData, open_data, open_metadata, select_episodes
@@ -65,9 +65,8 @@ class TrainResult:
         return self.stopped_by.exit_status
 
 
-def train(request: Request, console: Console | None = None) -> TrainResult:
-    """Train what a command line asks for."""
-    config = request.config
+def train(config: BhdTrainConfig, console: Console | None = None) -> TrainResult:
+    """Train what a configuration asks for."""
     config.validate()
     refuse_unsupported(config)
     if config.threads is not None:
@@ -76,12 +75,13 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
     console = console or Console(stderr=True, quiet=not accelerator.is_main_process)
     with accelerator.main_process_first():  # whoever comes later finds what the first one downloaded
         meta = open_metadata(config)
-    if request.contract is not None:
-        check_contract(request.contract, meta)
+    tuned = config.policy.pretrained_path if config.policy and config.fine_tune and not config.resume else None
+    if tuned is not None:
+        check_contract(str(tuned), meta)
     select_episodes(config, meta)
     policy = build_policy(config, meta, accelerator)
     select_parameters(policy, config.fine_tune_parameters)
-    keep = config.resume or (request.contract is not None and config.fine_tune_statistics == "checkpoint")
+    keep = config.resume or (tuned is not None and config.fine_tune_statistics == "checkpoint")
     preprocessor, postprocessor = build_processors(config, policy, meta, accelerator.device, keep_statistics=keep)
     optimizer, scheduler = build_optimizer(config, policy)
     data = open_data(
@@ -230,7 +230,7 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
 
 PROGRAM = Program(
     BhdTrainConfig,
-    lambda request: train(request).exit_status,
+    lambda config: train(config).exit_status,
     parse_train,
     # Ctrl-C before the first step, or a second time while a step or a checkpoint was under way.
     "Stopped; checkpoints that were written before are complete.",

@@ -49,7 +49,7 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
     overrides = [f"--output_dir={tmp_path / 'run'}", "--policy.device=cpu"]
     if path.stem.startswith(("act_", "diffusion_")):
         overrides.append("--policy.pretrained_backbone_weights=null")  # they would be downloaded
-    config = parse_train([f"--config_path={path}", *overrides]).config
+    config = parse_train([f"--config_path={path}", *overrides])
     config.validate()
     assert config.policy is not None
     assert config.env_eval_freq == 0
@@ -99,9 +99,9 @@ def test_the_configuration_for_fine_tuning_takes_its_policy_from_the_checkpoint(
     data = make_dataset(tmp_path / "set", episodes=2)
     run_train(options(data, tmp_path / "before", MLP, steps=2))
     path = FOLDER / "fine_tune_ur5_pick.yaml"
-    request = parse_train([f"--config_path={path}", f"--fine_tune={tmp_path / 'before'}"])
-    request.config.validate()
-    assert request.config.policy.type == "bhd_mlp"
-    assert request.config.policy.optimizer_lr == 1e-4
-    assert request.config.optimizer.lr == 1e-4
-    assert request.contract == str((tmp_path / "before/checkpoints/last/pretrained_model").resolve())
+    config = parse_train([f"--config_path={path}", f"--fine_tune={tmp_path / 'before'}"])
+    config.validate()
+    assert config.policy.type == "bhd_mlp"
+    assert config.policy.optimizer_lr == 1e-4
+    assert config.optimizer.lr == 1e-4
+    assert config.policy.pretrained_path == (tmp_path / "before/checkpoints/last/pretrained_model").resolve()

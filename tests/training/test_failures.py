@@ -282,9 +282,9 @@ def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None
     values = json.loads(own.read_text())
     assert values["selection"].pop("hold_out") == "episode"
     own.write_text(json.dumps(values))  # as it was written when LeRobot's rule was the only one
-    assert parse_train(again).config.selection.hold_out == "instruction"
+    assert parse_train(again).selection.hold_out == "instruction"
     own.unlink()  # a checkpoint of lerobot-train
-    assert parse_train(again).config.selection.hold_out == "instruction"
+    assert parse_train(again).selection.hold_out == "instruction"
 
 
 def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
@@ -380,7 +380,7 @@ def test_mixed_precision_that_the_processor_can_only_emulate(
 @each_case("name", ["accelerator", "checkpoint_format", "ema", "parallelism", "peft", "sample_weighting"])
 def test_what_only_lerobots_loop_does_is_refused(name: str, tmp_path: Path) -> None:
     """Some of these options came after version 0.6.1 of LeRobot."""
-    config = parse_train(options(tmp_path, tmp_path / "run")).config
+    config = parse_train(options(tmp_path, tmp_path / "run"))
     refuse_unsupported(config)
     for owner, option in ((config, name), (config.dataset, "exclude_episodes")):
         before = vars(owner).get(option)

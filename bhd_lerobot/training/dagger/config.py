@@ -17,6 +17,8 @@ from bhd_lerobot.training.arguments import parse_train
 ALGORITHM = "dagger"
 FILES = "files.yaml"
 """What the files say that the configuration of a run names, in the run's folder."""
+STAGES = ("expert", "learner", "policy", "evaluation")
+"""The options of a run that name a program."""
 OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
@@ -83,13 +85,13 @@ class AggregationConfig(Options):
     @property
     def stages(self) -> tuple[StageConfig, ...]:
         """The programs of a round, in their order, and before them the expert."""
-        return self.expert, self.learner, self.policy, self.evaluation
+        return tuple(getattr(self, name) for name in STAGES)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.output_dir:
             raise ConfigError("output_dir is empty; name the folder in which the rounds are kept: --output_dir=FOLDER.")
-        for name in ("expert", "learner", "policy", "evaluation"):
+        for name in STAGES:
             if not getattr(self, name).config:
                 raise ConfigError(f"{name}.config is empty; name a configuration file: --{name}.config=FILE.")
 
@@ -125,7 +127,7 @@ def read_stages(config: AggregationConfig) -> Stages:
     evaluation = configuration.parse(EvalConfig, command(config.evaluation, {}))
     for other, name in ((learner, "learner"), (evaluation, "evaluation")):
         _check_same(expert, other, f"{name}.config, {getattr(config, name).config!r}", config.expert.config)
-    policy = parse_train(command(config.policy, {})).config
+    policy = parse_train(command(config.policy, {}))
     weight = "selection.learner_weight"
     if not learner.dataset.expert_action and weight in _names(config.policy):
         raise ConfigError(

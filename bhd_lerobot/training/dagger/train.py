@@ -2,11 +2,9 @@
 
 import contextlib
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,8 +29,8 @@ from bhd_lerobot.training import train as training
 from bhd_lerobot.training.dagger.config import (
     FILES,
     OWN,
+    STAGES,
     AggregationConfig,
-    StageConfig,
     Stages,
     command,
     kept,
@@ -111,14 +109,24 @@ def _check_data(config: AggregationConfig, stages: Stages) -> None:
 def _keep_to(folder: Path, config: AggregationConfig) -> None:
     """Note the configuration in the folder, and what the files in it say.
 
-    Refuse one that differs in more than how many rounds there are.
+    Refuse one that differs in more than how many rounds there are. Of a file its content counts, and of a dataset which
+    folder it is, not by which path it is named.
     """
     before = kept(folder)
     if before is None and folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"The folder {folder} holds other files. Set another --output_dir.")
     files = {stage.config: read_file(Path(stage.config).expanduser()) for stage in config.stages}
     if before is not None:
-        _check_same(folder, before, config, files)
+        known = read_file(folder / FILES) if (folder / FILES).exists() else {}
+        then, now = _plain(before), _plain(config)
+        for old, new in ((then[name], now[name]) for name in STAGES):
+            new["config"] = files[new["config"]]
+            old["config"] = known.get(old["config"], new["config"])
+        if differing := _differing(then, now):
+            raise ConfigError(
+                f"The rounds in {folder} were made with something else: {', '.join(differing)}. Undo that, or set "
+                "another --output_dir."
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, what in ((RUN_CONFIG, encode(config)), (FILES, files)):
@@ -127,44 +135,15 @@ def _keep_to(folder: Path, config: AggregationConfig) -> None:
         raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
 
 
-def _check_same(folder: Path, before: AggregationConfig, config: AggregationConfig, files: dict[str, Any]) -> None:
-    """Refuse a configuration other than that of the rounds in a folder.
-
-    Of a configuration file its content counts, and of a dataset which folder it is, not by which path it is named.
-    """
-    known = read_file(folder / FILES) if (folder / FILES).exists() else {}
-    for one in fields(config):
-        then, now = getattr(before, one.name), getattr(config, one.name)
-        if isinstance(now, StageConfig):
-            content = known.get(then.config)
-            if content is not None and (differing := _differing(content, files[now.config])):
-                raise ConfigError(
-                    f"{now.config} has changed since the rounds in {folder} were made: {', '.join(differing)}. Undo "
-                    "that, or set another --output_dir."
-                )
-            same = then.options == now.options and (content is not None or then.config == now.config)
-        elif one.name == "data":
-            same = then == now or [_place(root) for root in then] == [_place(root) for root in now]
-        else:
-            same = then == now or one.name in ("rounds", "output_dir")
-        if not same:
-            raise ConfigError(
-                f"The rounds in {folder} were made with {one.name} = {_shown(then)}, and now it is {_shown(now)}. "
-                "Continue with the same, or set another --output_dir."
-            )
-
-
-def _place(root: str) -> Path:
-    return Path(root).expanduser().resolve()
-
-
-def _shown(value: Any) -> Any:
-    return encode(value) if isinstance(value, StageConfig) else value
+def _plain(config: AggregationConfig) -> dict[str, Any]:
+    """Return what makes the rounds, as plain values."""
+    values = {name: value for name, value in encode(config).items() if name not in ("rounds", "output_dir")}
+    return values | {"data": [str(Path(root).expanduser().resolve()) for root in config.data]}
 
 
 def _differing(before: Any, now: Any, name: str = "") -> list[str]:
     """Return what differs between two configurations and is not set by the rounds, each with both values."""
-    if name in OWN:
+    if name.partition(".config.")[2] in OWN:
         return []
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return [] if before == now else [f"{name} was {before}, and is {now}"]
@@ -183,23 +162,19 @@ class _Rounds:
     def go(self, number: int) -> None:
         """Do what is not done yet of a round."""
         folder = self._folder / f"round_{number}"
-        done, seconds = self._done(folder)
+        note = _note(folder)
         for name, step in (("record", self._record), ("train", self._train), ("evaluate", self._evaluate)):
-            if name in done:
+            if name in note["done"]:
                 continue
             started = time.perf_counter()
             try:
                 step(number, folder)
-            except BaseException:
-                # What took time counts, even if it was stopped and is done again. The reason for the stop is what is
-                # to be said, also where nothing more can be written.
-                with contextlib.suppress(OSError):
-                    self._note(folder, done, seconds + time.perf_counter() - started)
-                raise
-            done.append(name)
-            seconds += time.perf_counter() - started
-            self._note(folder, done, seconds)
-        self._seconds += seconds
+                note["done"].append(name)
+            finally:  # what took time counts, even if it was stopped and is done again
+                note["seconds"] += time.perf_counter() - started
+                with contextlib.suppress(OSError):  # a step that is not noted is done again
+                    Disk().publish(folder / _DONE, json.dumps(note).encode())
+        self._seconds += note["seconds"]
         self._rows = dict(sorted({**self._rows, number: self._row(number, folder)}.items()))
         rows = list(self._rows.values())
         report = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": rows}
@@ -214,8 +189,7 @@ class _Rounds:
         for row in self._rows.values():
             share = "all" if row["expert_share"] is None else f"{100 * row['expert_share']:.1f} %"
             level = _interval(row["success"]), _interval(row["score"])
-            spent = "" if row["seconds"] is None else f"{row['seconds'] / 60:.1f} min"
-            table.add_row(str(row["round"]), str(row["episodes"]), share, *level, spent)
+            table.add_row(str(row["round"]), str(row["episodes"]), share, *level, f"{row['seconds'] / 60:.1f} min")
         level = _interval(self._expert["success"]), _interval(self._expert["score"])
         table.add_row("", "", self._stages.expert, *level, "")
         self._console.print(table)
@@ -247,7 +221,7 @@ class _Rounds:
             own["brain.learner.path"] = self._policy(number - 1)
         elif self._stages.has_advice:
             own["dataset.expert_action"] = "true"
-        self._run(number, "bhd-record", stage, own)
+        self._call(number, "bhd-record", command(stage, own))
 
     def _train(self, number: int, folder: Path) -> None:
         run_folder = folder / "policy"
@@ -268,7 +242,7 @@ class _Rounds:
             own["selection.expert_action"] = "true"
         elif number or self._config.data:  # which may have been recorded with takeovers, too
             own["selection.learner_weight"] = 0
-        self._run(number, "bhd-train", self._config.policy, own)
+        self._call(number, "bhd-train", command(self._config.policy, own))
 
     def _data_at(self, number: int, folder: Path) -> Path:
         """Return where the dataset of all rounds so far is."""
@@ -305,15 +279,12 @@ class _Rounds:
         }
         if not number:
             own["brains.expert"] = json.dumps(self._stages.brain)
-        self._run(number, "bhd-eval", self._config.evaluation, own)
+        self._call(number, "bhd-eval", command(self._config.evaluation, own))
 
     def _policy(self, number: int) -> Path:
         return self._folder / f"round_{number}" / "policy"
 
     # --- programs ----------------------------------------------------------------------------------------------------
-
-    def _run(self, number: int, program: str, stage: StageConfig, own: dict[str, Any]) -> None:
-        self._call(number, program, command(stage, own))
 
     def _call(self, number: int, program: str, arguments: Sequence[str]) -> None:
         self._say(number, f"{program} {' '.join(arguments)}")
@@ -337,28 +308,6 @@ class _Rounds:
 
     # --- results -----------------------------------------------------------------------------------------------------
 
-    @staticmethod
-    def _note(folder: Path, done: Sequence[str], seconds: float) -> None:
-        values = {"done": done, "seconds": None if math.isnan(seconds) else seconds}
-        Disk().publish(folder / _DONE, json.dumps(values).encode())
-
-    @staticmethod
-    def _done(folder: Path) -> tuple[list[str], float]:
-        """Return which steps of a round are done, and how long it took so far [s]; NaN if that is not known."""
-        folder.mkdir(exist_ok=True)
-        file = folder / _DONE
-        if not file.exists():
-            return [], 0.0
-        try:
-            values = json.loads(file.read_text(encoding="utf-8"))
-            if isinstance(values, list):  # of a version that did not note the time
-                return values, math.nan
-            return list(values["done"]), math.nan if values["seconds"] is None else float(values["seconds"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise BhdError(
-                f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is repeated."
-            ) from error
-
     def _row(self, number: int, folder: Path) -> dict[str, Any]:
         results = json.loads((folder / "evaluation" / "results.json").read_text(encoding="utf-8"))["brains"]
         if not number:
@@ -373,9 +322,23 @@ class _Rounds:
             "episodes": len(learned.episodes),
             "frames": learned.frames,
             "expert_share": share,
-            "seconds": None if math.isnan(self._seconds) else self._seconds,
+            "seconds": self._seconds,
             **_level(results["policy"]),
         }
+
+
+def _note(folder: Path) -> dict[str, Any]:
+    """Return which steps of a round are done, and how long they took so far [s]."""
+    folder.mkdir(exist_ok=True)
+    try:
+        values = json.loads((folder / _DONE).read_text(encoding="utf-8"))
+        return {"done": list(values["done"]), "seconds": float(values["seconds"])}
+    except FileNotFoundError:
+        return {"done": [], "seconds": 0.0}
+    except (ValueError, TypeError, KeyError) as error:
+        raise BhdError(
+            f"{folder / _DONE} cannot be read: {error}. Remove the folder {folder}, and its round is repeated."
+        ) from error
 
 
 def _reported(folder: Path) -> dict[int, dict[str, Any]]:
