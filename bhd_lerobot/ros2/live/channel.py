@@ -38,13 +38,10 @@ class Channel:
     """States and images one way, commands the other; neither side ever waits.
 
     Attributes:
-        words: see `Word`.
         states: counts, times and numbers of the inputs; mean times between two messages of inputs and cameras.
-        commands: numbers of the outputs.
         images: of each camera, records of `image_dtypes`.
 
     Args:
-        spec: the node.
         descriptor: of the memory; a new one is made if None.
     """
 

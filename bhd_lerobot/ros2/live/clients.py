@@ -28,8 +28,6 @@ class ServiceClient:
     places where the difference matters.
 
     Args:
-        node: the node that calls it.
-        name: of the service.
         srvtype: its type, such as ``std_srvs/srv/SetBool``.
 
     Raises:

@@ -72,9 +72,6 @@ class ClockOffset:
     stamp is of the same clock if it is a little older than the sending. Any other stamp, as of a simulation, is of a
     clock with a rate of its own, which may be set.
 
-    Attributes:
-        jumps: how often such a clock was set.
-
     Args:
         is_synchronised: whether the sender's clock is that of this machine.
     """

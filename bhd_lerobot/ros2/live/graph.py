@@ -22,12 +22,7 @@ class Endpoint:
     """A publisher or a subscription.
 
     Attributes:
-        topic: with a slash in front.
-        msgtype: of its messages.
-        qos: how they are kept.
-        is_publisher: whether it is a publisher.
         node: name of its node with its namespace; empty while that is not known.
-        is_own: whether it is of this process.
         type_hash: of the type's definition, as ROS 2 states it since Iron; empty if it does not.
     """
 
@@ -45,11 +40,6 @@ class Graph:
 
     ROS 2's nodes share a participant with others of their process, and tell which endpoints are theirs on
     ``ros_discovery_info``.
-
-    Args:
-        participant: Cyclone DDS' participant.
-        name, namespace: of the only node of this process.
-        distro: whose form of that message is used.
     """
 
     def __init__(self, participant: Any, name: str, namespace: str, distro: str) -> None:
@@ -156,14 +146,7 @@ class Graph:
             del self._nodes[key], self._owners[key]
 
     def mismatches(self, topic: str, msgtype: str, qos: Qos, *, is_publisher: bool) -> list[str]:
-        """Return why endpoints of others on a topic do not exchange messages with one of ours, in sentences.
-
-        Args:
-            topic: with a slash in front.
-            msgtype: of our endpoint.
-            qos: of our endpoint.
-            is_publisher: whether ours is a publisher.
-        """
+        """Return why endpoints of others on a topic do not exchange messages with one of ours, in sentences."""
         return _mismatches(Endpoint(topic, msgtype, qos, is_publisher, "", is_own=True), self.endpoints())
 
     def all_mismatches(self) -> list[str]:

@@ -30,14 +30,7 @@ SILENCE_S = 3.0  # so long without a sign of life a process counts as stopped; o
 
 
 class NodeLink:
-    """A node in a process of its own.
-
-    Attributes:
-        spec: the node.
-
-    Args:
-        spec: the node.
-    """
+    """A node in a process of its own."""
 
     def __init__(self, spec: NodeSpec) -> None:
         self.spec = spec
@@ -54,7 +47,6 @@ class NodeLink:
             patience_s: how long at the most [s]; None to wait for none.
 
         Raises:
-            ConfigError: Cyclone DDS is not installed.
             RealtimeError: the processes do not start, a topic sends nothing, or another program commands the robot;
                 names it, and why.
         """
@@ -122,11 +114,7 @@ class NodeLink:
 
     @property
     def channel(self) -> Channel:
-        """The shared memory.
-
-        Raises:
-            RealtimeError: the node is not open.
-        """
+        """The shared memory."""
         if self._channel is None:
             raise RealtimeError("The ROS 2 node is not open.")
         return self._channel
@@ -152,9 +140,6 @@ class NodeLink:
 
         Args:
             silence_s: so long without a sign of life one counts as stopped [s].
-
-        Raises:
-            RealtimeError: one has.
         """
         for role, word in (("node", Word.ALIVE), ("guard", Word.GUARD_ALIVE)):
             process = self._processes.get(role)

@@ -136,11 +136,7 @@ class Qos:
     transient_local: bool = False
 
     def of_dds(self, *user_data: bytes) -> Any:
-        """Return it for Cyclone DDS.
-
-        Args:
-            user_data: what else an endpoint tells the others.
-        """
+        """Return it for Cyclone DDS."""
         from cyclonedds.qos import Policy
         from cyclonedds.qos import Qos as DdsQos
 
@@ -173,11 +169,7 @@ LATCHED = Qos(1, transient_local=True)
 
 
 def require_cyclonedds() -> None:
-    """Raise unless the extra of live ROS 2 is installed.
-
-    Raises:
-        ConfigError: it is not; names the command that installs it.
-    """
+    """Raise unless the extra of live ROS 2 is installed."""
     try:
         import cyclonedds.core  # noqa: F401
         import rosbags.typesys  # noqa: F401

@@ -25,11 +25,8 @@ class Received:
     """A message that arrived.
 
     Attributes:
-        msgtype: its type.
-        data: it, serialised.
         sent_ns: when it was sent, on the sender's wall clock [ns].
         arrived_ns: when it was taken, on the monotonic clock of this machine [ns].
-        sender: its publisher, one of `Subscription.sender_ids`.
     """
 
     msgtype: str
@@ -39,11 +36,7 @@ class Received:
     sender: int = field(default=0, kw_only=True)
 
     def message(self) -> Any:
-        """Return it deserialised.
-
-        Raises:
-            DatasetError: its bytes are not of this type.
-        """
+        """Return it deserialised."""
         return decode(self.msgtype, self.data)
 
 
@@ -119,12 +112,7 @@ def _matched(ask: Callable[[], list[int]]) -> list[int]:
 class Node:
     """A node on the network, which `ros2 node list` shows.
 
-    Attributes:
-        graph: who else is there.
-
     Args:
-        name: the node's.
-        network: where other nodes are looked for.
         namespace: the node's; topics without a slash in front are in it.
 
     Raises:

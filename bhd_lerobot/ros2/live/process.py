@@ -43,11 +43,7 @@ _TOMORROW_NS = 1_000_000_000  # a stamp further from the one before is of a cloc
 
 
 class Stopper:
-    """Sends the stop of all outputs.
-
-    Args:
-        publishers: of the outputs, in their order.
-    """
+    """Sends the stop of all outputs."""
 
     def __init__(self, spec: NodeSpec, publishers: list[Publisher]) -> None:
         self._pairs = [

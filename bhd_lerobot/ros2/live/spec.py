@@ -48,7 +48,6 @@ class InputSpec:
 
     Attributes:
         topic, msgtype, qos: of the subscription; what is transient local is received from volatile publishers, too.
-        reader: takes the numbers from a message.
         silence_s: without a message for so long it is silent, which is a problem [s]; infinite for a topic that is sent
             when something changes, which is not waited for either: its numbers are not a number until then.
     """
@@ -75,9 +74,6 @@ class OutputSpec:
     """A topic that is sent.
 
     Attributes:
-        topic, msgtype, qos: of the publisher.
-        writer: makes a message of the command's numbers.
-        is_required: whether a node has to receive it.
         remedy: what to do if a node receives another type.
         stop: the numbers that stop the robot, sent when no command comes any more; None for a robot that stops by
             itself.
@@ -102,10 +98,7 @@ class CameraSpec:
     """A topic of images.
 
     Attributes:
-        name: of the camera.
-        topic, msgtype, qos: of the subscription.
         width, height: of an image [px].
-        silence_s: without an image for so long it is silent, which is a problem [s].
     """
 
     name: str
@@ -122,8 +115,6 @@ class NodeSpec:
     """A node.
 
     Attributes:
-        name: of the node.
-        network: where other nodes are.
         command_hz: a command is sent at once, but at most so often; without a new one, the last is repeated as often
             [Hz].
         timeout_s: without a command for so long the stop is sent instead [s].

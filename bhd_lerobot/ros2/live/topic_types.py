@@ -27,11 +27,7 @@ def ros_type_name(name: str) -> str:
 
 @cache
 def topic_type(msgtype: str) -> Any:
-    """Return the class of a type's samples, whose `data` is the serialised message with its encapsulation header.
-
-    Raises:
-        ConfigError: the type is not known.
-    """
+    """Return the class of a type's samples, whose `data` is the serialised message with its encapsulation header."""
     made = _nested(msgtype)
     made.serialize = lambda sample, *_, **__: sample.data
     made.deserialize = classmethod(lambda _, data, *__, **___: raw(made, bytes(data)))

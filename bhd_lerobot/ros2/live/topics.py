@@ -85,11 +85,6 @@ def _mismatches(ends: list[Endpoint]) -> list[str]:
 def subscribed(node: Node, topic: str, wait_s: float) -> Subscription:
     """Subscribe to a topic, with the type of its publishers and a quality of service that fits all of them.
 
-    Args:
-        node: the node that subscribes.
-        topic: its name, with a slash in front or without.
-        wait_s: how long a publisher is waited for [s].
-
     Raises:
         ConfigError: there are several types, or the type's definition is not known.
         RealtimeError: there is no publisher of it.
@@ -125,11 +120,7 @@ def is_hidden(topic: str) -> bool:
 
 
 class Intervals:
-    """Times between messages, of the last seconds and of all.
-
-    Args:
-        window_s: length of the window [s].
-    """
+    """Times between messages, of the last seconds and of all."""
 
     def __init__(self, window_s: float) -> None:
         self.window_s = window_s

@@ -48,9 +48,6 @@ class OdometryPart(Part):
 
     Where it is not, the message's pose is integrated from the speeds, so that a viewer has a path to draw; how far it
     is off is not known then.
-
-    Attributes:
-        noise: if it is known; only needed to write.
     """
 
     msgtype: str = ODOMETRY_TYPE
@@ -129,11 +126,7 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class ScanPart(Part):
-    """A scan. Without a return, ROS has infinity and the dataset the maximum range.
-
-    Attributes:
-        lidar: its ranges and rate; only needed to write.
-    """
+    """A scan. Without a return, ROS has infinity and the dataset the maximum range."""
 
     msgtype: str = SCAN
     lidar: LidarSpec | None = None

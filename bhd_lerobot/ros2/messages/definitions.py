@@ -244,11 +244,7 @@ def register_types(types: Mapping[str, str]) -> None:
 
 
 def register_message(name: str, text: str) -> None:
-    """Make a message known as a bag defines it, together with those that it names.
-
-    Raises:
-        ConfigError: its definition cannot be read, or is another one than that known already.
-    """
+    """Make a message known as a bag defines it, together with those that it names."""
     from rosbags.typesys import get_types_from_msg
 
     store = type_store()
@@ -266,11 +262,7 @@ def find_type(name: str, distro: str = "jazzy") -> None:
     """Make sure that the definition of a type is known.
 
     Args:
-        name: of a message, a service or an action.
         distro: the definition is that of this distribution, unless another was registered before in this process.
-
-    Raises:
-        ConfigError: it is not.
     """
     if _is_known(name):
         return
@@ -284,11 +276,7 @@ def find_type(name: str, distro: str = "jazzy") -> None:
 
 
 def register_unknown(types: Mapping[str, str]) -> None:
-    """Make types known that are not yet, as they come together with one of them, which names the others.
-
-    Raises:
-        ConfigError: a definition cannot be read.
-    """
+    """Make types known that are not yet, as they come together with one of them, which names the others."""
     register_types({name: text for name, text in types.items() if not _is_known(name)})
 
 

@@ -23,7 +23,6 @@ class _Step:
     Attributes:
         index: of the element; None without one, or where `key` selects it.
         key: the element is the one whose field `key`, or the array `key` beside this one, has the value `value`.
-        is_message: whether an element is a message.
         length: of an array of a fixed length; 0 of any other.
     """
 
@@ -56,7 +55,6 @@ class Field:
     """A field of a type's messages.
 
     Args:
-        msgtype: the type, such as ``nav_msgs/msg/Odometry``.
         path: names separated by dots. ``[2]`` behind a name is an element of an array;
             ``[name=elbow_joint]`` is the one whose field `name` is that, or where the elements are numbers, the one at
             the place of that text in the array `name` beside it.

@@ -29,10 +29,8 @@ class FieldConfig:
 
     Attributes:
         topic: its topic, such as ``/odom``; without a slash in front it is the same.
-        type: of the topic's messages, such as ``nav_msgs/msg/Odometry``.
         field: in a message, see `Field`. A quaternion is read as its yaw [rad].
         scale: the feature is the field times this, plus `offset`; an action is taken back by the inverse.
-        offset: see `scale`.
         beams: of a LaserScan, how many features it becomes: ``NAME_000.pos`` … [m], the first straight ahead,
             counter-clockwise. 0 for one feature.
         range_min, range_max: of these features [m]; no return is `range_max`.
@@ -70,8 +68,6 @@ class ImageConfig:
     """Where a camera's images are.
 
     Attributes:
-        topic: its topic.
-        type: of the topic's messages, ``sensor_msgs/msg/CompressedImage`` or ``sensor_msgs/msg/Image``.
         width, height: of an image [px]; 0 for those of the first image of a bag.
     """
 
@@ -90,9 +86,6 @@ class MappingConfig:
     """The topics of a robot.
 
     Attributes:
-        observation: features of the state, in this order.
-        action: features of the action, in this order.
-        images: cameras by name.
         types: definitions of message types that are not ROS 2's own, in its message language, by name.
     """
 
@@ -120,14 +113,7 @@ class MappingConfig:
 
     @classmethod
     def of(cls, tree: Any, where: str) -> Self:
-        """Return the mapping in nested values, as a file holds them.
-
-        Args:
-            where: they are from, for messages.
-
-        Raises:
-            ConfigError: there are other keys, or values.
-        """
+        """Return the mapping in nested values, as a file holds them."""
         kinds: dict[str, Any] = {"observation": FieldConfig, "action": FieldConfig, "images": ImageConfig, "types": str}
         if not isinstance(tree, dict):
             raise ConfigError(f"{where} is not a mapping of {', '.join(kinds)}.")
@@ -171,9 +157,7 @@ class TopicFields:
     """The features of one topic.
 
     Attributes:
-        topic, msgtype: of its messages.
         columns: places of its features among all of them.
-        fields: where each of them is in a message.
         scales, offsets: a feature is its field times the scale, plus the offset; shape (len(columns),).
     """
 
@@ -244,11 +228,7 @@ class TopicFields:
 
 
 class FieldsReader:
-    """Reads the features of one topic message by message: yaws count on beyond half a turn.
-
-    Args:
-        names: of the features.
-    """
+    """Reads the features of one topic message by message: yaws count on beyond half a turn."""
 
     def __init__(self, fields: TopicFields, names: Sequence[str]) -> None:
         self._fields, self._names, self.width = fields, names, fields.width
@@ -318,11 +298,7 @@ def topics_of(section: Mapping[str, FieldConfig], types: Mapping[str, str]) -> l
 
 
 def fields_of(topic: str, msgtype: str, paths: Iterable[str]) -> TopicFields:
-    """Return what reads and writes some fields of a topic's messages, in order.
-
-    Raises:
-        ConfigError: as for `topics_of`.
-    """
+    """Return what reads and writes some fields of a topic's messages, in order."""
     [found] = topics_of({path: FieldConfig(topic, msgtype, path) for path in paths}, {})
     return found
 

@@ -28,7 +28,6 @@ class Frames:
     """Frames of an episode that messages are made for.
 
     Attributes:
-        episode: its index.
         index: numbers of the frames, shape (n,).
         stamps: when the messages are stamped [ns], shape (n,).
     """
@@ -70,11 +69,7 @@ def head_stamps(heads: Sequence[bytes]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Part(ABC):
-    """Numbers of a feature that one topic carries.
-
-    Attributes:
-        names: of the numbers, in the order in which they are given.
-    """
+    """Numbers of a feature that one topic carries."""
 
     topic: str
     names: tuple[str, ...]
@@ -97,7 +92,6 @@ class FieldsPart(Part):
     Attributes:
         name: what it is called in an exported bag.
         frame: of the header; None of messages without one.
-        rest: the other fields that are not zero.
     """
 
     name: str = ""

@@ -44,10 +44,6 @@ def turtlebot3(
     """Return the mapping of a TurtleBot3.
 
     Args:
-        scan, odom, cmd, imu: topics; of odometry and IMU None if they are not observed.
-        cameras: topics of images by name.
-        beams: of a scan in the observation.
-        pose: whether the odometry's pose is observed, too.
         stamped: whether commands are TwistStamped, as on Jazzy, or Twist, as on Humble.
     """
     lidar = turtlebot3_burger().lidar

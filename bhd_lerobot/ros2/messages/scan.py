@@ -38,8 +38,6 @@ def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: floa
     nearest or farthest range.
 
     Args:
-        ranges: as they came [m].
-        range_min: of the scanner that measured [m].
         range_max: of the same; one that is not positive is none.
     """
     values = np.asarray(ranges, np.float64)
@@ -180,13 +178,8 @@ class ScanReader:
     """Ranges [m] of our beams from the scans of a scanner, whatever its beams and however it is mounted.
 
     Attributes:
-        topic: of the scans.
-        lidar: the ranges that the features have.
-        width: the number of beams.
-        frame: the scanner's frame, if the user names it.
         yaw: the scanner's angle in the robot [rad], if the user gives it.
         prefix: what the names of the options begin with by which the user does.
-        static: the transforms of ``/tf_static``.
     """
 
     topic: str

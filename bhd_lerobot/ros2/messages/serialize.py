@@ -19,10 +19,8 @@ def encode(msgtype: str, fields: Tree, n: int) -> list[bytes]:
     """Return n serialised messages.
 
     Args:
-        msgtype: their type.
         fields: values by name; what is left out is zero, empty or nothing. A number of each message is an array of
             shape (n,), a sequence of numbers one of shape (n, m), or of shape (m,) if all messages share it.
-        n: how many.
     """
     store = type_store()
     return [bytes(store.serialize_cdr(_message(msgtype, fields, row), msgtype)) for row in range(n)]
@@ -36,10 +34,6 @@ def encode_known(msgtype: str, fields: Tree) -> bytes:
 
 def encode_one(msgtype: str, fields: Tree) -> bytes:
     """Return one serialised message.
-
-    Args:
-        msgtype: its type.
-        fields: values by name; what is left out is zero, empty or nothing.
 
     Raises:
         ConfigError: there is no such field, or a value is not of its type.

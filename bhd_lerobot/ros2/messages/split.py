@@ -45,11 +45,7 @@ def parts_of(
     noise: BaseNoise | None = None,
     bare_twist: bool = False,
 ) -> list[Part]:
-    """Return what carries a vector of floats; every name is in exactly one part.
-
-    Args:
-        noise: of what it measures of its own motion, if it is known; only needed to write.
-    """
+    """Return what carries a vector of floats; every name is in exactly one part."""
     left = list(names)
     parts: list[Part] = []
 

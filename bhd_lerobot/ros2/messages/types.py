@@ -12,7 +12,7 @@ from typing import Any
 from bhd_lerobot.errors import ConfigError, install_extra
 
 FORMAT = 2
-"""Version of the messages below; an `Episode` of another one is refused."""
+"""Version of the messages below."""
 
 INTERFACES = "bhd_interfaces"
 """Package of the messages in the folder `msg`: what a brain, a cerebellum and a person send one another."""
@@ -135,11 +135,7 @@ string text
 
 
 def require_rosbags() -> None:
-    """Raise unless the extra that bags need is installed.
-
-    Raises:
-        ConfigError: it is not; names the command that installs it.
-    """
+    """Raise unless the extra that bags need is installed."""
     try:
         import mcap.reader  # noqa: F401
         import rosbags.rosbag2  # noqa: F401

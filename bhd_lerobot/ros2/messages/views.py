@@ -23,7 +23,6 @@ class StaticFrame:
     """A frame that sits still in another one.
 
     Attributes:
-        parent, child: their names.
         position: of the child's origin in the parent [m].
         rotation: of the child in the parent, a unit quaternion wxyz.
     """
@@ -36,11 +35,7 @@ class StaticFrame:
 
 @dataclass(frozen=True)
 class JointFrame(StaticFrame):
-    """A frame that turns about its z axis, with a joint; `position` and `rotation` are those at zero.
-
-    Attributes:
-        joint: the joint's name in ROS.
-    """
+    """A frame that turns about its z axis, with a joint; `position` and `rotation` are those at zero."""
 
     joint: str = ""
 
@@ -50,9 +45,6 @@ class RobotView:
     """What is known of a robot beside its data.
 
     Attributes:
-        lidar: its range finder, if it has one.
-        noise: of what it measures of its own motion, if it is known.
-        frames: that sit still in others.
         joints: frames that turn; their parents come first.
         fovy: vertical field of view of its cameras by name [rad].
         wheels: names of the wheels' joints in ROS -> names of angle and speed in `simulation.state`.
@@ -163,8 +155,6 @@ def camera_info(frames: Frames, frame_id: str, size: tuple[int, int], fovy: floa
     """Return the geometry of a camera without distortion.
 
     Args:
-        frames: which messages.
-        frame_id: the camera's optical frame.
         size: height and width of its images [px].
         fovy: its vertical field of view [rad].
     """

@@ -28,10 +28,6 @@ class ArmPlant(Ros2Plant):
     In come ``/joint_states``, the speed scaling and the safety mode, out go positions, and the opening of a gripper.
     The driver knows no gripper: its opening reads as it was commanded last. Without commands the arm holds where it was
     commanded to be. Efforts are not read: the driver has the motors' currents [A].
-
-    Args:
-        config: the robot's configuration.
-        body: its hardware.
     """
 
     command_hz = 125.0

@@ -23,10 +23,6 @@ class BasePlant(Ros2Plant):
     """A base with the topics of a TurtleBot3: ``/joint_states``, ``/scan``, by option ``/imu``; ``/cmd_vel``.
 
     The robot's node continues with its last command for ever: the stop is sent when commands cease.
-
-    Args:
-        config: the robot's configuration.
-        body: its hardware.
     """
 
     takes = "twist"

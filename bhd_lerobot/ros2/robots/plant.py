@@ -25,14 +25,7 @@ def scan_reader(network: Ros2Config, topic: str, lidar: LidarSpec, beams: int) -
 class Ros2Plant(Plant):
     """A robot on a ROS 2 network.
 
-    Args:
-        name: of the robot.
-        config: the robot's configuration.
-        inputs: what is received.
-        outputs: what is sent.
-
     Attributes:
-        usual_latency_s: of robots of this kind [s].
         moves: a command that is so far from rest moves the robot, see `commanded` and `moved`.
         followed_s: how long after its first such command the robot had moved as far [s]; None before.
     """
@@ -93,11 +86,7 @@ class Ros2Plant(Plant):
         return state
 
     def read(self, out: PlantReading) -> None:
-        """Write the newest readings into `out`.
-
-        Raises:
-            RealtimeError: as for `state`.
-        """
+        """Write the newest readings into `out`."""
         self.read_parts(self.state(), out)
         if self.followed_s is None and self._commanded_ns and self.moved(out) >= self.moves:
             self.followed_s = (time.monotonic_ns() - self._commanded_ns) / 1e9

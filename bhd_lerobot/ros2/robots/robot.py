@@ -41,15 +41,8 @@ class Ros2Robot(Robot):
     newest message of each topic.
 
     Attributes:
-        spec: its node.
         reading_timestamps: when each topic's numbers in the last observation were measured, on `time.perf_counter`
             [s]; none of messages that are on their way for an unknown time.
-
-    Args:
-        config: the configuration.
-
-    Raises:
-        ConfigError: the mapping cannot be used.
     """
 
     config_class = Ros2RobotConfig
@@ -150,8 +143,6 @@ class Ros2Robot(Robot):
         """Join the network, and wait for the robot's topics.
 
         Raises:
-            DeviceAlreadyConnectedError: it is connected already.
-            ConfigError: Cyclone DDS is not installed.
             RealtimeError: a topic sends nothing; names it, and why.
         """
         if self._is_connected:
@@ -184,7 +175,6 @@ class Ros2Robot(Robot):
         """Return the newest values of all features: floats, and images of shape (height, width, 3), uint8 RGB.
 
         Raises:
-            DeviceNotConnectedError: it is not connected.
             RealtimeError: a topic is silent, or another node commands the robot.
         """
         state = self._state()
@@ -213,9 +203,7 @@ class Ros2Robot(Robot):
         """Send an action; return it.
 
         Raises:
-            DeviceNotConnectedError: it is not connected.
             ActionError: an action is missing, or is not a finite number; nothing is sent.
-            RealtimeError: as for `get_observation`.
         """
         self._state()
         missing = [name for name in self._actions if name not in action]
@@ -262,10 +250,6 @@ class Ros2Camera:
 
     Attributes:
         latest_timestamp: when the last image was taken, on `time.perf_counter` [s]; None before the first.
-
-    Args:
-        link: the node.
-        index: of the camera.
     """
 
     def __init__(self, link: NodeLink, index: int) -> None:
@@ -273,11 +257,7 @@ class Ros2Camera:
         self.latest_timestamp: float | None = None
 
     def read_latest(self) -> NDArray[np.uint8]:
-        """Return the newest image, shape (height, width, 3).
-
-        Raises:
-            RealtimeError: there is none.
-        """
+        """Return the newest image, shape (height, width, 3)."""
         record = self._link.channel.images[self._index].latest()
         if record is None:
             raise RealtimeError("The camera has sent no image.")

@@ -31,15 +31,7 @@ _STUCK_NS = NANOSECONDS  # without coming nearer
 
 
 class ArmTopics(Topics):
-    """The topics of an arm.
-
-    Args:
-        host: the robot, whose actions are joint positions.
-        node: the node.
-        counts: what is refused.
-        view: what is known of the robot.
-        joint_states_hz: how often the joints are published [Hz].
-    """
+    """The topics of an arm."""
 
     def __init__(
         self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView, joint_states_hz: float
@@ -198,9 +190,7 @@ class _Motion:
     """What an arm is brought to: sent again until the arm is there, as a controller of ROS 2 holds its last command.
 
     Args:
-        topic: that it came by.
         trajectory: the joints' way; None for one posture.
-        start_ns: when the trajectory starts, monotonic [ns].
     """
 
     def __init__(self, topic: str, trajectory: JointTrajectory | None = None, start_ns: int = 0) -> None:

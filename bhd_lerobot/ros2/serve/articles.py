@@ -91,8 +91,6 @@ class TrajectoryController(Topics):
     """The topics of a `joint_trajectory_controller` in front of a served arm.
 
     Args:
-        host: the arm.
-        node: the node.
         follow: takes a trajectory; returns False if it is refused.
     """
 

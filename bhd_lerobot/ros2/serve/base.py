@@ -35,8 +35,6 @@ class BaseTopics(Topics):
 
     Args:
         host: the robot, with odometry and a gyroscope in its observation.
-        node: the node.
-        view: what is known of the robot.
     """
 
     def __init__(self, host: LiveHost, node: Node, view: views.RobotView) -> None:

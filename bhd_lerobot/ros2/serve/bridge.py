@@ -64,12 +64,7 @@ class BridgeConfig(ServiceConfig):
 
 
 class Faults(Topics):
-    """Reports each fault of the robot once, with its cause and the remedy; one that no reset ends is an error.
-
-    Args:
-        host: the robot.
-        report: takes a line.
-    """
+    """Reports each fault of the robot once, with its cause and the remedy; one that no reset ends is an error."""
 
     def __init__(self, host: LiveHost, report: Callable[[str], None]) -> None:
         self._host, self._report, self._before, self._looks = host, report, host.bridge.latest.copy(), 0
@@ -100,13 +95,7 @@ def bridge(
 ) -> None:
     """Stand between brains and a robot until SIGINT or SIGTERM. The robot starts where it is, and holds.
 
-    Args:
-        simulation: of the robot's type, which names what drives the plant.
-        console: takes lines about the state.
-        ended: ends it as well, once it is set.
-
     Raises:
-        ConfigError: Cyclone DDS is not installed, or there is no such plant.
         DatasetError: what is at `record.root` is no dataset of this robot, or cannot be written.
         RealtimeError: the robot is not there, another program commands it, or a process of it has ended.
     """

@@ -25,8 +25,6 @@ def urdf(name: str, view: RobotView, parts: Sequence[Part]) -> str:
     """Return the description of a robot, whose links are the frames of ``/tf``.
 
     Args:
-        name: the robot's.
-        view: its frames.
         parts: what it consists of, with all joints at zero, in the frame `base_footprint` or `base`.
     """
     frames = [*view.frames, *view.joints]

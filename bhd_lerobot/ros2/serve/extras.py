@@ -21,13 +21,7 @@ _CLOCK = "rosgraph_msgs/msg/Clock"
 
 
 class CameraTopics(Topics):
-    """The images of a robot's cameras, one an action: ``/camera/image_raw/compressed``, or with the camera's name.
-
-    Args:
-        host: the robot.
-        node: the node.
-        view: what is known of the robot.
-    """
+    """The images of a robot's cameras, one an action: ``/camera/image_raw/compressed``, or with the camera's name."""
 
     def __init__(self, host: LiveHost, node: Node, view: views.RobotView) -> None:
         self._host, self._view, self._pending = host, view, 0
@@ -63,11 +57,7 @@ class CameraTopics(Topics):
 
 
 class ClockTopic(Topics):
-    """``/clock``, for nodes with `use_sim_time`; it is the wall clock.
-
-    Args:
-        node: the node.
-    """
+    """``/clock``, for nodes with `use_sim_time`; it is the wall clock."""
 
     def __init__(self, node: Node) -> None:
         self._clock = node.publisher("/clock", _CLOCK, SENSOR_DATA)

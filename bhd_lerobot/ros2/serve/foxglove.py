@@ -32,10 +32,6 @@ class _Refused(Received):
 class FoxgloveServer:
     """Serves topics to the Foxglove app, on this machine alone: ``ws://localhost:PORT``.
 
-    Args:
-        name: the robot's, which the app shows.
-        port: the TCP port.
-
     Raises:
         ConfigError: Foxglove's SDK is not installed.
     """
@@ -150,12 +146,7 @@ class FoxgloveServer:
 
 
 class MirroredPublisher(Publisher):
-    """A publisher whose messages are also sent to clients of Foxglove that are subscribed.
-
-    Args:
-        writer, made, topic, msgtype: see `Publisher`.
-        channel: the topic's channel of Foxglove's SDK.
-    """
+    """A publisher whose messages are also sent to clients of Foxglove that are subscribed."""
 
     def __init__(self, writer: Any, made: Any, topic: str, msgtype: str, channel: Any) -> None:
         super().__init__(writer, made, topic, msgtype)
@@ -183,12 +174,7 @@ class MirroredPublisher(Publisher):
 
 
 class MirroredSubscription(Subscription):
-    """A subscription that also receives what clients of Foxglove publish.
-
-    Args:
-        reader, topic, msgtype: see `Subscription`.
-        inbox: where clients' messages are.
-    """
+    """A subscription that also receives what clients of Foxglove publish."""
 
     def __init__(self, reader: Any, topic: str, msgtype: str, inbox: deque[Received]) -> None:
         super().__init__(reader, topic, msgtype)
@@ -202,12 +188,7 @@ class MirroredSubscription(Subscription):
 
 
 class MirroredNode(Node):
-    """A node whose topics are also served to the Foxglove app.
-
-    Args:
-        name, network, namespace: see `Node`.
-        server: Foxglove's server.
-    """
+    """A node whose topics are also served to the Foxglove app."""
 
     def __init__(self, name: str, network: NetworkConfig, namespace: str, server: FoxgloveServer) -> None:
         super().__init__(name, network, namespace)

@@ -24,7 +24,6 @@ class Goals(Protocol):
 
     Attributes:
         frames: in which a target pose may be given; the first where none is named.
-        timeout_s: a goal fails if it takes longer [s].
     """
 
     frames: tuple[str, ...]
@@ -44,11 +43,7 @@ class Goals(Protocol):
 
 
 class ArmGoals:
-    """Goals of an arm, which its cerebellum follows.
-
-    Args:
-        host: the arm.
-    """
+    """Goals of an arm, which its cerebellum follows."""
 
     frames: tuple[str, ...] = (ARM_FRAME,)
     timeout_s = 20.0

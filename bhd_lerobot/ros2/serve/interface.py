@@ -35,10 +35,6 @@ class Names:
     """Under which topics, and as which messages, goals, their results and the state are exchanged.
 
     Fields of a message are found by their names; a field that the other side does not have is left out.
-
-    Attributes:
-        command, result, state: the topics.
-        command_type, result_type, state_type: of their messages.
     """
 
     command: str = COMMAND_TOPIC
@@ -53,14 +49,7 @@ class InterfaceTopics(Topics):
     """The topics of brain and cerebellum.
 
     Args:
-        host: the robot.
-        node: the node.
-        counts: what is refused.
-        state_hz: how often the state is published [Hz].
-        goals: follows the commands.
-        taken: called when a goal was taken.
         ended: called with the result of each goal that was taken, before it is published.
-        names: under which they are there.
     """
 
     def __init__(

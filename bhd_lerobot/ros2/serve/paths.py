@@ -32,11 +32,6 @@ class PlannedPath(Topics):
     """The path of an arm's tool by the plan that is followed, and its end, in the base frame.
 
     The plan is that of a goal, or a joint trajectory that came by its topic. At its end the path is empty.
-
-    Args:
-        host: the robot.
-        node: the node.
-        trajectory: returns the joint trajectory that is followed, or None.
     """
 
     def __init__(self, host: LiveHost, node: Node, trajectory: Callable[[], JointTrajectory | None]) -> None:
@@ -78,11 +73,7 @@ class PlannedPath(Topics):
 
 
 class DrivenPath(Topics):
-    """The path that a base has driven in the last minute, by its odometry; sent where somebody receives it.
-
-    Args:
-        node: the node.
-    """
+    """The path that a base has driven in the last minute, by its odometry; sent where somebody receives it."""
 
     def __init__(self, node: Node) -> None:
         self._poses: deque[Any] = deque(maxlen=_DRIVEN_HZ * _DRIVEN_S)

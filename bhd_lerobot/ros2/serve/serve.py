@@ -75,11 +75,6 @@ def serve(
 ) -> None:
     """Serve a robot until SIGINT or SIGTERM.
 
-    Args:
-        simulation: of the robot of `config.robot`.
-        console: takes lines about the state.
-        ended: ends it as well, once it is set.
-
     Raises:
         ConfigError: Cyclone DDS is not installed, or Foxglove cannot be served.
         RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.

@@ -47,8 +47,6 @@ class Output:
     """Something that is published at a fixed rate.
 
     Attributes:
-        rate_hz: how often [Hz].
-        publish: sends the messages of a state.
         due_ns: when it is due next, monotonic [ns].
     """
 
@@ -70,7 +68,6 @@ class Input:
     """A topic that commands the robot.
 
     Attributes:
-        subscription: where messages come from.
         take: takes a message, deserialised; returns False if it is refused.
         which: of the messages that have arrived: the newest that is not refused; each, the oldest first, one in a turn
             of the loop, which goes on meanwhile; or those that differ, once each, to find one among any number.
@@ -154,14 +151,7 @@ class Topics:
 
 
 class Server:
-    """Serves a robot.
-
-    Args:
-        host: the robot, whose loop runs.
-        node: the node.
-        parts: its topics.
-        counts: what they refuse.
-    """
+    """Serves a robot."""
 
     def __init__(self, host: LiveHost, node: Node, parts: Iterable[Topics], counts: Counts) -> None:
         self._host, self._node, self._parts, self.counts = host, node, list(parts), counts

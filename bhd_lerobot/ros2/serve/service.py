@@ -58,18 +58,10 @@ def run_service(
     """Run a robot and its topics until SIGINT or SIGTERM; return the robot's last state.
 
     Args:
-        simulation: of the robot's type.
         scene: in which it starts; None: where it is.
-        parts: makes the topics.
-        console: takes lines about the state.
-        ended: ends it as well, once it is set.
         name: of the node; the robot's type if empty.
-        title: what the robot is from now on, as the first line says.
-        node: makes the node of a name, a network and a namespace.
-        view: show the simulation in MuJoCo's viewer.
 
     Raises:
-        ConfigError: Cyclone DDS is not installed, or the configuration does not fit.
         RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
     """
     require_cyclonedds()

@@ -15,15 +15,7 @@ from bhd_lerobot.ros2.serve.server import Counts, Input, Topics
 
 
 class Setpoints(Topics):
-    """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm.
-
-    Args:
-        host: the robot.
-        node: the node.
-        counts: what is refused.
-        taken: called when a setpoint was taken.
-        topic: of the setpoints.
-    """
+    """The topic by which a brain streams setpoints: twists of a base, joint positions and the opening of an arm."""
 
     def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
         self._host, self._counts, self._taken, self._topic = host, counts, taken, topic

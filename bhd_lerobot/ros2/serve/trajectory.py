@@ -24,8 +24,6 @@ class JointTrajectory:
         duration_s: when the last point is reached, since the trajectory's start [s].
 
     Args:
-        message: a `trajectory_msgs/msg/JointTrajectory`.
-        joints: the robot's joints, as ROS has them, in its order.
         start: where they are commanded to be now [rad], shape (joints,); it precedes the first point that is left.
         passed_s: how long ago the trajectory started [s]; the points up to then are left out.
 

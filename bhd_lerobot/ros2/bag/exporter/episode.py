@@ -51,11 +51,7 @@ class ExportOptions:
     """How bags are written.
 
     Attributes:
-        storage: ``"mcap"`` or ``"sqlite3"``.
-        episodes: which; all if None.
         one_bag: all episodes in one bag, instead of a bag for each.
-        bare_twist: commands of a base as Twist, without stamps.
-        compressed_images: images as JPEG.
         start_s: when the first episode starts [s since 1970].
     """
 

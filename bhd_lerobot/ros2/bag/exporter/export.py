@@ -1,4 +1,4 @@
-"""From a dataset to rosbag2 bags, of which `bhd-data import` makes a dataset of the same drives."""
+"""From a dataset to rosbag2 bags."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -37,18 +37,11 @@ def export_bags(
     """Write episodes of a dataset as bags; all of them, or nothing, also if the process is killed.
 
     Args:
-        root: the dataset.
-        output: the folder to make: a bag, or a folder of bags.
-        view: what is known of the robot.
         repo_id: name of the dataset; that of its folders if empty.
-        options: how.
 
     Raises:
         DatasetError: no such dataset or episode, or an interrupted edit of it was completed and not reported yet.
-        DatasetLockedError: it is being recorded or edited.
         ConfigError: `output` lies in the dataset.
-        DatasetExistsError: `output` is there already.
-        DatasetWriteError: the bags cannot be written.
         UnsupportedDatasetError: it holds something that no message is made for.
     """
     root, output = Path(root), Path(output)

@@ -27,7 +27,6 @@ def frame_columns(
     """Return the columns of an episode.
 
     Args:
-        times: of the frames [ns], shape (n,).
         ages: of the oldest of each frame's newest readings [ns], shape (n,).
     """
     n = len(times)
@@ -94,11 +93,7 @@ def _standing_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) 
 def unexplained_frames(
     options: ImportOptions, tracks: Sequence[Track], times: Times, timeout_s: float
 ) -> tuple[int, int]:
-    """Return in how many frames the robot moves without a command, and in how many it stands against one.
-
-    Args:
-        times: of the frames [ns], shape (n,).
-    """
+    """Return in how many frames the robot moves without a command, and in how many it stands against one."""
     commands, age = _commands(replace(options, command_timeout_s=timeout_s), tracks, times)
     observed = _vector(options.observation_names, tracks, times)
     moves, driven = _moves(options.observation_names, observed), _moves(options.action_names, commands)
@@ -113,9 +108,6 @@ def unanswered(options: ImportOptions, tracks: Sequence[Track], times: Times) ->
     """Return how many frames at the beginning end before the first command of a position.
 
     Speeds are 0 without a command; a position that nothing commands is not.
-
-    Args:
-        times: of the frames [ns], shape (n,).
     """
     ends = _ends(times, options.fps)
     waits = [track for track in tracks if track.is_action and not all(name.endswith(".vel") for name in track.names)]

@@ -38,14 +38,7 @@ _LISTED = 8  # sentences in an error; a damaged bag may give hundreds
 
 @dataclass
 class ImportReport:
-    """What was made of bags.
-
-    Attributes:
-        root: the dataset.
-        episodes, frames: how many.
-        problems: what was wrong with the bags, in sentences.
-        notes: what was done that the user should know, in sentences.
-    """
+    """What was made of bags."""
 
     root: Path
     episodes: int = 0
@@ -57,16 +50,8 @@ class ImportReport:
 def import_bags(bags: Sequence[Bag], root: Path | str | None, repo_id: str, options: ImportOptions) -> ImportReport:
     """Make a dataset of bags of a robot; the whole of it, or nothing, also after a kill.
 
-    Args:
-        bags: in order; each gives one episode, or several where it has gaps.
-        root: where to put it; LeRobot's default place if None.
-        repo_id: its name.
-        options: what becomes of them.
-
     Raises:
         DatasetError: a bag does not have what is needed.
-        DatasetExistsError: `root` exists.
-        DatasetWriteError: the dataset cannot be written.
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
     names = options.observation_names

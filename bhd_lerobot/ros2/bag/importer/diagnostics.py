@@ -26,7 +26,6 @@ def pace(received: Times, stamps: Times) -> float:
 
     Args:
         received: when the recorder got the messages [ns], shape (n,), in the order in which they were written.
-        stamps: of their headers [ns], shape (n,).
     """
     by_recorder, by_header = np.diff(received), np.diff(stamps)
     steady = np.minimum(by_recorder, by_header) >= -STEP_BACK_NS
@@ -54,7 +53,6 @@ def speed_warnings(topic: str, times: Times, speeds: Array, pose: Array) -> list
     So it is if a driver fills in the pose alone, or writes degrees.
 
     Args:
-        times: of the messages [ns], shape (n,).
         speeds: forward and turning [m/s, rad/s], shape (n, 2).
         pose: x, y and unwrapped yaw [m, m, rad], shape (n, 3).
     """

@@ -14,11 +14,6 @@ class ImportOptions:
     """How bags are read, and what the dataset has.
 
     Attributes:
-        robot_type: of the dataset.
-        task: the instruction.
-        fps: frames a second.
-        observation_names, action_names: of the dataset's numbers, in order.
-        sources: what is read of a bag.
         stamps: whose time counts: ``"auto"``, ``"header"`` or ``"receive"``.
         pose: whether ``x.pos``, ``y.pos`` and ``theta.pos`` are those since the episode's start.
         max_speed: largest of each action [m/s, rad/s], to which the applied action is limited; None if not known.
@@ -27,7 +22,6 @@ class ImportOptions:
         command_timeout_s: silence after which a command is no longer in force and the robot stands.
         timeouts: those that the user chooses from where the robot moves without a command; none if one was given.
         min_episode_s: shorter episodes are left out.
-        outcome: what the episodes ended with; None if it is not known.
         given: what else decides the episodes, JSON values.
     """
 

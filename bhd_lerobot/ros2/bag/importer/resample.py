@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Times = NDArray[np.int64]
+"""Times [ns], shape (n,)."""
 NANO = 1_000_000_000
 STEP_BACK_NS = NANO // 2  # stamps that go back further are of a clock that has jumped; what is less is sorted
 CLOCK_STEP_NS = NANO // 20  # the same of the recorder's own clock, which nothing but a jump lets go back
@@ -25,7 +26,6 @@ class Grid:
     """The frames of an episode.
 
     Attributes:
-        times: of the frames [ns], shape (frames,).
         ages: of the newest message of each sensor, shape (sensors, frames) [ns].
         why: what began it: ``"start"``, ``"gap"``, ``"clock"`` or ``"reset"``.
     """
@@ -43,7 +43,6 @@ def message_times(received: Times, stamps: Times | None, policy: str, tolerance_
     """Return when messages happened [ns], shape (n,).
 
     Args:
-        stamps: of their headers; None if they have none.
         policy: ``"header"`` or ``"receive"`` take one of them; ``"auto"`` takes the headers' of a topic if nearly all
             of them are sane: before the message was received, and not by more than the tolerance. Two clocks in one
             topic would mix up its order.
@@ -69,7 +68,6 @@ def apart(one: tuple[Times, Times], other: tuple[Times, Times]) -> int:
 
     Args:
         one: reception and time of its messages [ns], shape (n,) each.
-        other: the same of the other topic.
     """
     received, times = (values[np.argsort(other[0], kind="stable")] for values in other)
     both = (one[0] >= received[0]) & (one[0] <= received[-1])
@@ -104,7 +102,6 @@ def newest(times: Times, at: Times) -> NDArray[np.intp]:
 
     Args:
         times: of the messages, ascending.
-        at: of the frames.
     """
     return np.searchsorted(times, at + ROUNDING_NS, side="right") - 1
 
@@ -124,9 +121,6 @@ def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: 
 
     An episode continues as long as every sensor was received within the last `max_gap_ns`. Frames at its end that only
     have readings older than `max_age_ns` are left out.
-
-    Args:
-        fps: frames a second.
     """
     if not sensors or any(not len(times) for times in sensors):
         return []

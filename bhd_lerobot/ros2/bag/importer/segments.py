@@ -130,12 +130,7 @@ def _resets(
 
 
 def silence_notes(sensors: Sequence[Track], start: int, gap: int) -> list[str]:
-    """Return, in sentences, where a sensor was silent in a segment: at its beginning, within it, or at its end.
-
-    Args:
-        start: of the bag [ns].
-        gap: silence that is reported [ns].
-    """
+    """Return, in sentences, where a sensor was silent in a segment: at its beginning, within it, or at its end."""
     received = [track.times for track in sensors if len(track.times)]
     if not received:
         return []
@@ -175,7 +170,6 @@ def pose_steps(times: Times, pose: Array) -> tuple[Array, Array, Array]:
     """Return how far a pose moves and turns from each message to the next [m, rad], and in what time [s]; shape (n-1,).
 
     Args:
-        times: of the messages [ns], shape (n,).
         pose: x, y and yaw, shape (n, 3).
     """
     x, y, yaw = np.diff(pose, axis=0).T

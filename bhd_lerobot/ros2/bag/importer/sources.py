@@ -30,7 +30,6 @@ class Reading:
 
     Attributes:
         decoded: what is in the messages; nothing of images.
-        static: the transforms of ``/tf_static``.
         static_lost: whether some of them cannot be read.
     """
 
@@ -51,12 +50,7 @@ class Source:
     """What one topic carries of the dataset.
 
     Attributes:
-        topic: its name.
-        feature: of the dataset: the state, the action, or the images of a camera.
-        names: of its numbers in the feature; none of images.
         readers: type that the topic's messages may have -> what reads them.
-        meaning: what is read from it, for messages.
-        option: what names the topic.
         is_turned: whether ``/tf_static`` states how the sensor is mounted.
         angles: those of the names that are yaws, which count on beyond half a turn, and a whole turn of each.
         size: height and width that images must have [px]; 0 for any.
@@ -82,9 +76,6 @@ def mapped_sources(
     mapping: MappingConfig, scan_frame: str | None = None, scan_yaw: float | None = None
 ) -> list[Source]:
     """Return what is read for a mapping.
-
-    Args:
-        scan_frame, scan_yaw: the scanner's frame, and its angle in the robot [rad], if the user gives them.
 
     Raises:
         ConfigError: a type is not known, or has no such field, or it is no number.
@@ -126,8 +117,6 @@ def base_sources(
     Args:
         mapping: of its preset, for commands with stamps.
         bare: the same for commands without.
-        odom_frame: of its base, if the user names it.
-        scan_frame, scan_yaw: see `mapped_sources`.
     """
     found = []
     bare_readers = {one.feature: one.readers for one in mapped_sources(bare) if one.is_action}

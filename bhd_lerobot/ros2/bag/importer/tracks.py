@@ -36,8 +36,6 @@ class Track:
     """Messages of one topic that carry the same numbers, in the order in which they were written.
 
     Attributes:
-        source: what is read from the topic.
-        times: when they happened [ns], shape (n,).
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
         stamps: of their headers [ns], shape (n,); None if they have none.

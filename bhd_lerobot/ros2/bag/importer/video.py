@@ -43,11 +43,7 @@ class CameraImages:
         return height, width, channels
 
     def blind(self, track: Track, times: Times) -> int:
-        """Return how many frames at the beginning of an episode have no image that can be decoded.
-
-        Args:
-            times: of the frames [ns].
-        """
+        """Return how many frames at the beginning of an episode have no image that can be decoded."""
         rows, first = np.unique(newest(track.times, times), return_index=True)
         return int(first[rows == self._first(track, rows.tolist())][0])
 

@@ -41,12 +41,10 @@ def offers_of(bag: Bag, wanted: Collection[str], distro: str) -> tuple[list[Offe
     """Return what is published of a bag, and why topics are left out.
 
     Args:
-        wanted: names of topics; all if there is none.
         distro: whose definitions are used of types that the bag does not define.
 
     Raises:
         ConfigError: the bag has no such topic.
-        DatasetError: nothing of it can be published.
     """
     names = ["/" + name.lstrip("/") for name in wanted]
     topics = {"/" + name.lstrip("/"): topic for name, topic in bag.topics.items()}

@@ -23,14 +23,9 @@ class PlayOptions(Options, prefix="--"):
     """How a bag is published.
 
     Attributes:
-        topics: names of topics; all if there is none.
         rate: how many times faster than recorded.
         start: where in the bag it begins [s].
-        loop: whether it begins anew at the end.
         wait: how long subscriptions to each topic are waited for [s].
-
-    Raises:
-        ConfigError: a number cannot be.
     """
 
     topics: tuple[str, ...] = ()
@@ -45,8 +40,6 @@ class PlayReport:
     """What was published.
 
     Attributes:
-        messages: how many.
-        rounds: how often the end of the bag was reached.
         late_s: the largest time by which a message was published after it was due [s].
     """
 
@@ -56,15 +49,7 @@ class PlayReport:
 
 
 class Player:
-    """Publishes a bag, which is read as it is published.
-
-    Args:
-        print_line: takes lines: the topics, those that are left out, and warnings.
-
-    Raises:
-        ConfigError: the bag has no such topic.
-        DatasetError: it cannot be read.
-    """
+    """Publishes a bag, which is read as it is published."""
 
     def __init__(self, node: Node, bag: Bag, options: PlayOptions, print_line: Callable[[str], None]) -> None:
         self._node, self._bag, self._options, self._print = node, bag, options, print_line
@@ -81,7 +66,6 @@ class Player:
         """Publish until the end, or until `stop` returns true.
 
         Raises:
-            RealtimeError: a message cannot be sent.
             DatasetError: the bag cannot be read, or ends before `start`.
         """
         self._wait(stop)

@@ -33,14 +33,8 @@ class RecordOptions(Options, prefix="--"):
     """What is recorded, and where to.
 
     Attributes:
-        output: the folder of the bag.
-        topics: names of topics; all if there is none.
         exclude: regular expression of the whole names of topics that are left out.
-        storage: ``mcap`` or ``sqlite3``.
         seconds: when it ends [s]; never if None.
-
-    Raises:
-        ConfigError: one of them cannot be.
     """
 
     output: Path
@@ -73,9 +67,7 @@ class RecordReport:
 
     Attributes:
         counts: topic and type -> messages.
-        lost: topic and type -> messages that the network lost.
         left_out: topic and type -> why it was not recorded.
-        duration_s: from the first message to the last.
     """
 
     output: Path
@@ -108,13 +100,6 @@ class Recorder:
 
     The time of a message is when it was received: within the 20 ms in which it was found, when it was sent. It never
     goes back, whatever the clocks do.
-
-    Args:
-        node: the node that listens.
-        print_line: takes lines about topics that begin, and about those that are left out.
-
-    Raises:
-        DatasetExistsError: there is something at the output's place.
     """
 
     def __init__(self, node: Node, options: RecordOptions, print_line: Callable[[str], None]) -> None:

@@ -33,9 +33,6 @@ class _AppendedMcap:
     """An MCAP file in which a block of records appears in one step: by the 9 bytes of the head that precedes it.
 
     Behind what was written there is a record that readers skip, and behind that the end of the file.
-
-    Args:
-        path: a file that begins as an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:

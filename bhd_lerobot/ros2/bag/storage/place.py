@@ -10,15 +10,7 @@ from bhd_lerobot.errors import DatasetExistsError
 
 
 def refuse_existing(target: Path, option: str) -> None:
-    """Check that nothing is at a place yet, but perhaps an empty folder; first complete what was decided there.
-
-    Args:
-        target: the place.
-        option: what named it, for the error.
-
-    Raises:
-        DatasetExistsError: something is there.
-    """
+    """Check that nothing is at a place yet, but perhaps an empty folder; first complete what was decided there."""
     if target.is_symlink() and not target.exists():
         raise DatasetExistsError(f"{target} is a broken link. Remove it, or choose another {option}.")
     remove_abandoned(real(target))  # a name such as ``new/..`` is no name for a folder beside it

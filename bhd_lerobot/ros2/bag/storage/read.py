@@ -34,7 +34,6 @@ class Topic:
         connections: messages of each connection (of a publisher, if the recorder kept them apart) in one of the bag's
             files; empty if there is but one.
         publishers: how many offered it when the recorder subscribed; 0 if that is not known.
-        profiles: their quality of service, as the recorder wrote it.
     """
 
     name: str
@@ -72,12 +71,8 @@ class Bag:
     """A bag.
 
     Attributes:
-        path: the folder or file.
-        files: its files in order.
         expected: messages that its metadata count; None if it has none.
-        problems: what is wrong with it and did not keep it from being read, in sentences.
         per_message: whether its metadata say that each message is compressed.
-        publishers: topic -> how many offered it, by its metadata.
         definitions: type -> its definition, as far as they are in the bag; known after `topics`.
     """
 
@@ -91,11 +86,7 @@ class Bag:
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """Its topics by name; they are read once.
-
-        Raises:
-            DatasetError: a file cannot be read at all.
-        """
+        """Its topics by name; they are read once."""
         types: dict[str, Counter[tuple[str, str]]] = {}  # messages by type and serialisation
         connections: dict[str, list[int]] = {}
         publishers = dict(self.publishers)
@@ -132,11 +123,7 @@ class Bag:
         """Return the messages of some topics; what could not be read is added to `problems`.
 
         Args:
-            topics: these.
             heads: of these, which may be large, only the first bytes, with the header.
-
-        Raises:
-            DatasetError: a file cannot be read at all.
         """
         rows: dict[str, list[tuple[int, int, bytes]]] = {name: [] for name in (*topics, *heads)}
         for name, received, place, payload in self.messages(rows, note=True):
@@ -151,7 +138,6 @@ class Bag:
         """Yield topic, receive time [ns], place among all messages and bytes, in the order in which they were written.
 
         Args:
-            topics: whose messages.
             note: whether what could not be read is added to `problems` at the end.
         """
         counts: Counter[str] = Counter()

@@ -16,15 +16,7 @@ _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20
 
 
 class SqliteFile:
-    """One file.
-
-    Attributes:
-        profiles: number -> quality of service of the topic's publishers, where the recorder wrote it.
-        definitions: type -> its definition with those that it names, where the recorder wrote it.
-
-    Args:
-        budget: how much may be unpacked; by its own size if None.
-    """
+    """One file."""
 
     def __init__(self, path: Path, budget: Budget | None = None) -> None:
         self.path = path

@@ -45,11 +45,7 @@ def profile(depth: int, *, reliable: bool = True, transient_local: bool = False)
 
 
 class BagWriter:
-    """Writes one bag; use it as a context manager. After an exception inside the bag is as at the last `flush`.
-
-    Args:
-        path: the folder to write; it must not exist.
-    """
+    """Writes one bag; use it as a context manager. After an exception inside the bag is as at the last `flush`."""
 
     def __init__(self, path: Path, storage: str, custom: Mapping[str, str]) -> None:
         require_rosbags()
@@ -100,7 +96,6 @@ class BagWriter:
         """Add a topic; once for each type that it has.
 
         Args:
-            profiles: what its publishers offer, as `profile` returns it.
             type_hash: of the type's definition, as its publishers state it; computed if empty.
         """
         store = type_store()

@@ -280,20 +280,6 @@ def test_options_of_a_mapping_that_cannot_be_honoured_are_refused(tmp_path, bag,
     assert part in refused(bag, tmp_path / "d", capsys, *arguments)
 
 
-def test_readings_that_come_rarely_are_late_and_silence_ends_the_episode(tmp_path, mapping):
-    def keep(one):
-        time = (one[1] - START) / NANO
-        is_hand = one[0] == "/joint_states" and "hand" in one[2].name
-        return not (is_hand and (1.0 < time < 1.6 or 3.0 < time < 4.5))
-
-    bag = write(tmp_path / "bag", list(filter(keep, work())))
-    info = imported(bag, tmp_path / "d", f"--map={mapping}", "--fps=20")
-    assert len(info.episodes) == 2
-    columns = read_episode(tmp_path / "d", 0)
-    assert np.array_equal(columns["control.late"], columns["control.age"] > 0.25)
-    assert columns["control.late"].any()
-
-
 def test_a_mapping_is_stored_with_the_dataset(dataset, mapping):
     about = json.loads((Path(dataset) / "meta/bhd.json").read_text())["recording"]["imported"]
     assert about["mapping"]["observation"]["hand.pos"]["field"] == "position[name=hand]"
