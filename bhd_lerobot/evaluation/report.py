@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from bhd_lerobot.datasets.timing.tables import ms
+from bhd_lerobot.datasets.timing import ms
 from bhd_lerobot.evaluation import plots
 from bhd_lerobot.evaluation.config import Comparison
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics

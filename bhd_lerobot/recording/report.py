@@ -134,7 +134,7 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         )
     if result.late:
         share = 100 * result.late / result.frames
-        table.add_row("late", f"{counted(result.late, 'frame')}, {share:.1f} % (bhd-data timing lists them)")
+        table.add_row("late", f"{counted(result.late, 'frame')}, {share:.1f} % (bhd-data info lists them)")
     files = [
         "config.yaml",
         *(["trajectories.png"] if (result.output_dir / "trajectories.png").is_file() else []),

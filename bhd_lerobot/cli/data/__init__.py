@@ -13,6 +13,5 @@ __all__ = [
     "pull",
     "push",
     "repair",
-    "timing",
     "view",
 ]

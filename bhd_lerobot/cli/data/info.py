@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
+from bhd_lerobot.cli.data.episode_list import short as ranges
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
-from bhd_lerobot.datasets.timing.report import timing_of
-from bhd_lerobot.datasets.timing.tables import aligned, fitting, ms
+from bhd_lerobot.datasets.timing import grants_of, ms, timing_of
 from bhd_lerobot.errors import DatasetError, counted
 
 
@@ -102,8 +102,7 @@ def info(root: Path, console: Console) -> None:
     if "seed" in summary.recording:
         table.add_row("seed", f"{summary.recording['seed']} ({summary.recording.get('split')})")
     timings = [timing_of(episode) for episode in summary.episodes]
-    if any(timings):
-        table.add_row("timing", _timing([t for t in timings if t is not None]))
+    _add_timing(table, [t for t in timings if t is not None])
     if outcomes := _outcomes(summary):
         table.add_row("outcomes", escape(outcomes))
     console.print(table)
@@ -114,6 +113,7 @@ def info(root: Path, console: Console) -> None:
         # Units stand in square brackets, which rich would take for markup.
         features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(keys.meaning_of(key, feature)))
     console.print(features)
+    _print_grants(summary, console)
     if not summary.episodes:
         return
     tasks = [" ".join(episode.task.split()) for episode in summary.episodes]
@@ -133,6 +133,9 @@ def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | 
         ("overruns", lambda t: str(t.overruns)),
         ("drops", lambda t: str(t.drops)),
         ("age max / ms", lambda t: ms(t.age_max)),
+        ("tick p99 / ms", lambda t: ms(t.duration_p99)),
+        ("inference p99 / ms", lambda t: ms(t.inference_p99)),
+        ("rate error / ticks", lambda t: f"{round(t.rate_error, 2) + 0.0:+.2f}"),
     )
     timing = [(heading, ["" if t is None else cell(t) for t in timings]) for heading, cell in measured]
     metadata = [episode.metadata for episode in summary.episodes]
@@ -152,16 +155,74 @@ def _score(score: object) -> str:
     return "" if score is None else f"{score:.3f}" if isinstance(score, int | float) else str(score)
 
 
-def _timing(timings: Sequence[TimingSummary]) -> str:
+def _add_timing(table: Table, timings: Sequence[TimingSummary]) -> None:
+    """Add what was measured on the wall clock: counts are sums, times those of the worst episode."""
     measured = [t for t in timings if t.clock != "lockstep"]
     if not measured:
-        return "simulated time: nothing can be late"
-    late, frames = sum(t.late_frames for t in measured), sum(t.frames for t in measured)
-    skipped, drops = sum(t.skipped for t in measured), sum(t.drops for t in measured)
-    return (
-        f"wall-clock time: {late} of {frames} frames out of tolerance, {skipped} ticks skipped, {drops} frames or "
-        "states lost; `bhd-data timing` has the details"
+        if timings:
+            table.add_row("timing", "simulated time (lockstep): nothing can be late")
+        return
+
+    def total(name: str) -> int:
+        return sum(getattr(t, name) for t in measured)
+
+    def worst(name: str) -> str:
+        limits = {ms(t.tolerated[name]) for t in measured if name in t.tolerated}
+        times = [f"{part} {ms(max(getattr(t, f'{name}_{part}') for t in measured))}" for part in ("p50", "p99", "max")]
+        return f"{', '.join(times)} ms{f', tolerated {limits.pop()} ms' if len(limits) == 1 else ''}"
+
+    late, frames = total("late_frames"), total("frames")
+    table.add_row(
+        "timing", f"wall clock: {late} of {frames} frames ({100 * late / max(frames, 1):.1f} %) out of tolerance"
     )
+    ticks = f"{total('ticks')} run, {total('skipped')} skipped, {total('overruns')} overran"
+    table.add_row("control ticks", f"{ticks}; {total('drops')} frames or states lost")
+    table.add_row("tick lateness", worst("lateness"))
+    table.add_row("tick duration", f"{worst('duration')}; the period is {ms(max(t.period for t in measured))} ms")
+    table.add_row("inference time", worst("inference"))
+
+
+def _print_grants(summary: DatasetSummary, console: Console) -> None:
+    """Print what the control loop was granted, once for the episodes in which it was the same."""
+    found: dict[str, list[int]] = {}
+    for episode in summary.episodes:
+        if grants := grants_of(episode):
+            found.setdefault(json.dumps(grants), []).append(episode.index)
+    for text, episodes in found.items():
+        title = (
+            f"What the control loop was granted, {'episode' if len(episodes) == 1 else 'episodes'} {ranges(episodes)}"
+        )
+        table = Table(title=title, title_justify="left")
+        for heading in ("what", "wanted", "granted", "detail, remedy"):
+            table.add_column(heading)
+        for grant in json.loads(text):
+            said = "; ".join(str(grant[key]) for key in ("detail", "remedy") if grant[key])
+            cells = (
+                grant["name"],
+                grant["wanted"],
+                "yes" if grant["granted"] is True else grant["granted"] or "no",
+                said,
+            )
+            table.add_row(*(escape(str(cell)) for cell in cells))
+        console.print(table)
+
+
+def aligned(columns: Sequence[tuple[str, list[str]]], left: Collection[str] = ()) -> str:
+    """Return a table as plain lines, numbers to the right: rich takes the greater part of a millisecond for a row."""
+    forms = [f"{{:{'<' if heading in left else '>'}{max(map(len, (heading, *cells)))}}}" for heading, cells in columns]
+    rows = zip(*((heading, *cells) for heading, cells in columns), strict=True)
+    return "\n".join("  ".join(forms).format(*row).rstrip() for row in rows)
+
+
+def fitting(columns: Sequence[tuple[str, list[str]]], width: int) -> list[tuple[str, list[str]]]:
+    """Return the first columns of a table, as many as fit: a column is never cut off."""
+    room, shown = width - 1, []
+    for heading, cells in columns:
+        room -= 3 + max(map(len, (heading, *cells)))
+        if room < 0:
+            break
+        shown.append((heading, cells))
+    return shown
 
 
 def _plain(summary: DatasetSummary) -> dict[str, Any]:

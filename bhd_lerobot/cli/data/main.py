@@ -12,7 +12,6 @@ from bhd_lerobot.options.plugins import load_named
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
     "info",
-    "timing",
     "check",
     "repair",
     "mark",

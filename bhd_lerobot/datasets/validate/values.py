@@ -72,7 +72,7 @@ class ValueCheck:
         self._judge_stats()
         if self.frames and self._counted[keys.LATE] > _LATE_SHARE * self.frames:
             what = f"{self._counted[keys.LATE]} of {self.frames} frames were late"
-            self._findings.warning("timing", keys.LATE, what, "bhd-data timing lists them.")
+            self._findings.warning("timing", keys.LATE, what, "bhd-data info lists them.")
         if self._counted[keys.SKIPPED]:
             self._findings.note("timing", keys.SKIPPED, f"{self._counted[keys.SKIPPED]} control ticks were skipped")
 

@@ -26,7 +26,7 @@ SEEDS = {"": range(60), "full": range(6000)}
 
 GRANT = ("name", "wanted", "granted", "detail", "remedy")
 READS: Mapping[str, Sequence[str]] = {
-    "info": (), "info --short": ("--short",), "info --json": ("--json",), "timing": ("--json",), "check": (),
+    "info": (), "info --short": ("--short",), "info --json": ("--json",), "check": (),
     "check --no-videos": ("--no-videos", "--json"), "filter": ("--outcome=all", "--output={out}"),
     "filter --exclude_late": ("--exclude_late", "--min_score=0", "--output={out}"),
     "split": ("--parts=a=0;b=1,2", "--output={out}"), "export": ("--output={out}",),

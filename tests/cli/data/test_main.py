@@ -92,7 +92,7 @@ def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
     new = ["--output", str(tmp_path / "new")]
     for status, command in (
         *((0, ["info"]), (0, ["info", "--short"]), (1, ["check"]), (0, ["repair"]), (1, ["check", "--strict"])),
-        *((2, ["timing"]), (2, ["filter", "--outcome", "all", *new]), (2, ["split", "--parts", "a=0.5", *new])),
+        *((2, ["filter", "--outcome", "all", *new]), (2, ["split", "--parts", "a=0.5", *new])),
         *((2, ["delete", "--episodes", "0"]), (2, ["mark", "--episodes", "0", "--outcome", "failure"])),
     ):
         assert main.main([command[0], str(root), *command[1:]]) == status

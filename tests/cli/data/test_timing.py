@@ -1,20 +1,17 @@
-"""bhd-data timing: what it says of a recording on the wall clock, of one in simulated time, and of what is neither."""
+"""The timing in `bhd-data info`: of a recording on the wall clock, of one in simulated time, and of what is neither."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.timing import report as timing_report
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import DatasetError
 from tests.recording.support import data_columns, run_record
 
 RATES = Rates(500, 500, 25)
@@ -91,60 +88,19 @@ def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
     assert columns == data_columns(simulated)
 
 
-@pytest.mark.law
-def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
-    report = timing_report.load_timing(measured)
-    parts, total = [episode.summary for episode in report.episodes], report.total.summary
-    for name in ("ticks", "skipped", "overruns", "frames", "late_frames", "drops"):
-        assert getattr(total, name) == sum(getattr(part, name) for part in parts)
-    for name in ("lateness_p99", "lateness_max", "duration_p50", "age_max", "inference_max"):
-        assert getattr(total, name) == max(getattr(part, name) for part in parts)
-    assert len(report.total.intervals) == 3 * (FRAMES - 1)  # from one episode to the next there is none
-    assert total.tolerated == parts[0].tolerated
-    changes = ({"rate_error": 0.5}, {"rate_error": -2.0}, {"rate_error": 1.0, "tolerated": {"lateness": 1.0}})
-    pairs = zip(report.episodes, changes, strict=True)
-    episodes = tuple(replace(one, summary=replace(one.summary, **change)) for one, change in pairs)
-    total = replace(report, episodes=episodes).total.summary
-    assert (total.rate_error, total.tolerated) == (-2.0, {})  # the largest, and no limit where they differ
-
-
-@pytest.mark.figures
-def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "170")
-    image = tmp_path / "new" / "t.png"
-    assert main.main(["timing", str(measured), "--output", str(image)]) == 0
+def test_info_holds_what_was_measured(measured, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main.main(["info", str(measured)]) == 0
     text = capsys.readouterr().out
     for part in (
-        "wall clock",
-        "3600 run",
-        "6 of 180 (3.3 %)",
-        "max 1.50 ms",
-        "tolerated 1.00 ms",
-        "9 frames or states",
+        *("wall clock: 6 of 180 frames (3.3 %)", "3600 run, 0 skipped, 0 overran; 9 frames or states lost"),
+        *("max 1.50 ms, tolerated 1.00 ms", "the period is 2.00 ms", "granted, episodes 0-1", "granted, episode 2"),
+        *("raise memlock [KiB]", "rate error / ticks"),
     ):
         assert part in text
-    for part in ("granted, episodes 0-1", "granted, episode 2", "raise memlock [KiB]", "lateness [ms]", "rate"):
-        assert part in text
-    assert str(image) in text.replace("\n", "")
-    assert min(Image.open(image).size) > 500
-
-
-def test_json_holds_everything_and_draws_only_if_asked(measured, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main.main(["timing", str(measured), "--json"]) == 0
-    values = json.loads(capsys.readouterr().out)
-    assert [value["index"] for value in values["episodes"]] == [0, 1, 2]
-    assert values["clock"] == "realtime"
-    assert values["all"]["late_frames"] == 6
-    assert values["episodes"][1]["realtime"] == GRANTS
-    assert values["episodes"][0]["interval"]["max"] == pytest.approx(1 / RATES.fps)
-    assert list(tmp_path.iterdir()) == []
-    assert main.main(["timing", str(measured), "--episode", "1"]) == 0
-    assert "2 of 60" in capsys.readouterr().out
-    assert (tmp_path / "outputs" / "timing" / "measured_episode_000001.png").exists()
-    assert main.main(["timing", str(measured), "--json", "--output", "t.pdf"]) == 0
-    json.loads(capsys.readouterr().out)
-    assert (tmp_path / "t.pdf").is_file()
+    assert main.main(["info", str(measured), "--json"]) == 0
+    stored = [json.loads(one["metadata"]["timing"]) for one in json.loads(capsys.readouterr().out)["episodes"]]
+    assert [one["late_frames"] for one in stored] == [2, 2, 2]
 
 
 def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch):
@@ -157,31 +113,26 @@ def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch
     save(tmp_path / "old", [(columns, {"timing": json.dumps(old)})], features)
     assert main.main(["info", str(tmp_path / "old")]) == 0
     assert "late frames" in capsys.readouterr().out
-    assert main.main(["timing", str(tmp_path / "old"), "--json"]) == 0
-    values = json.loads(capsys.readouterr().out)
-    assert (values["clock"], values["all"]["frames"], values["all"]["late_frames"]) == ("lockstep", FRAMES, 0)
 
 
 @pytest.mark.parametrize(
     ("metadata", "words"),
     [
-        ({"other": "x"}, "has no timing"),
         ({"timing": "{"}, "not JSON"),
         ({"timing": '{"overruns": 0}'}, "not complete"),
         ({"timing": "[]"}, "not complete"),
+        ({"realtime": "{}"}, "no list of grants"),
     ],
 )
-def test_a_missing_or_invalid_timing_is_named(tmp_path, metadata, words):
+def test_an_invalid_timing_is_named(tmp_path, capsys, metadata, words):
     columns, _ = make_episode(0)
     save(tmp_path / "d", [(columns, metadata)])
-    with pytest.raises(DatasetError, match=words):
-        timing_report.load_timing(tmp_path / "d")
+    assert main.main(["info", str(tmp_path / "d")]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_a_dataset_of_another_program(tmp_path, capsys):
     feature = {"x": {"dtype": "float32", "shape": (1,), "names": None}}
     save(tmp_path / "d", [({"x": np.zeros(5, np.float32)}, {})], feature)
     assert main.main(["info", str(tmp_path / "d")]) == 0
-    capsys.readouterr()
-    assert main.main(["timing", str(tmp_path / "d")]) == 2
-    assert "another program recorded it" in capsys.readouterr().err
+    assert "timing" not in capsys.readouterr().out

@@ -41,7 +41,7 @@ def test_the_advice_works(
 ) -> None:
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     break_it(root / "meta/info.json")
-    for command in ("info", "check", "repair", "view", "timing"):
+    for command in ("info", "check", "repair", "view"):
         assert main.main([command, str(root)]) == 2
         advice = re.search(r"`bhd-data (repair .* --info) OTHER`", capsys.readouterr().err)
         assert advice is not None, command
