@@ -77,7 +77,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "ros2.bag.exporter": (*_DATASETS, "datasets.edit", "ros2.messages", "ros2.bag.storage"),
     "ros2.bag.importer": (
         *("tasks", "bodies", "control", "datasets.format", "datasets.writer"),
-        *("ros2.messages", "ros2.bag.storage", "ros2.bag.exporter"),
+        *("ros2.messages", "ros2.bag.storage"),
     ),
     "rollout": (
         *("__version__", "options", "registry"),

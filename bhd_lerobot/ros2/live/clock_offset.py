@@ -29,7 +29,6 @@ class _Line:
             1.0,
             0.0,
         )  # ns of ours per ns of theirs; the smallest delay from the first point [ns]
-        self.jumps = 0
 
     @property
     def rate(self) -> float:
@@ -41,7 +40,6 @@ class _Line:
         if self._points and abs(self._delay(theirs, ours) - self._before) > _JUMP_NS:
             self._points.clear()
             self._period = 1.0
-            self.jumps += 1
         points = self._points
         if not points or ours // _BUCKET_NS != points[-1][1] // _BUCKET_NS:
             points.append((theirs, ours))
@@ -81,11 +79,6 @@ class ClockOffset:
         self._network, self._clock = _Line(has_rate=False), _Line(has_rate=True)
         self._stamp_ns = self._sent_ns = 0
         self._has_own_clock = False
-
-    @property
-    def jumps(self) -> int:
-        """How often the clock was set."""
-        return self._clock.jumps
 
     @property
     def rate(self) -> float:

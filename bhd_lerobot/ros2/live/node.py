@@ -12,7 +12,7 @@ from typing import Any, Self
 from bhd_lerobot.errors import RealtimeError, as_text
 from bhd_lerobot.ros2.live.graph import Graph
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos, require_cyclonedds
-from bhd_lerobot.ros2.live.topic_types import raw, topic_type
+from bhd_lerobot.ros2.live.topic_types import raw, sample_class
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.types import type_store
 
@@ -175,7 +175,7 @@ class Node:
     def _topic(self, name: str, msgtype: str) -> Any:
         from cyclonedds.topic import Topic
 
-        topic = Topic(self._participant, name, topic_type(msgtype))
+        topic = Topic(self._participant, name, sample_class(msgtype))
         self._entities.append(topic)
         return topic
 
@@ -185,7 +185,7 @@ class Node:
         writer = DataWriter(self._participant, self._topic(name, msgtype), qos.of_dds(_type_hash(msgtype)))
         self._entities.append(writer)
         self.graph.add(writer.guid, is_writer=True)
-        return writer, topic_type(msgtype)
+        return writer, sample_class(msgtype)
 
     def _reader(self, name: str, msgtype: str, qos: Qos, *, wakes: bool = True) -> Any:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState

@@ -27,6 +27,7 @@ from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.live.node import Node, Publisher, Received
 from bhd_lerobot.ros2.live.spec import NodeSpec, silence_text
 from bhd_lerobot.ros2.messages.images import decode_image
+from bhd_lerobot.ros2.messages.parts import head_stamps
 from bhd_lerobot.ros2.messages.scan import ScanReader, static_frames, static_topics
 from bhd_lerobot.ros2.messages.views import TF
 
@@ -268,7 +269,7 @@ class Receiver:
             return
         self._wrong.pop(number, None)
         record = np.zeros((), self._channel.image_dtypes[index])
-        stamp = _header_stamp(received.data)
+        [stamp] = head_stamps([received.data]).tolist()
         record["measured_ns"] = self._measured_ns(len(self._spec.inputs) + index, stamp, received)
         record["pixels"] = image
         ring.publish(record)
@@ -366,13 +367,6 @@ class Receiver:
 def _either(qos: Qos) -> tuple[Qos, ...]:
     """Return how a topic is received: what is transient local here is volatile in older drivers, or later ones."""
     return (qos, replace(qos, transient_local=False)) if qos.transient_local else (qos,)
-
-
-def _header_stamp(data: bytes) -> int:
-    """Return the stamp [ns] of a serialised message that begins with a header."""
-    order: Any = "little" if data[1] & 1 else "big"
-    seconds, nanoseconds = (int.from_bytes(data[k : k + 4], order) for k in (4, 8))
-    return seconds * 1_000_000_000 + nanoseconds
 
 
 def _offers(one: Any, endpoints: list[Endpoint], does: str = "publishes") -> str:

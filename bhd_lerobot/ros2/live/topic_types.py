@@ -26,7 +26,7 @@ def ros_type_name(name: str) -> str:
 
 
 @cache
-def topic_type(msgtype: str) -> Any:
+def sample_class(msgtype: str) -> Any:
     """Return the class of a type's samples, whose `data` is the serialised message with its encapsulation header."""
     made = _nested(msgtype)
     made.serialize = lambda sample, *_, **__: sample.data
@@ -35,7 +35,7 @@ def topic_type(msgtype: str) -> Any:
 
 
 def raw(made: Any, data: bytes) -> Any:
-    """Return a sample of a class that `topic_type` returned."""
+    """Return a sample of a class that `sample_class` returned."""
     sample = made.__new__(made)
     sample.data = data
     return sample

@@ -32,20 +32,6 @@ int8 ERROR_GOAL_TERMINATED=3
 int8 return_code
 action_msgs/GoalInfo[] goals_canceling
 """,
-    "controller_manager_msgs/srv/SwitchController": """
-int32 BEST_EFFORT=1
-int32 STRICT=2
-int32 AUTO=3
-int32 FORCE_AUTO=4
-string[] activate_controllers
-string[] deactivate_controllers
-int32 strictness
-bool activate_asap
-builtin_interfaces/Duration timeout
----
-bool ok
-string message
-""",
     "type_description_interfaces/msg/FieldType": """
 uint8 type_id
 uint64 capacity
@@ -183,20 +169,6 @@ trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error
 trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_output
 trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_desired
 trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_actual
-""",
-    "controller_manager_msgs/srv/SwitchController": """
-int32 BEST_EFFORT=1
-int32 STRICT=2
-string[] activate_controllers
-string[] deactivate_controllers
-string[] start_controllers
-string[] stop_controllers
-int32 strictness
-bool start_asap
-bool activate_asap
-builtin_interfaces/Duration timeout
----
-bool ok
 """,
     "nav2_msgs/action/NavigateToPose": """
 geometry_msgs/PoseStamped pose

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text, unknown_name
 from bhd_lerobot.ros2.messages.base import unwrapped, yaw_of
 from bhd_lerobot.ros2.messages.definitions import register_types
@@ -57,6 +58,11 @@ class FieldConfig:
             raise ConfigError(
                 f"range_min is {self.range_min}, range_max {self.range_max}; beams need both, and the second is larger."
             )
+
+    @property
+    def lidar(self) -> LidarSpec:
+        """The scanner whose beams the features are."""
+        return LidarSpec("", self.beams, self.range_min, self.range_max, rate_hz=5, noise_std=0.0)
 
     def names(self, name: str) -> tuple[str, ...]:
         """Return the features of an entry of this name."""

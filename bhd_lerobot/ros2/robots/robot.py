@@ -12,7 +12,6 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ActionError, ConfigError, RealtimeError, unknown_name
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
@@ -105,8 +104,7 @@ class Ros2Robot(Robot):
             yaws += [(places[-1][place], turn) for place, turn in topic.turns.items()]
         for name, one in mapping.observation.items():
             if one.beams:
-                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
-                scans = scan_reader(self.config.ros2, one.topic, lidar, one.beams)
+                scans = scan_reader(self.config.ros2, one.topic, one.lidar, one.beams)
                 found.append(InputSpec(named(one.topic), SCAN, scans, SENSOR_DATA, self.config.topic_timeout_s))
                 places.append([self._names.index(feature) for feature in one.names(name)])
         self._yaws, self._turns = [place for place, _ in yaws], np.array([turn for _, turn in yaws])

@@ -175,7 +175,7 @@ class Server:
         start = time.monotonic_ns()
         for output in self._outputs:
             output.due_ns = start
-        reported, told_ns = self.counts.all(), start
+        reported, reported_ns = self.counts.all(), start
         since: dict[str, int] = {}
         printed: set[str] = set()
         while not stop():
@@ -185,8 +185,8 @@ class Server:
             for output in self._outputs:
                 output.run(now, self._host)
             due = min([*(output.due_ns for output in self._outputs), *(part.poll(now) for part in self._parts)])
-            if now - told_ns > NANOSECONDS:
-                told_ns = now
+            if now - reported_ns > NANOSECONDS:
+                reported_ns = now
                 self._host.link.check()
                 found = self.counts.all()
                 for (what, reason), count in found.items():

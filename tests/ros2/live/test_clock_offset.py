@@ -21,7 +21,6 @@ def test_it_is_never_after_the_arrival_and_off_by_the_smallest_delay_at_most(off
         assert found <= true + delay
         if number > 100:
             assert abs(found - true) < 4_000_000  # the smallest of a hundred delays, and 5 s of drift
-    assert clock.jumps == 0
 
 
 def test_a_clock_that_is_set_begins_anew_and_stamps_of_zero_are_none() -> None:
@@ -31,7 +30,6 @@ def test_a_clock_that_is_set_begins_anew_and_stamps_of_zero_are_none() -> None:
             arrived = (1000 + k) * SECOND
             found = clock.measured_ns(arrived + jump * SECOND - SECOND // 100, arrived)
             assert 0 <= arrived - found < SECOND // 10
-    assert clock.jumps == 3
     assert clock.measured_ns(0, 123) == 123
 
 

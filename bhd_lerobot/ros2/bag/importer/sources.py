@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.importer import frames
@@ -97,9 +96,8 @@ def mapped_sources(
             found.append(Source(topic.topic, feature, names, readers, meaning, angles=angles))
         for name, one in section.items():
             if one.beams:
-                lidar = LidarSpec("", one.beams, one.range_min, one.range_max, rate_hz=5, noise_std=0.0)
                 topic_name, names = "/" + one.topic.lstrip("/"), one.names(name)
-                reader = partial(_scans, ScanReader(topic_name, lidar, one.beams, scan_frame, scan_yaw))
+                reader = partial(_scans, ScanReader(topic_name, one.lidar, one.beams, scan_frame, scan_yaw))
                 found.append(Source(topic_name, feature, names, {SCAN: reader}, f"{place}.{name}", is_turned=True))
     for name, camera in mapping.images.items():
         feature = f"{keys.OBSERVATION_IMAGES}.{name}"
