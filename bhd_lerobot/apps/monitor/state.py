@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numpy as np
-
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import decode_feedback
@@ -29,42 +27,24 @@ HEARTBEATS = {
 }
 POSE = ("x", "y", "yaw")
 
-DECADES, CELLS = 6, 5
-"""A histogram has so many decades from 1 us on, and so many cells in each."""
-_FINE = 20 // CELLS  # bins of `TimingStatistics` in a cell
 _WINDOW_NS = 2 * NANOSECONDS  # over which rates are measured
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How a time is distributed over the ticks of the episode [s].
-
-    Attributes:
-        p50: half the ticks took no longer.
-        p99: 99 % of them took no longer.
-        max: the longest.
-        histogram: ticks by logarithmic cells: the first holds all up to 1.6 us, the last all from 0.63 s on.
-    """
+    """How a time is distributed over the ticks of the episode [s]."""
 
     p50: float
     p99: float
     max: float
-    histogram: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Dimension:
-    """One dimension of the command, in its own unit.
-
-    Attributes:
-        name: the command's name.
-        requested: the setpoint taken last; None if there was none or a goal is followed.
-        applied: what the cerebellum commands, after all limits.
-        measured: where the robot really is.
-    """
+    """One dimension of the command, in its own unit: the setpoint taken last, after all limits, where the robot is."""
 
     name: str
-    requested: float | None
+    requested: float | None  # None if there was none or a goal is followed
     applied: float
     measured: float
 
@@ -79,77 +59,41 @@ class Count:
 
 @dataclass(frozen=True)
 class MonitorState:
-    """A running robot at one moment. Times in seconds, rates in Hz; None: unknown or without meaning at present.
-
-    Attributes:
-        id: the robot's id.
-        robot: its type.
-        clock: whose time it lives in.
-        uptime: since it was started.
-        phase: what the loop does, a name of `Phase`.
-        episode: number of the segment of ticks that runs or ran last, from 1; 0 before the first.
-        episode_time: how long that has been running.
-        mode: name of the cerebellum's `Mode`.
-        estop: the word of the emergency stop is set.
-        estop_latched: the cerebellum has latched it.
-        control_rate: measured; over the last two seconds, as all rates.
-        control_hz: wanted.
-        frame_rate: frames that the recorder takes, measured.
-        fps: wanted.
-        command_rate: setpoints that the cerebellum takes, measured.
-        executed: ticks of the episode.
-        skipped: ticks of it that were left out.
-        overruns: ticks of it that ended after the next was due.
-        catch_up_lost: ticks by which the simulated world fell behind.
-        recorder_drops: states that the recorder lost.
-        lateness: of the ticks' starts.
-        duration: of the ticks.
-        fifo_fill: commands that wait.
-        fifo_capacity: commands that may wait.
-        command_age: of the setpoint that is followed.
-        observation_age: of the newest observation's oldest reading.
-        dimensions: the command.
-        limits: interventions of the limiter by name of `Limit`, counted once a frame.
-        watchdogs: by name of `Watchdog`.
-        refusals: commands refused, by name of `Reason`; those that occurred.
-        alive: since the last sign of life of each process; None if it is not watched.
-        goal: the fields of the `Feedback` about the goal that is followed.
-        pose: odometry x, y [m] and yaw [rad] of a robot that drives.
-    """
+    """A running robot at one moment. Times in seconds, rates in Hz; None: unknown or without meaning at present."""
 
     id: str
-    robot: str
+    robot: str  # its type
     clock: str
-    uptime: float
-    phase: str
-    episode: int
+    uptime: float  # since it was started
+    phase: str  # what the loop does, a name of `Phase`
+    episode: int  # number of the segment of ticks that runs or ran last, from 1; 0 before the first
     episode_time: float | None
-    mode: str | None
-    estop: bool
-    estop_latched: bool
-    control_rate: float | None
-    control_hz: int
-    frame_rate: float | None
-    fps: int
-    command_rate: float | None
-    executed: int
-    skipped: int
-    overruns: int
-    catch_up_lost: int
-    recorder_drops: int
-    lateness: Spread | None
-    duration: Spread | None
-    fifo_fill: int
+    mode: str | None  # a name of `Mode`
+    estop: bool  # the word of the emergency stop is set
+    estop_latched: bool  # by the cerebellum
+    control_rate: float | None  # measured over the last two seconds, as all rates
+    control_hz: int  # wanted
+    frame_rate: float | None  # that the recorder takes
+    fps: int  # wanted
+    command_rate: float | None  # setpoints that the cerebellum takes
+    executed: int  # ticks of the episode
+    skipped: int  # ticks that were left out
+    overruns: int  # ticks that ended after the next was due
+    catch_up_lost: int  # ticks by which the simulated world fell behind
+    recorder_drops: int  # states that the recorder lost
+    lateness: Spread | None  # of the ticks' starts
+    duration: Spread | None  # of the ticks
+    fifo_fill: int  # commands that wait
     fifo_capacity: int
-    command_age: float | None
-    observation_age: float | None
+    command_age: float | None  # of the setpoint that is followed
+    observation_age: float | None  # of the newest observation's oldest reading
     dimensions: tuple[Dimension, ...] = ()
-    limits: dict[str, Count] = field(default_factory=dict)
-    watchdogs: dict[str, Count] = field(default_factory=dict)
-    refusals: dict[str, int] = field(default_factory=dict)
-    alive: dict[str, float | None] = field(default_factory=dict)
-    goal: dict[str, Any] | None = None
-    pose: dict[str, float] = field(default_factory=dict)
+    limits: dict[str, Count] = field(default_factory=dict)  # by name of `Limit`, counted once a frame
+    watchdogs: dict[str, Count] = field(default_factory=dict)  # by name of `Watchdog`
+    refusals: dict[str, int] = field(default_factory=dict)  # by name of `Reason`; those that occurred
+    alive: dict[str, float | None] = field(default_factory=dict)  # since the last sign of life; None: not watched
+    goal: dict[str, Any] | None = None  # the fields of the `Feedback` about the goal that is followed
+    pose: dict[str, float] = field(default_factory=dict)  # odometry x, y [m] and yaw [rad] of a robot that drives
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; what is not finite is None."""
@@ -301,10 +245,9 @@ class Sampler:
         if not copy.ticks:
             return None, None
         total = copy.summary(clock="realtime")
-        _, lateness, duration = copy.histograms
         return (
-            Spread(total.lateness_p50, total.lateness_p99, total.lateness_max, cells(lateness)),
-            Spread(total.duration_p50, total.duration_p99, total.duration_max, cells(duration)),
+            Spread(total.lateness_p50, total.lateness_p99, total.lateness_max),
+            Spread(total.duration_p50, total.duration_p99, total.duration_max),
         )
 
 
@@ -314,10 +257,3 @@ class _Counts:
     now: int
     started: int
     counts: dict[str, int]
-
-
-def cells(histogram: Any) -> tuple[int, ...]:
-    """Return a histogram of `TimingStatistics`, shape (142,), by the cells that are shown, shape (DECADES * CELLS,)."""
-    # Bin 0 is all up to 1 us, and bin i ends at 1 us x 10^(i / 20).
-    index = np.clip((np.arange(len(histogram)) - 1) // _FINE, 0, DECADES * CELLS - 1)
-    return tuple(np.bincount(index, weights=histogram, minlength=DECADES * CELLS).astype(int).tolist())

@@ -1,20 +1,16 @@
-"""The display of `bhd-monitor`: from a state to text. Pure: the same state gives the same image.
+"""The display of `bhd-monitor`: from a state to a table of 80 columns, as many lines as there are. Pure."""
 
-Everything has its place and a fixed width, so that nothing jumps when numbers change. 80 columns and 24 lines hold all.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 from rich.console import Group
+from rich.table import Column, Table
 from rich.text import Text
 
-from bhd_lerobot.apps.monitor.state import CELLS, DECADES, HEARTBEATS, Count, Dimension, MonitorState, Spread
+from bhd_lerobot.apps.monitor.state import HEARTBEATS, Count, MonitorState, Spread
 
 WIDTH = 80
 KEYS = "e or space: emergency stop   q: quit"
 
-_LABEL = 11
-_BARS = " ▁▂▃▄▅▆▇█"
 _MODES = {
     "HOLD": "black on green",
     "TRACKING": "black on cyan",
@@ -22,10 +18,7 @@ _MODES = {
     "ESTOP": "bold white on red",
     "FAULT": "bold white on red",
 }
-_LATE_S = 0.1  # a process without a sign of life for so long is highlighted
-_SILENT_S = 0.5
-_UNITS = {"x.vel": "m/s", "y.vel": "m/s", "z.vel": "m/s", "gripper.pos": "m", "gripper.vel": "m/s"}
-_UNITS |= {"x.pos": "m", "y.pos": "m", "z.pos": "m"}
+_LATE_S, _SILENT_S = 0.1, 0.5  # a process without a sign of life for so long is highlighted
 _NOTHING = "–"
 
 
@@ -34,53 +27,60 @@ def render(state: MonitorState, *, height: int | None = None, message: str = "",
 
     Args:
         state: what is shown.
-        height: lines that there are; sections are set apart if there is room. All that is needed if None.
+        height: lines that there are; all that is needed if None.
         message: shown instead of the keys.
         keys: the last line; there is none if empty.
     """
-    sections = [
-        ("", [_title(state), _mode(state)]),
-        ("rates", _rates(state)),
-        ("timing of the episode's ticks", _timing(state)),
-        ("queues and processes", [_queues(state), _alive(state)]),
-        ("command", [*_command(state), *_goal(state), *_pose(state)]),
-        ("interventions", _interventions(state)),
-    ]
-    lines = [line for _, section in sections for line in section]
-    if height is not None and len(lines) + 2 * len(sections) <= height:
-        lines = []
-        for name, section in sections:
-            lines += [Text(), Text(f"── {name} " + "─" * (WIDTH - 4 - len(name)), "dim")] if name else []
-            lines += section
-        lines.append(Text())
-    last = [Text(f" {message or keys}", "bold yellow" if message else "dim")] if message or keys else []
-    if height is not None:
-        lines = lines[: max(0, height - len(last))]
-    lines += last
-    for line in lines:
-        line.no_wrap, line.overflow = True, "ellipsis"
-        line.truncate(WIDTH, overflow="ellipsis")
-    return Group(*lines)
+    last = [Text((message or keys)[:WIDTH], "bold yellow" if message else "dim")] if message or keys else []
+    rows = list(_rows(state))
+    width = min(24, max(len(label) for label, _ in rows))
+    columns = [Column(no_wrap=True, width=one) for one in (width, WIDTH - 1 - width)]
+    table = Table.grid(*columns, padding=(0, 1))
+    for label, text in rows if height is None else rows[: max(0, height - len(last))]:
+        table.add_row(Text(label, "dim"), text)
+    return Group(table, *last)
 
 
-def _title(state: MonitorState) -> Text:
-    line = Text.assemble((f" {state.id}", "bold"), f"  {state.robot}, {state.clock} clock")
+def _rows(state: MonitorState) -> Iterator[tuple[str, Text]]:
     minutes, seconds = divmod(int(state.uptime), 60)
-    hours, minutes = divmod(minutes, 60)
-    right = f"up {hours}:{minutes:02d}:{seconds:02d}"
-    line.truncate(WIDTH - len(right) - 2, overflow="ellipsis")
-    line.pad_right(WIDTH - len(right) - line.cell_len)
-    return line.append(right)
+    about = f"  {state.robot}, up {minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    yield "robot", Text(state.id, "bold", end="").append(about, "not bold")
+    yield "mode", _mode(state)
+    yield "control", _rate(state.control_rate, state.control_hz, 0.01, executed=state.executed, overruns=state.overruns)
+    yield "frames", _rate(state.frame_rate, state.fps, 0.15, skipped=state.skipped, drops=state.recorder_drops)
+    yield "commands", _rate(state.command_rate, 0, 0.0, **{"world behind": state.catch_up_lost})
+    yield "lateness", _spread(state.lateness)
+    yield "tick takes", _spread(state.duration)
+    waiting = f"{state.fifo_fill} of {state.fifo_capacity}"
+    queue = Text(waiting, "bold red" if state.fifo_fill >= state.fifo_capacity else "")
+    ages = f"   command age {duration(state.command_age)}   observation age {duration(state.observation_age)}"
+    yield "queue", queue.append(ages, "not bold default")
+    yield "last signs", _alive(state)
+    yield "", Text(f"{'requested':>11}{'applied':>11}{'measured':>11}", "dim")
+    for one in state.dimensions:
+        limited = one.requested is not None and abs(one.requested - one.applied) > 1e-3
+        row = Text(_number(one.requested)).append(_number(one.applied), "yellow" if limited else "")
+        yield one.name, row.append(f"{_number(one.measured)} {unit(one.name)}")
+    if state.goal is not None:
+        done = 100 * min(max(state.goal["progress"], 0.0), 1.0)
+        left = f"{done:3.0f} %, {max(0.0, state.goal['remaining_s']):5.1f} s left"
+        yield "goal", Text(f"{state.goal['task_id'][:16]} {state.goal['phase'].lower()} {left}")
+    if state.pose:
+        x, y, yaw = (state.pose[key] for key in ("x", "y", "yaw"))
+        yield "odometry", Text(f"x {x:.3f} m   y {y:.3f} m   yaw {yaw:.3f} rad")
+    yield "limits", _counts(state.limits)
+    yield "watchdogs", _counts(state.watchdogs)
+    yield "refused", _counts({name: Count(n, None) for name, n in state.refusals.items()})
 
 
 def _mode(state: MonitorState) -> Text:
     mode = state.mode or "UNKNOWN"
-    line = Text.assemble(" ", (f" {mode:<12} ", _MODES.get(mode, "black on white")), f"  loop {state.phase.lower():<9}")
     time = _NOTHING if state.episode_time is None else f"{state.episode_time:.1f} s"
-    line.append(f"episode {state.episode:<4d} {time:>9}  ")
+    line = Text.assemble((f" {mode} ", _MODES.get(mode, "black on white")))
+    line.append(f" {state.phase.lower()}, episode {state.episode}, {time} ")
     silent = state.alive.get("cerebellum")
     if state.phase == "RUNNING" and silent is not None and silent > _SILENT_S:
-        line.append(f"cerebellum silent {min(silent, 999):3.0f} s", "bold white on red")
+        line.append(f"cerebellum silent {min(silent, 999):.0f} s", "bold white on red")
     elif state.estop and not state.estop_latched:
         line.append("e-stop not latched yet", "bold white on red")
     elif state.estop_latched:
@@ -88,122 +88,51 @@ def _mode(state: MonitorState) -> Text:
     return line
 
 
-def _rates(state: MonitorState) -> list[Text]:
-    def rate(label: str, measured: float | None, wanted: float | None, off: float) -> Text:
-        text = Text(f" {label:<{_LABEL}}")
-        style = "yellow" if measured is not None and wanted and abs(measured - wanted) > off * wanted else ""
-        text.append(f"{_NOTHING if measured is None else f'{measured:.1f}':>7}", style)
-        return text.append(f" of {wanted:>4.0f} Hz" if wanted else " Hz        ")
-
-    def count(label: str, number: int, width: int = 12) -> tuple[str, str]:
-        return f"   {label:<{width}}{number:>{21 - width}}", "yellow" if number else ""
-
-    control = rate("control", state.control_rate, state.control_hz, 0.01)
-    control.append(f"   {'executed':<12}{state.executed:>9}").append(*count("overruns", state.overruns, 14))
-    frames = rate("frames", state.frame_rate, state.fps, 0.15)
-    frames.append(*count("skipped", state.skipped)).append(*count("recorder drops", state.recorder_drops, 14))
-    commands = rate("commands", state.command_rate, None, 0.0).append(*count("world behind", state.catch_up_lost))
-    return [control, frames, commands]
+def _rate(measured: float | None, wanted: int, off: float, **counts: int) -> Text:
+    is_off = measured is not None and wanted and abs(measured - wanted) > off * wanted
+    line = Text.assemble((f"{_NOTHING if measured is None else f'{measured:.1f}':>7}", "yellow" if is_off else ""))
+    line.append(f" of {wanted} Hz" if wanted else " Hz")
+    for name, count in counts.items():
+        line.append(f"   {name} {count}", "yellow" if count and name != "executed" else "")
+    return line
 
 
-def _timing(state: MonitorState) -> list[Text]:
-    axis = "".join(f"{mark:<{CELLS}}" for mark in ("1µs", "10µs", ".1ms", "1ms", "10ms", ".1s"))
-    head = Text(f" {'':<{_LABEL}}{'p50':>9}{'p99':>9}{'max':>9}    {axis}", "dim")
-    return [head, _spread("lateness", state.lateness), _spread("tick takes", state.duration)]
-
-
-def _spread(label: str, spread: Spread | None) -> Text:
-    values = [None] * 3 if spread is None else [spread.p50, spread.p99, spread.max]
-    line = Text(f" {label:<{_LABEL}}" + "".join(f"{duration(value):>9}" for value in values) + "    ")
-    return line.append(bars((0,) * DECADES * CELLS if spread is None else spread.histogram), "cyan")
-
-
-def bars(histogram: Sequence[int]) -> str:
-    """Return a histogram as a line of bars, whose heights are logarithmic: one tick in a million is visible."""
-    most = max(histogram, default=0)
-    if most < 1:
-        return " " * len(histogram)
-    steps = len(_BARS) - 2
-    heights = [round(steps * (n.bit_length() - 1) / max(1, most.bit_length() - 1)) for n in histogram]
-    return "".join(_BARS[1 + height if n else 0] for n, height in zip(histogram, heights, strict=True))
-
-
-def _queues(state: MonitorState) -> Text:
-    line = Text(f" {'queue':<{_LABEL}}")
-    full = state.fifo_fill >= state.fifo_capacity
-    line.append(f"{state.fifo_fill:>4}", "bold red" if full else "").append(f" of {state.fifo_capacity:<5}")
-    line.append(f"  command age {duration(state.command_age):>8}")
-    return line.append(f"   observation age {duration(state.observation_age):>8}")
+def _spread(spread: Spread | None) -> Text:
+    values = (None, None, None) if spread is None else (spread.p50, spread.p99, spread.max)
+    return Text(
+        "   ".join(f"{name} {duration(one):>7}" for name, one in zip(("p50", "p99", "max"), values, strict=True))
+    )
 
 
 def _alive(state: MonitorState) -> Text:
-    line = Text(f" {'last signs':<{_LABEL}}")
+    line = Text()
     for name in HEARTBEATS:
         age = state.alive.get(name)
         late = age is not None and age > _LATE_S and state.phase != "STARTING"
         style = "bold red" if late and age is not None and age > _SILENT_S else "yellow" if late else ""
-        line.append(f"{name} ").append(f"{duration(age):<8}", style)
+        line.append(f"{name} ").append(f"{duration(age)}  ", style)
     return line
 
 
-def _command(state: MonitorState) -> list[Text]:
-    width = max((len(dimension.name) for dimension in state.dimensions), default=0)
-    width = min(max(width, _LABEL), 24)
-    head = f" {'':<{width}}{'requested':>11}{'applied':>11}{'measured':>11}"
-    return [Text(head, "dim"), *(_dimension(dimension, width) for dimension in state.dimensions)]
-
-
-def _dimension(dimension: Dimension, width: int) -> Text:
-    def number(value: float | None) -> str:
-        # What rounds to nothing has no sign.
-        return f"{_NOTHING:>11}" if value is None else f"{round(value, 4) + 0.0:>11.4f}"
-
-    limited = dimension.requested is not None and abs(dimension.requested - dimension.applied) > 1e-3
-    line = Text(f" {dimension.name[:width]:<{width}}{number(dimension.requested)}")
-    line.append(number(dimension.applied), "yellow" if limited else "")
-    return line.append(f"{number(dimension.measured)} {unit(dimension.name)}")
+def _number(value: float | None) -> str:
+    # What rounds to nothing has no sign.
+    return f"{_NOTHING:>11}" if value is None else f"{round(value, 4) + 0.0:>11.4f}"
 
 
 def unit(name: str) -> str:
     """Return the unit of a command by its name."""
-    return _UNITS.get(name) or ("rad/s" if name.endswith(".vel") else "rad" if name.endswith(".pos") else "")
+    part, _, kind = name.rpartition(".")
+    length = "m" if part in ("x", "y", "z", "gripper") else "rad"
+    return {"pos": length, "vel": f"{length}/s"}.get(kind, "")
 
 
-def _goal(state: MonitorState) -> list[Text]:
-    if state.goal is None:
-        # An arm keeps the line, so that nothing moves when a goal begins; what drives takes no goals.
-        return [] if state.pose else [Text(f" {'goal':<{_LABEL}}{_NOTHING}")]
-    goal = state.goal
-    done = min(max(goal["progress"], 0.0), 1.0)
-    bar = "█" * round(20 * done) + "░" * (20 - round(20 * done))
-    line = Text(f" {'goal':<{_LABEL}}{goal['task_id'][:16]:<16} {goal['phase'].lower():<10}")
-    return [line.append(bar, "green").append(f" {100 * done:3.0f} %, {max(0.0, goal['remaining_s']):5.1f} s left")]
-
-
-def _pose(state: MonitorState) -> list[Text]:
-    if not state.pose:
-        return []
-    x, y, yaw = (state.pose[key] for key in ("x", "y", "yaw"))
-    return [Text(f" {'odometry':<{_LABEL}}x {x:>8.3f} m   y {y:>8.3f} m   yaw {yaw:>7.3f} rad")]
-
-
-def _interventions(state: MonitorState) -> list[Text]:
-    return [
-        _counts("limits", state.limits),
-        _counts("watchdogs", {name: counter for name, counter in state.watchdogs.items() if counter.count}),
-        _counts("refused", {name: Count(n, None) for name, n in state.refusals.items()}),
-    ]
-
-
-def _counts(label: str, counts: dict[str, Count]) -> Text:
-    line = Text(f" {label:<{_LABEL}}")
-    raised = {name: counter for name, counter in counts.items() if counter.count}
-    if not raised:
-        return line.append("none")
-    for name, counter in sorted(raised.items(), key=lambda item: -item[1].count):
-        now = f" ({counter.per_second:.1f}/s)" if counter.per_second is not None else ""
-        line.append(f"{name.lower().replace('_', ' ')} {counter.count}{now}   ", "yellow" if counter.per_second else "")
-    return line
+def _counts(counts: dict[str, Count]) -> Text:
+    line = Text()
+    for name, one in sorted(counts.items(), key=lambda item: -item[1].count):
+        if one.count:
+            now = f" ({one.per_second:.1f}/s)" if one.per_second is not None else ""
+            line.append(f"{name.lower().replace('_', ' ')} {one.count}{now}   ", "yellow" if one.per_second else "")
+    return line or Text("none")
 
 
 def duration(seconds: float | None) -> str:

@@ -278,8 +278,6 @@ def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
     assert late is not None
     assert takes is not None
     assert (late.p50, late.p99, late.max) == (pytest.approx(20e-6, rel=0.13), pytest.approx(20e-6, rel=0.13), 2e-3)
-    assert sum(late.histogram) == sum(takes.histogram) == 100
-    assert (max(late.histogram), late.histogram.index(99)) == (99, 6)  # 16 to 25 us
     assert takes.max == 2e-3
     block.close()
 

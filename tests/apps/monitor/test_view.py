@@ -9,19 +9,13 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bhd_lerobot.apps.monitor import state as monitor_state
-from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Dimension, MonitorState, Spread
+from bhd_lerobot.apps.monitor.state import Count, Dimension, MonitorState, Spread
 from bhd_lerobot.apps.monitor.view import KEYS, render, unit
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
 from tests.cases import each_case
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
-
-
-def spread(**overrides: Any) -> Spread:
-    histogram = [0] * (DECADES * CELLS)
-    histogram[8:11] = [40, 1000, 3]
-    return Spread(**{"p50": 45e-6, "p99": 120e-6, "max": 2.3e-3, "histogram": tuple(histogram), **overrides})
 
 
 def state(**overrides: Any) -> MonitorState:
@@ -46,8 +40,8 @@ def state(**overrides: Any) -> MonitorState:
         "overruns": 2,
         "catch_up_lost": 0,
         "recorder_drops": 0,
-        "lateness": spread(),
-        "duration": spread(),
+        "lateness": Spread(45e-6, 120e-6, 2.3e-3),
+        "duration": Spread(45e-6, 120e-6, 2.3e-3),
         "fifo_fill": 3,
         "fifo_capacity": 256,
         "command_age": 0.0123,
@@ -79,7 +73,7 @@ EXTREME = state(
     overruns=9_999_999,
     catch_up_lost=99_999_999,
     recorder_drops=9_999_999,
-    lateness=spread(p50=1.234, p99=99.9, max=999.0),
+    lateness=Spread(1.234, 99.9, 999.0),
     fifo_fill=256,
     command_age=0.9994,
     observation_age=99.96,
@@ -127,6 +121,7 @@ def test_an_arm_is_shown_completely_in_24_lines() -> None:
     for word in ("wally", "TRACKING", "control", "p99", "queue", "brain", "wrist_3.pos", "gripper.pos", "2-down"):
         assert any(word in line for line in printed), word
     assert [line.split()[0] for line in printed[-4:-1]] == ["limits", "watchdogs", "refused"]
+    assert "executed 6170   overruns 2" in "\n".join(printed)
 
 
 def text(shown: MonitorState, **options: Any) -> str:
@@ -153,7 +148,7 @@ def test_requested_against_applied_with_units_and_without_a_request_under_a_goal
     rows = {row.split()[0]: row.split()[1:] for row in shown.splitlines() if row.strip()}
     assert rows["x.vel"] == ["0.2000", "0.1500", "0.0000", "m/s"]
     assert rows["theta.vel"] == ["–", "-1.0000", "-0.9800", "rad/s"]
-    assert "x    1.500 m   y   -2.250 m   yaw   3.125 rad" in shown
+    assert "x 1.500 m   y -2.250 m   yaw 3.125 rad" in shown
     assert unit("gripper.pos") == "m"
     assert unit("elbow.pos") == "rad"
 
@@ -163,7 +158,7 @@ def test_requested_against_applied_with_units_and_without_a_request_under_a_goal
     [
         ({"estop": True}, "e-stop not latched yet"),
         ({"estop": True, "estop_latched": True, "mode": "ESTOP"}, "emergency stop latched"),
-        ({"alive": {"cerebellum": 3.25}}, "cerebellum silent   3 s"),
+        ({"alive": {"cerebellum": 3.25}}, "cerebellum silent 3 s"),
     ],
 )
 def test_what_matters_most_stands_beside_the_mode(changes: dict[str, Any], message: str) -> None:
