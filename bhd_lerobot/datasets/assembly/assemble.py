@@ -62,14 +62,9 @@ def assemble(
     """Write a dataset.
 
     Args:
-        picks: its episodes, in order; at least one.
-        new: an empty or missing folder: becomes the dataset's root, or the folder of a `Workspace`.
-        disk: how to write.
         types: Arrow types of metadata columns that no source has, by name without prefix.
         in_place: the new content takes the place of the only source's. Then files that stay are linked; two datasets
             never share one, because other programs write into files.
-        edit: the entry in ``meta/edits.jsonl``.
-        identity: content of ``meta/bhd.json``; no such file if None.
         known: feature -> statistic -> values of all episodes of the only source; those that are stored if None.
     """
     sources = _sources(picks, known is not None)

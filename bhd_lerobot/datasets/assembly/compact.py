@@ -28,11 +28,7 @@ EpisodeStats = dict[str, statistics.Stats]
 def compact(
     state: DatasetState, schema: Schema, disk: Disk, lock: RootLock, known: Mapping[int, EpisodeStats] | None = None
 ) -> bool:
-    """Compact a dataset and store all statistics.
-
-    Returns:
-        False if there was nothing to do.
-    """
+    """Compact a dataset and store all statistics; return False if there was nothing to do."""
     picks, rows = [Pick(state, row) for row in state.rows], [dict(row) for row in state.rows]
     plan = Plan(picks, rows, {task: index for index, task in enumerate(state.tasks)}, state.info, Files(picks))
     data = data_groups(plan)

@@ -33,10 +33,7 @@ def new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
 
 
 def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any], disk: Disk) -> RootLock:
-    """Create an empty dataset and return the lock on it.
-
-    It is built beside its place and renamed, so that a kill leaves either no dataset or a complete, empty one.
-    """
+    """Create an empty dataset beside its place, rename it to it, and return the lock on it."""
 
     def fill(building: Path) -> None:
         disk.make_folder(building / "meta")

@@ -18,8 +18,6 @@ class Pick:
     """An episode that goes into a new dataset.
 
     Attributes:
-        source: the dataset that it comes from.
-        row: its row there.
         metadata: metadata columns that get another value, by name without prefix.
         columns: columns of its frames that get other values, shape (T,).
     """
@@ -35,9 +33,6 @@ class Run:
     """Successive picks that lie in one file.
 
     Attributes:
-        source: the dataset of that file.
-        slot: the file.
-        places: the numbers of the picks.
         whole: whether they are all episodes of that file, in its order.
         share: the share of the file's frames that they have.
     """
@@ -121,15 +116,7 @@ class Files:
 
 @dataclass(frozen=True)
 class Plan:
-    """A dataset that is being assembled.
-
-    Attributes:
-        picks: its episodes, in order.
-        rows: their new rows, to be completed with the files that they get into.
-        tasks: the index of each instruction, in order.
-        info: content of its ``info.json``.
-        files: where the picks lie.
-    """
+    """A dataset that is being assembled."""
 
     picks: Sequence[Pick]
     rows: Sequence[Row]

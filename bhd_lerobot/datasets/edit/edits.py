@@ -36,9 +36,6 @@ class EditReport:
     """What came out of an edit.
 
     Attributes:
-        root: the dataset that was made or changed.
-        episodes: episodes it holds now.
-        frames: frames it holds now.
         is_repeated: whether this edit had been completed before, by a process that was killed before it reported it;
             nothing was changed now.
     """
@@ -152,9 +149,7 @@ class Change:
     """Other content for a dataset.
 
     Attributes:
-        picks: its new episodes.
         edit: the entry in ``meta/edits.jsonl``; the time is added.
-        identity: new content of ``meta/bhd.json``.
         types: Arrow types of new metadata columns, by name without prefix.
     """
 

@@ -42,13 +42,8 @@ def mark(
     stays that of the task.
 
     Args:
-        root: the dataset.
-        episodes: the episodes meant.
         outcome: what they ended with, one of `OUTCOMES`; ``failure`` is a failure without a cause.
         intervention: first and last frame of an intervention.
-        clear_interventions: take back all interventions.
-        note: why; for the log.
-        on_done: called with the report; see `bhd_lerobot.datasets.edit.edits.delete`.
     """
     if outcome is not None and outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", outcome, OUTCOMES))

@@ -92,10 +92,7 @@ def instructions_of(row: Row, task_index: NDArray[np.int64], tasks: Sequence[str
     If it does not name the same, in the order in which its frames have them.
 
     Args:
-        row: of the episode.
         task_index: number of the instruction of each frame, shape (T,).
-        tasks: the instructions in the order of their numbers.
-        path: the file of the frames.
     """
     numbers, first = np.unique(task_index, return_index=True)
     if numbers[0] < 0 or numbers[-1] >= len(tasks):
@@ -177,13 +174,7 @@ def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
 
 
 def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
-    """Yield images of a video, each of shape (H, W, 3).
-
-    Args:
-        path: the video.
-        start_s: time of the first one [s].
-        count: how many.
-    """
+    """Yield `count` images of a video from `start_s` [s] on, each of shape (H, W, 3)."""
     import av
 
     found = 0

@@ -68,7 +68,6 @@ def episode_table(
         rows: light columns of E episodes, all with the same keys.
         types: type of the metadata columns, by name without prefix.
         stats: feature -> statistic -> values of shape (E, ...).
-        extra: type of columns that are another program's, by name.
     """
     names, arrays = [], []
     for name in rows[0]:

@@ -95,15 +95,10 @@ def dataset_features(
     """Return the features of a dataset in LeRobot's form.
 
     Args:
-        observation_names: the robot's floats, in order.
-        action_names: the action's floats, in order.
         images: image shapes (height, width, 3) by camera name.
         columns: what the robots report beside observation and action: names of the values by key, in order; those of
             `SCALARS` are always there.
         environment_names: the values of the environment state, in order; no such column if there are none.
-        expert: whether it is recorded what an expert would do, with the action's floats.
-        subtask: whether the brain reports its subtask.
-        language: whether the subtask is stored in LeRobot's language column, too.
     """
     features: dict[str, dict[str, Any]] = {OBSERVATION_STATE: _vector("float32", observation_names)}
     if environment_names:

@@ -31,16 +31,7 @@ def check_identity(
     recording: Mapping[str, Any] | None,
     video: Mapping[str, Any] | None,
 ) -> None:
-    """Check that a dataset may be continued.
-
-    Args:
-        state: the dataset on disk.
-        schema: the requested columns.
-        fps: the requested frame rate.
-        robot_type: the requested robot.
-        recording: the requested description; None accepts the recorded one.
-        video: the requested video settings; None accepts the recorded ones.
-    """
+    """Check that a dataset may be continued with these; None accepts the recording and video that were recorded."""
     if state.identity is None:
         raise DatasetMismatchError(
             f"{state.root} was not recorded by this program (it has no meta/bhd.json). Record into another root."

@@ -36,13 +36,8 @@ def write_meta(
     """Write the rows and statistics of episodes, and the statistics of all of them.
 
     Args:
-        new: root of the dataset that is being built.
-        info: content of its ``info.json``.
         rows: one per episode, in order; the numbers of the file it is written to are filled in.
-        types: Arrow type of the metadata columns, by name without prefix.
         stats: feature -> statistic -> values of all episodes, shape (E, ...).
-        disk: how to write.
-        extra: Arrow type of columns that are another program's, by name.
         done: so many of the first episodes are in files already.
         slot: the last of those files.
     """

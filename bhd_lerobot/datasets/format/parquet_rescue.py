@@ -31,7 +31,6 @@ class Rescued:
     """What could be read.
 
     Attributes:
-        groups: the row groups, in order.
         problem: why there is no more; empty if the file is whole.
         lost_bytes: bytes that belong to no row group that can be read.
         is_cut: whether there is no footer, so that bytes at the end may belong to no row group.
@@ -88,7 +87,6 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
     """Return the row groups of a file, with its footer or without; damaged ones are left out.
 
     Args:
-        path: the file.
         schema: its columns, in order; used only if there is no footer.
         shapes: the shape of a row's value in columns of nested lists, whose type does not define it.
     """

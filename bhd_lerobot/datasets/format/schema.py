@@ -47,17 +47,12 @@ class Schema:
 
     Attributes:
         features: all features in LeRobot's form, ours first, LeRobot's default ones last.
-        columns: what a caller brings for every frame.
         videos: (height, width) in pixels of every camera feature.
         arrow: the Arrow schema of a data file, with the same metadata that the `datasets` library writes.
     """
 
     def __init__(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check `features`.
-
-        Args:
-            features: LeRobot feature dictionaries; the default features may be among them.
-        """
+        """Check `features`; LeRobot's default features may be among them."""
         own = {key: _checked(key, feature) for key, feature in features.items() if key not in DEFAULT_FEATURES}
         if not own:
             raise ConfigError("A dataset needs at least one feature of its own; none was given.")

@@ -34,11 +34,8 @@ class DatasetState:
     """The committed content of a dataset.
 
     Attributes:
-        root: the dataset.
-        info: content of ``meta/info.json``.
         identity: content of ``meta/bhd.json``; None if another program recorded the dataset.
         tasks: task sentences in the order of their index; may hold more than ``info`` counts after a kill.
-        rows: one per committed episode, in order.
         without_stats: committed episodes whose statistics are not stored yet.
         metadata_types: Arrow type of every ``bhd/`` column, empty before the first episode.
         extra_types: Arrow type of columns that neither LeRobot nor this package writes.

@@ -94,14 +94,7 @@ def _rank(share: float, count: int) -> int:
 
 
 def image_histogram(image: np.ndarray) -> np.ndarray:
-    """Return how often each value occurs per channel in a thinned image.
-
-    Args:
-        image: shape (H, W, 3), uint8.
-
-    Returns:
-        Shape (3, 256), uint32. All statistics of 8-bit images follow from it exactly.
-    """
+    """Return how often each value occurs in a thinned image (H, W, 3) of bytes, shape (3, 256)."""
     height, width = image.shape[:2]
     step = 1
     if max(height, width) >= 300:

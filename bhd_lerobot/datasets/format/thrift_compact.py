@@ -30,11 +30,7 @@ def integer(value: int) -> Field:
 
 
 class Reader:
-    """Reads structs from bytes.
-
-    Attributes:
-        position: of the next byte.
-    """
+    """Reads structs from bytes."""
 
     def __init__(self, data: bytes | memoryview, position: int = 0) -> None:
         self._data, self.position = data, position

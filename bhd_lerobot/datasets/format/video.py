@@ -126,14 +126,7 @@ class CameraEncoder:
     """
 
     def __init__(self, path: Path, fps: int, size: tuple[int, int], settings: VideoSettings) -> None:
-        """Start the thread.
-
-        Args:
-            path: the file to write.
-            fps: frames per second of the dataset.
-            size: (height, width) in pixels.
-            settings: codec and its options.
-        """
+        """Start the thread; `size` is (height, width) in pixels."""
         self.path = path
         self.frames = 0
         self._fps, self._size, self._settings = fps, size, settings
@@ -220,7 +213,6 @@ class EncodedVideo:
     """Images of one camera and one episode that were encoded elsewhere; in the place of a `CameraEncoder`.
 
     Args:
-        path: the file.
         histograms: of its images, shape (T, 3, 256).
     """
 

@@ -20,8 +20,6 @@ def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int 
 
     Args:
         parts: a file and its spans, in the order of the new video. All files have the same `stream_signature`.
-        target: the new video.
-        fps: frames per second of all of them.
     """
     import av
 

@@ -41,14 +41,7 @@ def image_shape(meta: "LeRobotDatasetMetadata", key: str) -> tuple[int, int, int
 def needed_bytes(
     meta: "LeRobotDatasetMetadata", episodes: Sequence[int], cameras: Sequence[str], keys: Collection[str] | None = None
 ) -> tuple[int, int]:
-    """Return the bytes that the decoded images and the columns of some episodes take.
-
-    Args:
-        meta: the dataset.
-        episodes: indices of the episodes.
-        cameras: camera features to decode.
-        keys: features to keep besides LeRobot's index columns; None keeps all.
-    """
+    """Return the bytes that decoded cameras and the columns of some episodes take; all columns if `keys` is None."""
     frames = int(np.asarray(meta.episodes["length"], dtype=np.int64)[list(episodes)].sum())
     sizes = {"float": 4, "int": 8, "uint": 8, "bool": 1}
     column = 0
@@ -123,14 +116,7 @@ class FrameCache:
     """
 
     def __init__(self, table: FrameTable, cameras: Sequence[str], tolerance_s: float, backend: str = "pyav") -> None:
-        """Decode.
-
-        Args:
-            table: its rows are the frames to keep.
-            cameras: camera features.
-            tolerance_s: by how much a frame may miss its time [s].
-            backend: LeRobot's video decoder whose pixels are wanted.
-        """
+        """Decode the images of the rows; a frame may miss its time by `tolerance_s` [s]."""
         self._table, self._tolerance, self._backend = table, tolerance_s, backend
         self._stored = [key for key in cameras if key in table.images]
         self.keys = [*(key for key in cameras if key not in table.images), *self._stored]

@@ -42,12 +42,7 @@ class Gatherer:
         self._order = [*videos, *(key for key in table.keys if key not in table.nested)]
 
     def gather(self, rows: Tensor, return_uint8: bool) -> Batch:
-        """Return the batch of some rows of the table.
-
-        Args:
-            rows: shape (B,), int64.
-            return_uint8: leave videos 8-bit instead of float32 in [0, 1].
-        """
+        """Return the batch of rows of the table, shape (B,); videos are float32 in [0, 1] unless they stay 8-bit."""
         # numpy's `take` copies whole rows in this thread. torch's `index_select` shares a batch of images among
         # threads, which costs more than the copy, and several hundred times as much while other programs run.
         at = rows.numpy()

@@ -203,8 +203,6 @@ def _first_frames(index: Tensor, meta: Any, drop_n_last_frames: int) -> Tensor:
 
     Args:
         index: number of each sample's frame in the whole dataset, shape (N,).
-        meta: the dataset.
-        drop_n_last_frames: frames at the end of each episode that no sample starts from.
     """
     ends = torch.as_tensor(meta.episodes["dataset_to_index"], dtype=torch.int64)
     end = ends[torch.searchsorted(ends, index, right=True)]

@@ -41,13 +41,7 @@ class BatchOrder:
 
         Args:
             samples: indices to draw from, shape (M,), int64.
-            batch_size: samples in a batch of one rank, at least 1.
-            seed: decides the order, with the number of the epoch.
-            shuffle: False serves the samples as given.
-            drop_last: leave an incomplete batch out.
             weights: relative frequency of each of `samples`, shape (M,), not negative; needs `shuffle`.
-            rank: this process among `world_size`.
-            world_size: processes that train together.
         """
         self.batch_size, self.seed, self.shuffle, self.drop_last = batch_size, seed, shuffle, drop_last
         self.rank, self.world_size = rank, world_size

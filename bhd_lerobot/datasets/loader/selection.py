@@ -37,9 +37,6 @@ class StoredEpisodes:
     """What an `EpisodeFilter` asks a dataset for, of one that was read without LeRobot.
 
     Attributes:
-        root: the dataset.
-        total_episodes: how many there are.
-        total_frames: how many frames they have.
         episodes: columns of ``meta/episodes`` by name, one entry for each episode.
     """
 
@@ -88,12 +85,7 @@ class EpisodeFilter(Options):
     def select(
         self, meta: "LeRobotDatasetMetadata | StoredEpisodes", episodes: Sequence[int] | None = None
     ) -> list[int]:
-        """Return the wanted ones among some episodes, ascending.
-
-        Args:
-            meta: the dataset.
-            episodes: candidates; None means all.
-        """
+        """Return the wanted ones among some episodes, or among all, ascending."""
         candidates = checked_episodes(meta, episodes)
         wanted = candidates
         if self.outcomes is not None:
@@ -134,8 +126,6 @@ def split_episodes(
     With a single instruction it is what LeRobot's `make_train_eval_datasets` does.
 
     Args:
-        meta: the dataset.
-        episodes: to choose from; None means all.
         eval_split: share that is held out, from 0 to below 1.
         hold_out: `episode` for this rule. `instruction` for LeRobot's, which counts each instruction by itself and
             holds out at least one episode of every one.
@@ -182,8 +172,6 @@ def frame_weights(
     """Return how often each sample is to be drawn, by who drove in its frame.
 
     Args:
-        meta: the dataset.
-        episodes: the selected episodes; None means all.
         intervention: of frames in which someone intervened; 0 drops them.
         learner: of the other frames of episodes in which someone could intervene; 0 drops them. All others have 1.
 

@@ -24,10 +24,7 @@ def local_metadata(
     """Return the metadata of a dataset all of whose wanted files are on this machine, downloading what is not.
 
     Args:
-        repo_id: name of the dataset.
         root: its folder; None looks where LeRobot keeps datasets.
-        revision: version on the Hub, if it has to be downloaded.
-        episodes: the episodes whose files are wanted; None wants all.
         select: chooses the episodes by the metadata, for example those of an outcome; only their files are downloaded.
     """
     from lerobot.utils.constants import HF_LEROBOT_HOME

@@ -65,12 +65,10 @@ class FrameTable:
     that LeRobot gives them: all floats float32, all integers int64, bool. Videos are not here.
 
     Attributes:
-        meta: LeRobot's metadata of the dataset.
         columns: key -> tensor of shape (N, ...); a feature of shape (1,) is a column of shape (N,).
         texts: key -> array of N strings.
         nested: key -> Arrow column of N lists (LeRobot's language columns).
         images: key -> Arrow column of N encoded images (features of dtype "image").
-        keys: all of these and LeRobot's index columns, in the order of the features.
         episodes: indices of the episodes, in the order of their rows.
         starts, lengths: first row and number of rows of each of them, shape (E,), int64.
         first, last: first and last row of the episode that a row belongs to, shape (N,), int64.
@@ -107,8 +105,6 @@ class FrameTable:
         """Read the data files of a dataset on this machine.
 
         Args:
-            meta_or_root: LeRobot's metadata, or the folder of the dataset.
-            episodes: indices of the episodes to read; None reads all.
             keys: features to read besides LeRobot's index columns; None reads all. Videos are skipped.
             sources: features whose values are read from another column of the same shape, by name.
         """

@@ -23,11 +23,6 @@ class TableDataset:
 
     `dataset[i]` is what `LeRobotDataset[i]` is, and `dataset.batch(indices)` what PyTorch's default collate makes of
     such samples (LeRobot's collate if there are language columns), key by key, to the last bit.
-
-    Attributes:
-        repo_id, root, revision, meta, delta_timestamps, image_transforms, tolerance_s: as in `LeRobotDataset`.
-        episodes: selected episodes, None for all.
-        table: the columns.
     """
 
     def __init__(
@@ -50,20 +45,13 @@ class TableDataset:
         """Read the dataset, from this machine if it is there, as LeRobot does, and decode its images.
 
         Args:
-            repo_id: name of the dataset.
-            root: its folder; None looks where LeRobot keeps datasets.
-            episodes: indices of the episodes to load; None loads all.
             delta_timestamps: key -> times relative to the sample [s], multiples of 1 / fps.
             budget_gib: memory that columns and decoded images may take [GiB].
-            image_transforms: applied to the images of each sample.
             tolerance_s: by how much a video frame may miss its time [s].
-            video_backend: LeRobot's decoder whose images are wanted.
             sources: features whose values are another column's, by name.
             keep: features to serve besides LeRobot's index columns and `task`; None serves all. Cameras that are left
                 out are not decoded.
-            revision: version of the dataset on the Hub.
             return_uint8: serve videos as uint8 instead of float32 in [0, 1].
-            meta: LeRobot's metadata, if it has been read already; then `root` and `revision` are its own.
 
         Raises:
             DatasetError: no such dataset, episode or feature; delta_timestamps that are no multiples of 1 / fps.

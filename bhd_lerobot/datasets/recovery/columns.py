@@ -81,7 +81,6 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     """Return how columns differ from those that are described.
 
     Args:
-        info: describes them.
         sizes: the columns, and how many numbers each has; None if unknown.
         complete: whether they are all columns but videos; otherwise all that are numbers, and perhaps images.
     """

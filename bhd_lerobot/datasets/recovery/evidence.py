@@ -23,9 +23,7 @@ class EpisodeRows:
     """Rows and statistics of the episodes of sessions that were finished.
 
     Attributes:
-        rows: by the number of the episode.
         metadata_types: Arrow types of our columns, by name without prefix.
-        extra_types: Arrow types of columns of other programs.
         torn: names without prefix of our columns in files that cannot be read.
     """
 

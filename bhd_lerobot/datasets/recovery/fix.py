@@ -58,9 +58,6 @@ def rebuild(state: DatasetState, disk: Disk, lock: RootLock, *, order: bool = Fa
     """Count the frames, and write anew what follows from them, in one step; return a line for each thing.
 
     Args:
-        state: what is on disk.
-        disk: how to write.
-        lock: of the dataset.
         order: whether files, rows and instructions are put in the order of their numbers, and the frames numbered.
         stats: whether the statistics of all episodes are computed.
     """

@@ -36,11 +36,6 @@ def restore_outcomes(
     An outcome is a person's mark, or else the event of the last frame, where our recorder wrote it.
 
     Args:
-        root: the corrupted dataset.
-        recovered: the recovered episodes.
-        rows: their new rows; changed in place.
-        stored: what could be read of the old ones; its types get those of the outcomes.
-        findings: lost columns, and outcomes that are known from elsewhere, are added to it.
         is_ours: whether our recorder wrote every episode, so that each had a row with columns of ours.
     """
     without_row = [(episode, row) for episode, row in zip(recovered, rows, strict=True) if not episode.has_row]

@@ -24,10 +24,6 @@ def stats_of(
     """Return feature -> statistic -> values of all episodes, shape (E, ...).
 
     Args:
-        episodes: frames of each episode.
-        features: LeRobot feature dictionaries.
-        new: root of the dataset, with its videos.
-        rows: of the episodes, with the places of their videos.
         stored: statistics of each episode's images that are known already. Those of depth are never computed here.
     """
     from bhd_lerobot.stock import compute_episode_stats

@@ -30,11 +30,7 @@ def cut_out(
     """Write spans of a video into another one, which holds nothing else if each begins with a key frame.
 
     Args:
-        path: the video.
-        target: the new one.
-        spans: what is needed of it.
         frames: how many of its frames can be read, and what is wrong with the next, if anything.
-        fps: frames per second.
 
     Returns:
         Where each span begins in the new video; None if nothing was written, because the video can stay as it is.
@@ -91,13 +87,7 @@ _FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames
 
 @dataclass(frozen=True)
 class Part:
-    """Frames of a video.
-
-    Attributes:
-        path: the video, or a folder with an image for each frame.
-        start: number of the first frame in it.
-        length: how many.
-    """
+    """Frames of a video, or of a folder with an image for each frame."""
 
     path: Path
     start: int
@@ -109,8 +99,6 @@ class FoundEpisode:
     """An episode whose frames were found.
 
     Attributes:
-        number: the number that it had.
-        table: its frames.
         videos: for each camera what shows it.
         has_row: whether a readable row of ``meta/episodes`` is about it.
     """

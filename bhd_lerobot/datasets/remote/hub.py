@@ -23,9 +23,6 @@ class HubDataset:
     """A dataset repository.
 
     Attributes:
-        name: `user/name`.
-        folder: None: it does not lie on this machine.
-        has_checksums: yes: the Hub makes them from the contents.
         revision: branch, tag or commit; None for what stock LeRobot takes.
         commit: hash of the commit that `files` listed; None before, and if there is no repository yet.
     """

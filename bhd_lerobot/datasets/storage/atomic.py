@@ -136,12 +136,8 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
     Signals that would end the process wait until it is done.
 
     Args:
-        new: the folder, on the same file system.
-        place: the other one.
-        disk: how to write.
         done: the result, a sentence without a full stop; see `noting_what_is_done`.
         is_new: nothing may be at these places.
-        goes: names that are removed, too.
     """
     work = place / WORK
     if not new.is_relative_to(work):
@@ -245,11 +241,7 @@ def roll_forward(place: Path, disk: Disk) -> bool:
 
 
 def complete_interrupted(place: Path) -> bool:
-    """Complete a change that a killed process had decided, and log it; called before a dataset is read.
-
-    Returns:
-        Whether there was one.
-    """
+    """Complete a change that a killed process had decided, log it, and return whether there was one."""
     if not is_decided(place):
         return False
     lock = RootLock(place)

@@ -44,11 +44,9 @@ class FrozenCheck:
         """Add the values of a feature in some episodes.
 
         Args:
-            key: the feature.
             values: its finite numbers, shape (frames, d).
             starts: first row of each episode, shape (episodes,).
             lengths: frames of each episode, shape (episodes,).
-            episodes: their numbers.
         """
         low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
         known = self._columns.setdefault(key, _Column(low, high))

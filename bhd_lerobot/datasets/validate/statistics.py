@@ -78,7 +78,6 @@ def wrong_statistic(stored: Mapping[str, Array], found: Moments, longest: int) -
 
     Args:
         stored: statistics by name, each of shape (d,); what is not there is not judged.
-        found: what was read.
         longest: frames of the longest episode; LeRobot computes the statistics of one at a time.
     """
     mean, variance = found.mean, found.variance
@@ -105,12 +104,7 @@ def wrong_statistic(stored: Mapping[str, Array], found: Moments, longest: int) -
 
 
 def wrong_deviations(stored: Array, found: Moments) -> tuple[NDArray[np.bool_], Array]:
-    """Return which standard deviations would change what is learned, and those of the data, each of shape (d,).
-
-    Args:
-        stored: standard deviations, shape (d,).
-        found: what was read.
-    """
+    """Return which standard deviations would change what is learned, and those of the data, each of shape (d,)."""
     deviation = np.sqrt(found.variance)
     size = np.maximum(np.abs(found.low), np.abs(found.high))
     is_at_rest = found.high - found.low <= _STEPS * _ROUNDING * size

@@ -40,10 +40,8 @@ class StepCheck:
         """Add the values of a feature in some episodes.
 
         Args:
-            key: the feature.
             values: its finite numbers, shape (frames, d).
             starts: first row of each episode, shape (episodes,).
-            episodes: their numbers.
         """
         if len(values) < 2:
             return

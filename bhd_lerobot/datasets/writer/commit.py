@@ -27,12 +27,7 @@ class EpisodeContent:
 
     Attributes:
         columns: all columns, shape (T,) or (T, d).
-        videos: finished, staged video file per camera.
-        stats: statistics of all columns and cameras.
-        task: the instruction.
         tasks: all instructions of the dataset, this one included, in the order of their index.
-        metadata_types: type of every metadata column.
-        metadata: metadata columns of this episode.
     """
 
     columns: Mapping[str, np.ndarray]

@@ -175,11 +175,6 @@ class RemoteEncoder:
     """Encodes the images of one camera and one episode into one file; in the place of a `CameraEncoder`.
 
     Nobody waits for it: an image for which there is no room is dropped, and the one before stands in its place.
-
-    Attributes:
-        frames: images so far.
-        dropped: numbers of those that were dropped.
-        is_cancelled: whether nobody cares for the file any more.
     """
 
     def __init__(self, process: EncoderProcess, number: int, path: Path, size: tuple[int, int]) -> None:

@@ -38,12 +38,7 @@ class EpisodeWriter:
         """Start empty.
 
         Args:
-            schema: the columns.
-            fps: frames per second.
             folder: staging folder of this episode; made when there is something to put in it.
-            disk: how to write.
-            video: how to encode images.
-            make_encoder: makes the encoder of a camera.
             on_close: called once when the episode was saved or discarded.
         """
         self.folder = folder
