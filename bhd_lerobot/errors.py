@@ -78,10 +78,6 @@ class DatasetMismatchError(DatasetError):
     """A dataset that was to be resumed was recorded with another robot, frame rate or feature set."""
 
 
-class DatasetEditedError(DatasetMismatchError):
-    """A dataset that was to be resumed was edited: its next episode would not be the one that its seed says."""
-
-
 class DatasetCorruptError(DatasetError):
     """A file of the dataset cannot be read."""
 

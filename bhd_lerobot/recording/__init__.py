@@ -9,7 +9,6 @@ __all__ = [
     "record",
     "report",
     "reset",
-    "resume_advice",
     "status",
     "takes",
 ]

@@ -8,7 +8,7 @@ from typing import Any
 
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
-from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
+from bhd_lerobot.errors import ConfigError, DatasetMismatchError
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -43,7 +43,7 @@ def check_identity(
         )
     if edit := (state.identity.get("recording") or {}).get("edited"):
         name = edit.get("edit", "edit") if isinstance(edit, Mapping) else "edit"
-        raise DatasetEditedError(
+        raise DatasetMismatchError(
             f"{state.root} was edited after its recording ({name}), so it cannot be continued: its next episode would "
             "not be the one of its seed. Record the missing episodes into another root, with another seed, and merge "
             "the two."

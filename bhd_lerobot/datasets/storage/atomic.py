@@ -23,7 +23,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,7 +32,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
 
-WORK = Path(layout.STAGING, "compact")  # the same name as in version 0.1, whose leftovers are found by it
+WORK = Path(layout.STAGING, "compact")
 PULL = Path(layout.STAGING, "pull")  # downloads, if nothing can be put beside their place
 _WORKSPACES = {WORK.name, PULL.name}
 _MARKER, _INVALID = WORK / "ready", WORK / "info.json"
@@ -274,17 +274,11 @@ def link_others(
 
 @dataclass(frozen=True)
 class _Plan:
-    """The content of the marker.
+    """The content of the marker: inodes of the new content by name, names that are removed, whether places are free."""
 
-    Attributes:
-        new: inodes of the new content, by name; empty in version 0.1, which did not swap folders.
-        goes: names that are removed.
-        is_new: nothing may be at these places.
-    """
-
-    new: dict[str, int] = field(default_factory=dict)
-    goes: tuple[str, ...] = ()
-    is_new: bool = False
+    new: dict[str, int]
+    goes: tuple[str, ...]
+    is_new: bool
 
 
 def _read_plan(place: Path) -> _Plan:
@@ -292,11 +286,8 @@ def _read_plan(place: Path) -> _Plan:
     staging = place / layout.STAGING
     if any(path.is_symlink() for path in (staging, *(place / WORK / name for name in ("", "ready", "new", "old")))):
         raise _foreign_marker(place)
-    content = (place / _MARKER).read_bytes()
-    if not content:
-        return _Plan()  # of version 0.1
     try:
-        values = json.loads(content)
+        values = json.loads((place / _MARKER).read_bytes())
         plan = _Plan(
             {str(k): int(v) for k, v in values["new"].items()}, tuple(map(str, values["goes"])), values["is_new"]
         )
@@ -330,8 +321,6 @@ def _replace(new: Path, target: Path, old: Path, plan: _Plan, disk: Disk) -> Non
     if plan.is_new:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target))
     try:
-        if not plan.new:
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
         disk.swap(new, target)
         disk.move(new, _unused(old))
     except OSError as error:

@@ -52,6 +52,13 @@ def test_merge_gives_all_episodes_in_order(tmp_path: Path, video: bool) -> None:
     assert_valid(tmp_path / "all")
 
 
+def test_an_edited_dataset_is_not_continued(plain: Path, tmp_path: Path) -> None:
+    """Its next episode would not be the one of its seed."""
+    keep(plain, [0, 1], tmp_path / "kept")
+    with pytest.raises(DatasetMismatchError, match=r"was edited after its recording \(.*another seed, and merge"):
+        support.resume(tmp_path / "kept")
+
+
 def test_filter_gives_the_wanted_episodes_in_the_wanted_order(plain: Path, video_dataset: Path, tmp_path: Path) -> None:
     cases = [(plain, [0]), (plain, [5, 2, 0]), (plain, [0, 1, 2, 3, 4, 5]), (video_dataset, [3, 1])]
     for number, (source, wanted) in enumerate(cases):

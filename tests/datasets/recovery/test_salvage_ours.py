@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.recovery import salvage as guard
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError, DatasetMismatchError
 from bhd_lerobot.tasks.task import Event
 from tests.datasets import support
 from tests.datasets.edit_support import assert_valid, content, record
@@ -71,7 +71,7 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         if not is_ours:
             continue
         # It was edited, so nobody goes on as if nothing had happened.
-        with pytest.raises(DatasetEditedError, match="recovered"):
+        with pytest.raises(DatasetMismatchError, match="recovered"):
             support.resume(root, video=True)
         assert edits_of(root)[-1]["episodes"] == [0, 1, 2, 3]
         assert dataset_info(root).recording["seed"] == 1
