@@ -23,12 +23,7 @@ _REMEDY = (
 
 @contextmanager
 def connected(config: RayConfig) -> Iterator[str]:
-    """Be a driver of the cluster that a configuration names; yield its address.
-
-    A cluster of this machine is started without telemetry and ended at the end, with all its processes.
-
-    Args:
-        config: which cluster.
+    """Be a driver of the cluster that a configuration names, its own without telemetry and ended at the end.
 
     Raises:
         ClusterError: there is none, it does not answer in time, or it runs other versions; the message names it.

@@ -46,14 +46,7 @@ class RayConfig(Options, prefix="ray."):
 
 
 def check_engine(config: Any) -> None:
-    """Refuse what a cluster cannot do. Imports nothing.
-
-    Args:
-        config: of a recording or an evaluation.
-
-    Raises:
-        ConfigError: names the option and the remedy.
-    """
+    """Refuse what a cluster cannot do. Imports nothing."""
     if config.engine == "local":
         if config.ray != RayConfig():
             raise ConfigError("Options of ray are set, but engine is 'local'; add --engine=ray, or leave them out.")

@@ -35,11 +35,7 @@ _PROBE_FRAMES = 20
 class Job:
     """Episodes of one robot, one task and one brain.
 
-    Attributes:
-        tolerance: of frames, see `EpisodeLoop`.
-        fps: frames a second [Hz].
-        video: how cameras are encoded; None if images are not recorded.
-        checkpoints: files of the trained policies in `brain`: by the path that it names, then by file name.
+    `checkpoints`: files of the trained policies in `brain`, by the path that it names, then by file name.
     """
 
     robot: Any
@@ -55,13 +51,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Video:
-    """The images of one camera in one episode.
-
-    Attributes:
-        content: the encoded file.
-        frames: how many images it holds.
-        histograms: their histograms, shape (frames, 3, 256), uint32, compressed.
-    """
+    """The encoded images of one camera in one episode, with their histograms, (frames, 3, 256), uint32, compressed."""
 
     content: bytes
     frames: int
@@ -115,12 +105,7 @@ def _learned(config: Any) -> Iterator[LearnedBrainConfig | PerceptionOptions]:
 
 
 class VideoSink:
-    """Takes the images of one episode and encodes them into memory: a worker that is killed leaves no file behind.
-
-    Args:
-        fps: frames a second of the dataset.
-        size: (height, width) of all cameras [px].
-    """
+    """Takes the images of one episode and encodes them into memory: a worker that is killed leaves no file behind."""
 
     def __init__(self, fps: int, size: tuple[int, int], settings: VideoSettings) -> None:
         self._make = partial(_encoder, fps, size, settings)
@@ -218,12 +203,7 @@ class EpisodeServer:
             simulation.start_rendering()
 
     def run(self, specs: list[tuple[int, int]]) -> dict[str, Any]:
-        """Run episodes.
-
-        Returns:
-            `episodes`: those that were finished, in order, packed; `times`: durations of the brain's calls [s]; and, if
-            something ended the run early, `error`.
-        """
+        """Run episodes; return those that were finished, packed, the brain's times [s], and the error that ended it."""
         answer: dict[str, Any] = {"episodes": [], "times": self._loop.act_times}
         self._loop.act_times.clear()
         sink = None if self._job.video is None else self._make_sink

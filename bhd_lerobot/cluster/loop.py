@@ -24,11 +24,7 @@ from bhd_lerobot.tasks.task import Task
 
 @contextmanager
 def open_pool(config: RayConfig, console: Console) -> Iterator[WorkerPool]:
-    """Join a cluster, or start one, and give those who will work there.
-
-    Raises:
-        ClusterError: it cannot be reached.
-    """
+    """Join a cluster, or start one, and give those who will work there."""
     with connected(config), WorkerPool(config, console) as pool:
         yield pool
 
@@ -36,14 +32,8 @@ def open_pool(config: RayConfig, console: Console) -> Iterator[WorkerPool]:
 class ClusterLoop(EpisodeLoop):
     """Runs episodes on the workers of a cluster and yields the same, in the same order, as an `EpisodeLoop`.
 
-    Args:
-        robots: robots of this machine; they only say what is recorded.
-        task: what is to be achieved.
-        brain: what drives the robots; made here too, so that what does not fit fails before a dataset exists.
-        tolerance: see `EpisodeLoop`.
-        pool: the workers.
-        config: of the recording or the evaluation.
-        brain_config: of the brain.
+    Robots, task and brain are made here, too: they say what is recorded, and what does not fit fails before a dataset
+    exists.
     """
 
     def __init__(
@@ -67,8 +57,6 @@ class ClusterLoop(EpisodeLoop):
         open_images: Callable[[], Any] | None = None,
     ) -> Generator[Episode]:
         """Run episodes and yield them in their order, each as soon as it and all before it are done.
-
-        The arguments are those of `EpisodeLoop.run`.
 
         Raises:
             ClusterError: the cluster cannot continue, or the emergency stop was pressed.

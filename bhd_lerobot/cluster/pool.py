@@ -110,11 +110,7 @@ class WorkerPool:
             self._dismiss(lambda worker: bool(worker.tasks))
 
     def workers_for(self, tasks: int) -> int:
-        """Return how many workers some tasks will have.
-
-        Raises:
-            ClusterError: no machine has room for one.
-        """
+        """Return how many workers some tasks will have; at least one must have room on a machine."""
         places = free_places(self._config)
         if not places:
             raise ClusterError(

@@ -54,13 +54,9 @@ class ActionScale:
             self.space = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
     def to_robot(self, actions: Any, running: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return actions in the robot's units, in single precision.
+        """Return actions, shape (n, a), in the robot's units, in single precision; of those that do not run any do.
 
         What lies outside of the bounds is passed on: the limits of the cerebellum are the robot's own.
-
-        Args:
-            actions: shape (n, a); those of simulations that do not run mean nothing.
-            running: the simulations that the actions are for, shape (n,).
         """
         values = np.asarray(actions)
         shape = (len(running), len(self.names))

@@ -30,13 +30,9 @@ class ClosedError(BhdError, gymnasium.error.ClosedEnvironmentError):
 
 @dataclass(frozen=True)
 class Stepped:
-    """What came of a frame; zeros for simulations that did not run.
+    """What came of a frame, each of shape (n,); zeros for simulations that did not run.
 
-    Attributes:
-        reward: the task's reward, shape (n,).
-        event: `Event` that ended an episode, shape (n,).
-        terminated: whether it ended because of what happened, shape (n,).
-        truncated: whether it ended because the time was over, and for no other reason, shape (n,).
+    `truncated`: whether an episode ended because the time was over, and for no other reason.
     """
 
     reward: NDArray[np.float64]
@@ -46,14 +42,7 @@ class Stepped:
 
 
 class Stage:
-    """n simulations, each in an episode of its own, or idle.
-
-    Attributes:
-        frames: longest duration of an episode [frames].
-        seeds: seed of the episode that each simulation is in, shape (n,).
-        scenes: its scene, by simulation.
-        limits: `Limit` flags of the last frame, shape (n,).
-    """
+    """n simulations, each in an episode of its own, or idle; `frames`: longest duration of an episode."""
 
     def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:
         self.n = n
@@ -89,14 +78,10 @@ class Stage:
         self.simulation.stop(ids)
 
     def observe(self, ids: NDArray[np.intp] | None = None) -> dict[str, Any]:
-        """Return what the robots see now. Call it once a frame: noisy sensors read something else each time.
+        """Return what the robots see now; rows of others than `ids`, or all that run, mean nothing.
 
-        Args:
-            ids: the simulations to observe, all that run if None; rows of others mean nothing.
-
-        Returns:
-            `agent_pos`, shape (n, k); `environment_state`, shape (n, e), if the task reports one; and `pixels` by
-            camera name, shape (n, height, width, 3), if there are cameras.
+        Call it once a frame: noisy sensors read something else each time. `agent_pos`, shape (n, k);
+        `environment_state`, shape (n, e), if reported; `pixels` by camera name, shape (n, height, width, 3).
         """
         simulation, running = self.simulation, self.simulation.running
         if ids is not None:
@@ -115,10 +100,9 @@ class Stage:
         return seen
 
     def step(self, actions: NDArray[np.float64]) -> Stepped:
-        """Let one frame go by. Simulations whose episodes ended continue running until `rest` or `reset`.
+        """Let one frame go by, with finite actions of single precision, shape (n, a).
 
-        Args:
-            actions: of each robot, shape (n, a), finite and of single precision.
+        Simulations whose episodes ended continue running until `rest` or `reset`.
         """
         simulation = self.simulation
         report = simulation.step(actions)

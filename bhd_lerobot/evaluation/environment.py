@@ -146,11 +146,7 @@ class _StoppedError(Exception):
 
 
 class _Watched:
-    """A vector environment of LeRobot that notes how its episodes end; everything else is the environment's own.
-
-    Attributes:
-        says_success: whether every episode that ended had an `is_success`.
-    """
+    """A vector environment that notes how its episodes end; `says_success`: whether all of them had an `is_success`."""
 
     def __init__(self, env: Any, stop: StopRequest) -> None:
         self._env, self._stop = env, stop

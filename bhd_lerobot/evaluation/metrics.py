@@ -28,12 +28,6 @@ class JerkMeasure:
 
     Jerk is the third derivative of a position. Commands that are speeds are differentiated twice and those that are
     positions three times, by differences between frames; of several joints it is the Euclidean length.
-
-    Attributes:
-        columns: of the actions.
-        order: how often they are differentiated.
-        unit: of the result.
-        what: as text.
     """
 
     columns: tuple[int, ...]
@@ -43,14 +37,10 @@ class JerkMeasure:
 
     @classmethod
     def of(cls, action_names: Sequence[str], *, is_si: bool = True) -> "JerkMeasure":
-        """Return the measure for commands of these names.
+        """Return the measure for commands of these names; those of LeRobot's robots are not in SI units.
 
         A base's is that of its forward speed, a tool's that of its position, an arm's that of its joints without the
         gripper.
-
-        Args:
-            action_names: names of the commands.
-            is_si: whether they are in SI units and radians; LeRobot's robots use degrees and shares of a range, too.
         """
         measure = cls._of(action_names)
         return measure if is_si else replace(measure, unit="units/s³")
@@ -67,12 +57,7 @@ class JerkMeasure:
         return cls(tuple(joints), 3, "rad/s³", "joint positions")
 
     def lengths(self, applied: NDArray, fps: int) -> NDArray[np.float64]:
-        """Return the jerk between frames, shape (frames - order,), empty if there are too few.
-
-        Args:
-            applied: the commands after all limits, at the ends of frames, shape (frames, actions).
-            fps: frames a second [Hz].
-        """
+        """Return the jerk between frames, shape (frames - order,), of applied commands, shape (frames, actions)."""
         values = applied[:, self.columns].astype(np.float64)
         if len(values) <= self.order or not self.columns:
             return np.zeros(0)
@@ -140,12 +125,7 @@ class EpisodeMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvironmentMetrics(EpisodeMetrics):
-    """One episode of one policy in an environment of LeRobot: only what such an environment returns.
-
-    Attributes:
-        task: its task's group and number in LeRobot's evaluation.
-        max_reward: the largest reward.
-    """
+    """One episode of one policy in an environment of LeRobot: only what such an environment returns."""
 
     task: str
     max_reward: float
@@ -175,13 +155,7 @@ _REPEATED = (keys.ACTION, keys.APPLIED_ACTION, keys.PHYSICS_STATE, keys.REWARD)
 def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: JerkMeasure, fps: int) -> EpisodeMetrics:
     """Return an episode's numbers.
 
-    Args:
-        brain: the brain's name in the evaluation.
-        episode: the episode.
-        track: where base or tool was at the start of each frame, x, y, z first [m], shape (frames, 3 or more);
-            no rows if it is not known.
-        jerk: what jerk is measured of.
-        fps: frames a second [Hz].
+    `track`: where base or tool was at the start of each frame, x, y, z first [m], shape (frames, 3 or more), or empty.
     """
     columns, outcome = episode.columns, episode.outcome
     lengths = jerk.lengths(columns[keys.APPLIED_ACTION], fps)

@@ -20,14 +20,9 @@ _JUDGING = tuple(key for key in KEYS if key.meaning in ("success", "failure"))
 
 
 def drawn_orders(folder: Path, labels: Sequence[str], indices: Sequence[int]) -> dict[str, list[str]]:
-    """Return in which order the brains run each episode, by its number, as drawn when the evaluation began.
+    """Return in which order the brains run each episode, by its number, as drawn when the evaluation in a folder began.
 
     An order that followed from the seed would be the same in every evaluation, and a person would come to know it.
-
-    Args:
-        folder: the evaluation's, which keeps the order for when it is continued.
-        labels: of the brains.
-        indices: of the episodes.
     """
     path, chance = folder / "order.json", random.SystemRandom()
     if path.is_file():
@@ -38,17 +33,7 @@ def drawn_orders(folder: Path, labels: Sequence[str], indices: Sequence[int]) ->
 
 
 class Operator(Marks):
-    """A person at the terminal, who is not told which brain runs.
-
-    Args:
-        console: where the prompts are printed.
-        total: number of episodes of all brains.
-        outcomes: what an episode can end with, by name.
-
-    Attributes:
-        is_there: whether a terminal gives keys.
-        has_quit: whether the key q was pressed.
-    """
+    """A person at the terminal, who is not told which brain runs; `is_there`: whether a terminal gives keys."""
 
     def __init__(self, console: Console, total: int, outcomes: Sequence[str]) -> None:
         super().__init__(1, outcomes, _JUDGING)
@@ -62,14 +47,7 @@ class Operator(Marks):
         super().on_key(keys)
 
     def set_up(self, number: int, spec: EpisodeSpec, instruction: str, stop: Callable[[], bool]) -> None:
-        """Wait until the person has set up a scene.
-
-        Args:
-            number: of the episode among those of all brains, from 1.
-            spec: the episode.
-            instruction: what the robot is to do.
-            stop: whether the run is to end: then it is not waited for.
-        """
+        """Wait until the person has set up a scene, or the run ends; `number` counts all brains' episodes from 1."""
         self._title = f"Episode {number} of {self._total}"
         if not self.is_there:
             return

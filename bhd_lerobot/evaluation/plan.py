@@ -26,11 +26,7 @@ _MOST = 2**16  # pairs: beyond, no one waits for the answer
 def power_of(pairs: int, difference: float, discordant: float, confidence: float = CONFIDENCE) -> float:
     """Return the probability that McNemar's exact test shows a difference in the right direction.
 
-    Args:
-        pairs: number of episodes of each brain.
-        difference: of the success rates, positive.
-        discordant: share of the pairs in which exactly one of both succeeds, at least the difference.
-        confidence: 1 - the two-sided level of the test.
+    `discordant`: share of the pairs in which exactly one of both succeeds, at least the difference.
     """
     counts = np.arange(pairs + 1)
     needed = binom.isf((1 - confidence) / 2, counts, 0.5) + 1
@@ -41,10 +37,7 @@ def power_of(pairs: int, difference: float, discordant: float, confidence: float
 def pairs_needed(
     difference: float, discordant: float, confidence: float = CONFIDENCE, power: float = POWER
 ) -> int | None:
-    """Return the number of pairs with which McNemar's exact test shows a difference with a power; None beyond 2**16.
-
-    The arguments are those of `power_of`.
-    """
+    """Return the number of pairs with which McNemar's exact test shows a difference with a power; None beyond 2**16."""
     enough = 8
     while power_of(enough, difference, discordant, confidence) < power:
         enough *= 2
@@ -61,13 +54,7 @@ def pairs_needed(
 
 
 def discordant_share(one: float, other: float, correlation: float) -> float:
-    """Return in which share of the pairs exactly one of two brains succeeds; NaN if there is no such correlation.
-
-    Args:
-        one: success rate of the first.
-        other: success rate of the second.
-        correlation: of their outcomes, the phi coefficient.
-    """
+    """Return in which share of the pairs exactly one succeeds, by rates and phi coefficient; NaN without one."""
     both = one * other + correlation * math.sqrt(one * (1 - one) * other * (1 - other))
     return math.nan if both > min(one, other) + 1e-12 else max(one + other - 2 * both, abs(one - other))
 

@@ -53,10 +53,7 @@ _STYLE: Any = {
 
 
 def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
-    """Return success rates and mean scores, or returns, with their intervals, a row for each brain.
-
-    Dashed: the baseline's.
-    """
+    """Return success rates and mean scores, or returns, with intervals, a row a brain; dashed: the baseline's."""
     name = "score" if "score" in brains[baseline].means else "reward"
     columns = [
         ("success rate", {label: one.success for label, one in brains.items()}, baseline, (-0.03, 1.03)),

@@ -39,19 +39,7 @@ VIDEOS = 2  # failures of each brain of which videos are made, by default
 
 @dataclass
 class BrainRun:
-    """What a brain's run leaves for results and report.
-
-    Attributes:
-        label: the brain's name in the evaluation.
-        loop: what runs it.
-        episodes: the numbers of its episodes.
-        trajectories: its episodes from above, by number.
-        videos: of what videos are to be made: episode, scene and recorded physics states.
-        initial_states: the simulator's complete states at the episodes' starts.
-        recorder: fills its dataset; None if none is wanted.
-        recorded: episodes that had been recorded before, and are not run again, by number.
-        wall_s: duration of the run [s].
-    """
+    """What a brain's run leaves; of what videos are to be made: episode, scene and recorded physics states."""
 
     label: str
     loop: EpisodeLoop
@@ -170,10 +158,7 @@ def _recorded_episodes(recorder: DatasetRecorder, rows: Collection[EpisodeSummar
 
 @contextmanager
 def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[DatasetRecorder | None]:
-    """Open the dataset of a brain, written as `bhd-record` writes it and complete at the end; None if none is wanted.
-
-    One that a stopped evaluation left is continued.
-    """
+    """Open the dataset of a brain, if one is wanted, as `bhd-record` writes it; one that was begun is continued."""
     if config.record.repo_id is None:
         yield None
         return

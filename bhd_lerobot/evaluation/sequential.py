@@ -23,12 +23,7 @@ _EDGE = 1 - 1e-9  # the largest difference against which there are bets
 
 
 def log_e_value(better: int | NDArray, worse: int | NDArray) -> NDArray[np.float64]:
-    """Return the logarithm of the e-value against the hypothesis that both brains are equally good.
-
-    Args:
-        better: pairs in which only the first succeeded.
-        worse: pairs in which only the second succeeded, of the same shape.
-    """
+    """Return the logarithm of the e-value against equality, by the pairs in which only one or the other succeeded."""
     found: NDArray[np.float64] = betaln(np.add(better, 1), np.add(worse, 1)) + np.add(better, worse) * math.log(2)
     return found
 
@@ -37,12 +32,6 @@ def confidence_sequence(better: int, worse: int, same: int, confidence: float = 
     """Return the difference of two success rates with an interval that holds whenever the run is stopped.
 
     It excludes 0 if and only if the e-value has reached 1 / (1 - confidence).
-
-    Args:
-        better: pairs in which only the first succeeded.
-        worse: pairs in which only the second succeeded.
-        same: pairs in which both succeeded, or both failed.
-        confidence: probability that all intervals of the run cover the truth.
     """
     count = better + worse + same
     if count == 0:

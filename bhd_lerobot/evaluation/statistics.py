@@ -32,13 +32,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Discordance:
-    """On how many episodes two brains differed in success.
-
-    Attributes:
-        better: episodes in which the first succeeded and the second failed.
-        worse: episodes in which the second succeeded and the first failed.
-        p: two-sided p-value of McNemar's exact test that neither is more frequent.
-    """
+    """On how many episodes two brains differed in success; `p`: two-sided, of McNemar's exact test."""
 
     better: int
     worse: int
@@ -66,11 +60,6 @@ def mean(
     Society B 54 (1992). Where the values have bounds, the interval also holds what would be the mean if a share of the
     episodes that easily stays unseen, 3 / n of them for 95 %, had the value of a bound: twenty equal scores do not
     prove that there are no others. Where they have none, equal values have no interval: NaN.
-
-    Args:
-        values: one for each episode, shape (episodes,).
-        confidence: probability that the interval covers the truth.
-        within: what the values cannot exceed.
     """
     sample = np.asarray(values, np.float64)
     count = len(sample)
@@ -110,14 +99,7 @@ def mean_difference(
     *,
     within: tuple[float, float] = (-math.inf, math.inf),
 ) -> Estimate:
-    """Return the mean of paired differences, values minus baseline, with the interval of `mean`.
-
-    Args:
-        values: one for each episode, shape (episodes,).
-        baseline: of the same episodes, in the same order.
-        confidence: probability that the interval covers the truth.
-        within: what neither can exceed.
-    """
+    """Return the mean of paired differences, values minus baseline, with the interval of `mean`."""
     one, two = _paired(np.asarray(values, np.float64), np.asarray(baseline, np.float64))
     width = within[1] - within[0]
     return mean(one - two, confidence, within=(-width, width))
@@ -135,12 +117,6 @@ def ratio_of_means(
     Where the baseline's mean may be 0 the upper end is infinite; where it is, nothing is defined. Where the values have
     an upper bound, the interval also holds the ratio if a share of the episodes that easily stays unseen, as in `mean`,
     had the value of a bound.
-
-    Args:
-        values: one for each episode, shape (episodes,).
-        baseline: of the same episodes, in the same order.
-        confidence: probability that the interval covers the truth.
-        within: what neither can exceed.
     """
     one, two = _paired(np.asarray(values, np.float64), np.asarray(baseline, np.float64))
     count = len(one)
@@ -180,11 +156,6 @@ def rate_difference(successes: ArrayLike, baseline: ArrayLike, confidence: float
     proportions based on paired data", Statistics in Medicine 17 (1998): the Wilson intervals of both rates, put
     together with the correlation of the outcomes. Where McNemar's exact test does not find a difference, it is widened
     to hold 0: of 5 episodes that differ and all in one direction nothing is certain.
-
-    Args:
-        successes: whether each episode was a success, shape (episodes,).
-        baseline: of the same episodes, in the same order.
-        confidence: probability that the interval covers the truth.
     """
     one, two = _paired(np.asarray(successes, bool), np.asarray(baseline, bool))
     count = len(one)

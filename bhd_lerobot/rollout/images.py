@@ -26,13 +26,9 @@ class EpisodeImages:
         self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(robots.n)]
 
     def order_all(self, observer: Observer | None, wanted: NDArray[np.bool_]) -> dict[str, Image]:
-        """Order the images of the running simulations that anybody looks at; return those that are wanted.
+        """Order the images of the running simulations that anybody looks at; return those wanted, others black.
 
         A brain that does not use images does not wait for them: they are made while the frame continues.
-
-        Args:
-            observer: is shown them, too.
-            wanted: of which simulations to wait for them, shape (n,); the images of others are black.
         """
         robots, shapes = self._robots, self._robots.camera_shapes
         cameras = list(shapes)

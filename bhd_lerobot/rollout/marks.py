@@ -17,13 +17,7 @@ Mask = NDArray[np.bool_]
 
 
 class MarkKey(NamedTuple):
-    """A key of the terminal that marks the running episode.
-
-    Attributes:
-        name: what is printed on the key.
-        sent: what the terminal sends for it, each byte alone.
-        meaning: ``"success"``, ``"failure"``, ``"intervention"``, ``"again"`` or ``"pause"``.
-    """
+    """A key of the terminal that marks the running episode; of `sent`, what the terminal sends, each byte alone."""
 
     name: str
     sent: bytes
@@ -142,11 +136,7 @@ class Marks:
 
     @contextmanager
     def waiting(self, *, has_last: bool = False) -> Iterator[Callable[[], bool]]:
-        """Let Enter mean that the next episode begins; yield what returns whether it was pressed.
-
-        Args:
-            has_last: whether there is a take before it that can be discarded.
-        """
+        """Let Enter mean that the next episode begins; yield what returns whether it was pressed."""
         with self._lock:
             self._go.clear()
             self._is_waiting, self._has_last, self._again = True, has_last, False

@@ -25,15 +25,7 @@ _COLOURS = {True: "#1b7f4d", False: "#c0392b", None: "#3b4a5a"}
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One episode, seen from above.
-
-    Attributes:
-        title: what stands above the panel.
-        scene: the obstacles, or the objects on the table.
-        xy: positions in the world frame [m], shape (frames, 2).
-        success: whether the episode succeeded; None if nothing was attempted.
-        instruction: what the arm was asked to do; shown above a table.
-    """
+    """One episode from above: `xy` in the world frame [m], (frames, 2); `success` is None if nothing was attempted."""
 
     title: str
     scene: Arena | TableScene
@@ -200,17 +192,7 @@ def draw_divergence(
     heading: str,
     path: Path,
 ) -> None:
-    """Draw a replay beside its recording.
-
-    Args:
-        scene: the obstacles, or the objects on the table.
-        recorded: recorded positions [m], shape (frames, 2).
-        replayed: replayed positions [m], shape (frames, 2).
-        time: time of the frames [s], shape (frames,).
-        curves: difference over time by label with its unit, each of shape (frames,).
-        heading: what stands above the figure.
-        path: where the image goes.
-    """
+    """Draw a replay beside its recording: positions [m], (frames, 2), and differences by label with unit, over s."""
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)
     columns = figure.add_gridspec(1, 2, width_ratios=(1, 1.3))

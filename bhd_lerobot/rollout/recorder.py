@@ -33,19 +33,7 @@ from bhd_lerobot.tasks.task import Task, TaskConfig
 
 @dataclass(frozen=True)
 class Recording:
-    """A dataset that is opened, or continued.
-
-    Attributes:
-        repo_id: its name, `user/name`.
-        root: its folder.
-        fps: frames a second [Hz].
-        task: the task's configuration.
-        seed: what every episode's seed follows from.
-        split: which set of seeds.
-        resume: whether one that exists is continued.
-        language: whether the plan is recorded in LeRobot's language column, too, if there is one.
-        expert_action: whether it is recorded what an expert would do.
-    """
+    """A dataset that is opened, or continued; `language`: whether the plan is recorded in LeRobot's language column."""
 
     repo_id: str
     root: Path
@@ -143,12 +131,7 @@ def closing_used(recorder: DatasetRecorder, *, is_new: bool) -> Iterator[Dataset
 def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
     """Return LeRobot's column `language_persistent`: the plan, and every subtask from its first frame on.
 
-    Every frame of an episode holds the same rows.
-
-    Args:
-        plan: the plan; its `steps` are pairs of a skill and a text.
-        subtasks: what the brain was doing in each frame, shape (frames,).
-        fps: frames a second [Hz].
+    Every frame of an episode holds the same rows. The plan's `steps` are pairs of a skill and a text.
     """
     rows: list[dict[str, Any]] = []
 

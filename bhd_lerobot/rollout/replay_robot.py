@@ -25,17 +25,7 @@ from bhd_lerobot.rollout.signals import stop_on_signals
 
 
 def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, console: Console) -> float:
-    """Replay an episode.
-
-    Args:
-        root: the dataset.
-        episode: its number.
-        robot: the robot's configuration.
-        gate: what is let through to it, of a robot of another package.
-        console: where differences are printed.
-
-    Returns:
-        The largest difference of an observed value from the recorded one of that name, in its own unit; 0 without any.
+    """Replay an episode of a dataset; return the largest difference of a value from the recorded one, in its own unit.
 
     Raises:
         DatasetError: the dataset's actions are not those of the robot, by their names.

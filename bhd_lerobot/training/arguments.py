@@ -1,8 +1,4 @@
-"""From the command line of `bhd-train` to its configuration.
-
-Adds to `configuration.parse` what LeRobot's training knows beyond plain fields: `policy.path`, and `resume` from the
-configuration that lies in a checkpoint.
-"""
+"""From the command line of `bhd-train` to its configuration: also `policy.path`, and `resume` from a checkpoint."""
 
 import shlex
 from collections.abc import Sequence
@@ -23,11 +19,7 @@ from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig
 
 
 def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> BhdTrainConfig:
-    """Return the configuration that a command line describes, not validated.
-
-    With `--resume=true`, its `--config_path` is a checkpoint's `train_config.json`, or the folder of a checkpoint or of
-    a run.
-    """
+    """Return the configuration, not validated; to resume, its path is a checkpoint's file or folder, or a run."""
     line = configuration.read_line(arguments)
     checkpoint: Path | None = None
     if line.options.get("resume") is True:

@@ -74,10 +74,7 @@ def resume_command(checkpoint: Path) -> str:
 
 @contextmanager
 def writing(final: Path) -> Iterator[Path]:
-    """Give a new folder for a checkpoint; when it is complete, rename it and point `last` at it.
-
-    There is never half a checkpoint under a checkpoint's name.
-    """
+    """Give a new folder for a checkpoint; complete, it is renamed and `last` leads to it: there is never half one."""
     part, old = (final.with_name(f".{final.name}.{suffix}") for suffix in ("part", "old"))
     disk = Disk()
     try:

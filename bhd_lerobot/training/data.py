@@ -22,17 +22,7 @@ from bhd_lerobot.training.config import BhdTrainConfig
 
 @dataclass
 class TrainingData:
-    """What is learned from.
-
-    Attributes:
-        train: batches to learn from.
-        held_out: batches of the held-out episodes; None if there are none.
-        frames: samples in an epoch.
-        episodes: number of episodes that are learned from.
-        held_out_episodes: those that are not, by number.
-        how: how the batches are served, as text.
-        fingerprint: digest of what is learned from.
-    """
+    """What is learned from: samples in an epoch, how batches are served as text, a digest of the data."""
 
     train: Loader
     held_out: Loader | None

@@ -25,18 +25,8 @@ class DivergedError(BhdError):
 class LoopOptions:
     """When the loop does what; a frequency of 0 is never.
 
-    Attributes:
-        steps: when it is over.
-        batch_size: samples in a step, of all processes.
-        frames: samples in an epoch.
-        log_freq: steps from one row of metrics to the next; the first come earlier, after 10, 20, 50
-            and 100 steps, and the last step has one.
-        eval_freq: steps from one held-out loss to the next; there is one after the last step, too.
-        save_freq: steps from one checkpoint to the next; there is one after the last step, too.
-        env_eval_freq: steps from one evaluation in an environment to the next.
-        seed: of the noise in the held-out loss.
-        held_out: numbers of the episodes that are not learned from.
-        fingerprint: digest of what is learned from.
+    `batch_size` is of all processes. The first rows of metrics come earlier, after 10, 20, 50 and 100 steps; the last
+    step has a row, a held-out loss and a checkpoint.
     """
 
     steps: int
@@ -53,15 +43,7 @@ class LoopOptions:
 
 @dataclass
 class Hooks:
-    """What the loop calls; all of it in every process.
-
-    Attributes:
-        held_out: makes an iterator over the held-out batches; None if there are none.
-        save: takes the step and the state of the loop, and writes a checkpoint; None if none is wanted.
-        evaluate: takes the step, returns metrics of an evaluation in an environment; None if there is none.
-        should_stop: whether to end after this step.
-        mean: over all processes, of numbers in a tensor.
-    """
+    """What the loop calls, in every process; `mean` is over all of them. What is not wanted is None."""
 
     held_out: Callable[[], Iterator[Batch]] | None = None
     log: Callable[[Row], None] = lambda row: None
@@ -74,16 +56,7 @@ class Hooks:
 
 @dataclass
 class Window:
-    """What was measured since the last row of metrics.
-
-    Attributes:
-        results: one for each step.
-        before: the same, of steps before this process was started, as plain numbers.
-        batches: where each step's samples come from: `episode_index` and `frame_index`.
-        data_s: time that went into getting batches [s].
-        update_s: time that went into learning from them [s].
-        other_s: time that went into what is neither, such as checkpoints [s].
-    """
+    """What was measured since the last row of metrics, also before this process was started; times are in s."""
 
     results: list[StepResult] = field(default_factory=list)
     before: list[dict[str, float]] = field(default_factory=list)

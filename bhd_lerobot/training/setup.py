@@ -187,12 +187,7 @@ def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerat
 
 
 def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
-    """Let only some of a policy's parameters be trained.
-
-    Args:
-        policy: the policy; what it keeps from training itself stays so.
-        patterns: names of parameters, or patterns of them such as ``*.bias``.
-    """
+    """Let only some parameters be trained, by names or patterns like ``*.bias``; what the policy freezes stays so."""
     trained = {name: one for name, one in policy.named_parameters() if one.requires_grad}
     unknown = [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in trained)]
     if unknown or not patterns:

@@ -15,13 +15,7 @@ Batch = dict[str, Any]
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step measured; tensors on the device, so that a step does not wait for them.
-
-    Attributes:
-        loss: before the step, shape ().
-        grad_norm: before clipping, shape ().
-        outputs: what else the policy returned: numbers, or tensors of one number.
-    """
+    """What a step measured, the norm before clipping; tensors on the device, so that a step does not wait for them."""
 
     loss: Tensor
     grad_norm: Tensor
@@ -46,12 +40,7 @@ class Learner:
         grad_clip_norm: float,
         camera_keys: tuple[str, ...] = (),
     ) -> None:
-        """Keep what a step needs.
-
-        `scheduler`: of the learning rate, or None. `accelerator`: accelerate's; with several processes or mixed
-        precision it prepares the others. `grad_clip_norm`: largest norm of the gradient; not clipped if 0 or less.
-        `camera_keys`: images in a batch, which come as 8 bit.
-        """
+        """Keep what a step needs; the gradient is not clipped if `grad_clip_norm` is not positive; images are 8 bit."""
         self.unwrapped = policy
         # For one process in full precision, accelerate's wrappers change nothing and take longer than a small network.
         self._is_plain = accelerator.num_processes == 1 and accelerator.mixed_precision == "no"

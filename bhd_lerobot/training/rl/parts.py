@@ -34,13 +34,7 @@ _RANDOM_FRAMES = 50  # of each environment, when nothing else shows how large th
 
 @dataclass
 class RlParts:
-    """What is learned, and what it needs to run.
-
-    Attributes:
-        actor: the policy, with a chunk of one action and a Gaussian around it.
-        front: the same without convolutions, for its features only.
-        fresh: whether its weights are still to be initialised.
-    """
+    """What is learned, and what it needs: `front` is the actor without convolutions; `fresh`: not initialised yet."""
 
     actor: MlpPolicy
     front: MlpPolicy
@@ -165,12 +159,9 @@ def single_action(policy: MlpPolicy) -> MlpPolicy:
 
 
 def seeing_more(policy: MlpPolicy, *, ignored: bool = False, steps: tuple[int, int] | None = None) -> MlpPolicy:
-    """Return a policy that does the same, and that sees more: the weights of that are 0.
+    """Return a policy that does the same and sees more, with weights of 0.
 
-    Args:
-        policy: a policy; with `steps`, one that sees one observation.
-        ignored: see what the other ignores.
-        steps: how many observations to see, and frames from each to the next; as many as before if None.
+    `ignored`: what the other ignores. `steps`: how many observations, and frames between them; the other sees one.
     """
     values: dict[str, Any] = {"ignore": [], "ignored_columns": []} if ignored else {}
     if steps is not None:

@@ -68,11 +68,7 @@ _NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
 
 
 class Run(BaseCallback):
-    """One run, from its configuration to its result.
-
-    An update is reported before the next samples are gathered. The validation's episodes run in the evaluation's own
-    loop.
-    """
+    """One run; an update is reported before the next samples are gathered."""
 
     def __init__(self, config: RlConfig, folder: Path, console: Console, stop: StopRequest) -> None:
         super().__init__()
