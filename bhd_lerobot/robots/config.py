@@ -1,15 +1,15 @@
 """What the configurations of all simulated robots have in common."""
 
 from abc import abstractmethod
-from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.body import MobileBase, Rates
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import OneOf, Whole, check_options
 from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
@@ -49,7 +49,7 @@ class BhdRobotConfig(RobotConfig):
     not_recorded: ClassVar[tuple[str, ...]] = ()
 
     fps: int
-    clock: str = "lockstep"
+    clock: Annotated[str, OneOf(CLOCKS)] = "lockstep"
     require_realtime: bool = False
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     plant: str = ""
@@ -57,16 +57,14 @@ class BhdRobotConfig(RobotConfig):
     jerk_limits: bool = True
     control_hz: int
     physics_hz: int
-    seed: int = 0
+    seed: Whole = 0
     camera: bool = False
     camera_width: int = 320
     camera_height: int = 240
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_choice("clock", CLOCKS)
-        if self.seed < 0:
-            raise ConfigError(f"robot.seed is {self.seed}; seeds start at 0.")
+        check_options(self, "robot.")
         _ = self.rates
         if self.plant == "ros2":
             self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
@@ -97,10 +95,6 @@ class BhdRobotConfig(RobotConfig):
             )
         if self.camera:
             raise ConfigError("robot.camera is of simulated robots; with robot.plant leave it false.")
-
-    def _check_choice(self, name: str, valid: Collection[str]) -> None:
-        if getattr(self, name) not in valid:
-            raise ConfigError(unknown_name(name, getattr(self, name), valid))
 
     @property
     def rates(self) -> Rates:
@@ -139,7 +133,7 @@ class MobileBaseConfig(BhdRobotConfig):
     fps: int = 10
     control_hz: int = 200
     physics_hz: int = 200
-    arena: str = "turtlebot3_world"
+    arena: Annotated[str, OneOf(ARENAS)] = "turtlebot3_world"
     beams: int = 360
     lidar_noise_std: float = 0.01
     odometry: bool = False
@@ -149,7 +143,6 @@ class MobileBaseConfig(BhdRobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_choice("arena", ARENAS)
         lidar = self.body().lidar
         if lidar is None:
             raise ConfigError(f"The body of {type(self).__name__} has no lidar, which a simulated base needs.")

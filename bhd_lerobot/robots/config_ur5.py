@@ -1,6 +1,7 @@
 """Configuration of the simulated UR5."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
@@ -8,11 +9,8 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.bodies.body import OBSTACLE, Arm, Capsule
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import OneOf, Positive, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
-
-CONTROLS = ("servo", "impedance")
-ACTION_SPACES = ("joint", "tool")
-SCENES = ("empty", "reach", "pick")
 
 
 @RobotConfig.register_subclass("ur5")
@@ -47,29 +45,23 @@ class UR5Config(BhdRobotConfig):
     fps: int = 25
     control_hz: int = 500
     physics_hz: int = 500
-    control: str = "servo"
-    action_space: str = "joint"
+    control: Annotated[str, OneOf(("servo", "impedance"))] = "servo"
+    action_space: Annotated[str, OneOf(("joint", "tool"))] = "joint"
     tool_pose: bool = False
-    scene: str = "empty"
-    max_force: float = 150.0
+    scene: Annotated[str, OneOf(("empty", "reach", "pick"))] = "empty"
+    max_force: Annotated[float, Range("(0, inf]")] = 150.0
     payload: float = 0.0
     held_clearance: bool = True
     obstacles: list[list[float]] = field(default_factory=list)
     wrench: bool = False
-    stale_after_s: float = 0.1
+    stale_after_s: Positive = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, valid in (("control", CONTROLS), ("action_space", ACTION_SPACES), ("scene", SCENES)):
-            self._check_choice(name, valid)
         if self.control == "impedance" and self.action_space != "tool":
             raise ConfigError(
                 f"robot.control is 'impedance' and robot.action_space is {self.action_space!r}; "
                 "an impedance is commanded by tool poses: use --robot.action_space=tool."
-            )
-        if not self.max_force > 0:
-            raise ConfigError(
-                f"robot.max_force is {self.max_force}; it must be positive [N]. With .inf there is no limit."
             )
         for number, values in enumerate(self.obstacles):
             if len(values) != 7 or not np.isfinite(values).all() or not values[6] > 0:
@@ -77,11 +69,6 @@ class UR5Config(BhdRobotConfig):
                     f"robot.obstacles has {values} as number {number}; an obstacle is 7 finite numbers [m]: x, y, z of "
                     "one end, x, y, z of the other, and the radius, which is positive."
                 )
-        if not 0 < self.stale_after_s < float("inf"):
-            raise ConfigError(
-                f"robot.stale_after_s is {self.stale_after_s}; it must be positive and finite. "
-                "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
-            )
         self.check_rates()
 
     def body(self) -> Arm:

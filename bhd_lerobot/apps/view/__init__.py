@@ -1,3 +1,3 @@
 """`bhd-data view`: a dataset in the browser."""
 
-__all__ = ["columns", "dataset", "download", "episode", "geometry", "groups", "guard", "marking", "packing", "server"]
+__all__ = ["dataset", "download", "episode", "geometry", "groups", "guard", "marking", "packing", "server"]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, Options, Positive
 from bhd_lerobot.realtime.loop import LoopLimits
 from bhd_lerobot.realtime.privileges import RealtimeSettings
 
@@ -10,7 +10,7 @@ CLOCKS = ("lockstep", "realtime")
 
 
 @dataclass(kw_only=True)
-class RealtimeConfig:
+class RealtimeConfig(Options, prefix="robot.realtime."):
     """How a robot runs with ``clock = "realtime"``; without effect on the lockstep clock.
 
     Attributes:
@@ -36,24 +36,16 @@ class RealtimeConfig:
     hold_cpu_latency: bool = True
     freeze_collector: bool = True
     affinity: list[int] = field(default_factory=list)
-    brain_timeout_s: float | None = None
-    recorder_timeout_s: float = 1.0
-    most_misses: int = 10
-    most_catch_up: int = 10
+    brain_timeout_s: Positive | None = None
+    recorder_timeout_s: Positive = 1.0
+    most_misses: Count = 10
+    most_catch_up: Count = 10
     plant_process: bool = False
-    plant_timeout_s: float = 0.02
-    buffer_s: float = 8.0
+    plant_timeout_s: Positive = 0.02
+    buffer_s: Positive = 8.0
 
     def __post_init__(self) -> None:
-        for name in ("brain_timeout_s", "recorder_timeout_s", "plant_timeout_s", "buffer_s"):
-            if (value := getattr(self, name)) is not None and not 0 < value < float("inf"):
-                raise ConfigError(
-                    f"robot.realtime.{name} is {value}; it must be positive and finite. "
-                    "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
-                )
-        for name in ("most_misses", "most_catch_up"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"robot.realtime.{name} is {getattr(self, name)}; it must be at least 1.")
+        super().__post_init__()
         self.privileges(False)
 
     def privileges(self, require: bool) -> RealtimeSettings:
