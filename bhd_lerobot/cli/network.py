@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from bhd_lerobot.cli.data.command import Commands, Run, add_command
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, Positive, check_option
 from bhd_lerobot.ros2.live.network import NetworkConfig
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.definitions import register_types
@@ -47,9 +47,8 @@ def node_of(options: argparse.Namespace) -> Node:
         ConfigError: an option cannot be.
         RealtimeError: the network cannot be used.
     """
-    for name in ("wait", "window", "seconds", "n"):
-        if (value := getattr(options, name, None)) is not None and not value > 0:
-            raise ConfigError(f"{'-' if len(name) == 1 else '--'}{name} is {value}; it must be positive.")
+    for option, kind in (("--wait", Positive), ("--window", Positive), ("--seconds", Positive), ("-n", Count)):
+        check_option(option, getattr(options, option.lstrip("-"), None), kind)
     network = NetworkConfig(options.domain, options.interface, list(options.peers), options.distro)
     node = Node("bhd_ros2", network)
     if getattr(options, "map", None) is not None:

@@ -140,7 +140,7 @@ def test_what_cannot_be_shown_is_named(robot: list[str], capsys: pytest.CaptureF
         (["echo", "/cmd", "--wait=1"], "Nobody publishes /cmd"),
         (["echo", "/scan", "--field=heder"], "Did you mean 'header'?"),
         (["echo", "/scan", "--field=header.stamp.sec.x"], "there is no 'x' in what has no fields"),
-        (["echo", "/scan", "-n", "0"], "-n is 0; it must be positive"),
+        (["echo", "/scan", "-n", "0"], "-n is 0; it must be at least 1"),
         (["hz", "/scan", "--window=-1"], "--window is -1.0; it must be positive"),
         (["list", "--distro=jazy"], "Did you mean 'jazzy'?"),
         (["list", "--interface=nothing0"], "The network interface 'nothing0' cannot be used"),

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,6 +17,7 @@ from bhd_lerobot.apps.doctor import checks
 from bhd_lerobot.apps.doctor.checks import Finding, Status
 from bhd_lerobot.apps.doctor.trials import TIMEOUT_S, Outcome, run_trials
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Range, check_option
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
 _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}
@@ -53,10 +54,8 @@ def robot_rates() -> dict[str, int]:
 
 def _check_options(rate: int, seconds: float) -> None:
     """Raise a `ConfigError` if a value is out of range, or there would be too few wake-ups for a 99th percentile."""
-    if not 10 <= rate <= 10_000:
-        raise ConfigError(f"--rate is {rate} Hz; it must be from 10 to 10000.")
-    if not 0 < seconds <= 600:
-        raise ConfigError(f"--seconds is {seconds:g}; it must be above 0 and at most 600.")
+    check_option("--rate", rate, Annotated[int, Range("[10, 10000]")])
+    check_option("--seconds", seconds, Annotated[float, Range("(0, 600]")])
     if rate * seconds < _LEAST_POINTS:
         raise ConfigError(
             f"{seconds:g} s at {rate} Hz are {rate * seconds:.0f} wake-ups; a 99th percentile needs "

@@ -19,6 +19,7 @@ from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
 from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.control.keys import KeySource, key_source
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.options.declared import Positive, check_option
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
 
@@ -186,8 +187,7 @@ def _page(block: LiveBlock, options: argparse.Namespace) -> Iterator[str]:
 def monitor(options: argparse.Namespace) -> int:
     """Watch a robot as the options ask; return the exit status."""
     console = Console(highlight=False)
-    if options.seconds is not None and not 0 < options.seconds < math.inf:
-        raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
+    check_option("--seconds", options.seconds, Positive)
     if options.in_3d and (options.once or (options.json and options.seconds is None)):
         raise ConfigError("--3d serves a page for as long as the robot is watched; leave --once and --json out.")
     with ExitStack() as opened:

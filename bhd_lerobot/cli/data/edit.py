@@ -10,6 +10,7 @@ from bhd_lerobot.datasets.edit.edits import EditReport, delete, keep, merge, spl
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import check_not_empty, dataset_info
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Whole, check_option
 
 
 def add_to(commands: Commands) -> None:
@@ -112,8 +113,7 @@ def parts_of(text: str, total: int, shuffle_seed: int | None = None) -> dict[str
         raise ConfigError(f"--parts={text} mixes shares and episodes, or has a share that is no number.") from None
     if not all(0 < share <= 1 for share in shares.values()) or sum(shares.values()) > 1 + 1e-9:
         raise ConfigError(f"The shares in --parts={text} must be above 0, and at most 1 together.")
-    if shuffle_seed is not None and shuffle_seed < 0:
-        raise ConfigError(f"--shuffle_seed is {shuffle_seed}; seeds start at 0.")
+    check_option("--shuffle_seed", shuffle_seed, Whole)
     order = list(range(total))
     if shuffle_seed is not None:
         random.Random(shuffle_seed).shuffle(order)

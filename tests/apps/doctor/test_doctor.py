@@ -459,8 +459,8 @@ def test_the_printed_report_has_findings_histogram_and_remedies(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--rate=5"], "--rate is 5 Hz; it must be from 10 to 10000."),
-        (["--seconds=0"], "--seconds is 0; it must be above 0 and at most 600."),
+        (["--rate=5"], "--rate is 5; it must be from 10 to 10000."),
+        (["--seconds=0"], "--seconds is 0.0; it must be above 0 and at most 600."),
         (["--seconds=nan"], "--seconds is nan"),
         (["--rate=100", "--seconds=5"], "5 s at 100 Hz are 500 wake-ups; a 99th percentile needs 1000: --seconds=10"),
     ],

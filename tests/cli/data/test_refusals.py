@@ -36,7 +36,7 @@ REFUSALS = [
     ("delete d --episodes 5-1", "runs backwards; write 1-5"),
     ("delete d --episodes 0-99999999999", "at most 1000000"),
     ("split d --parts a=1 --output x", "Write a=1.0 for the share, a=1-1 for the episode"),
-    ("split d --parts a=0.5 --shuffle_seed -1 --output x", "seeds start at 0"),
+    ("split d --parts a=0.5 --shuffle_seed -1 --output x", "--shuffle_seed is -1; it must be at least 0"),
     ("split d --parts a=0.7,b=0.7 --output x", "at most 1 together"),
     ("split d --parts a=0.01 --output x", "would have no episode"),
     ("split d --parts a,b --output x", "not one name and its part"),
