@@ -19,9 +19,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import BrainSummary, PairedSummary
 from bhd_lerobot.evaluation.statistics import Estimate
-from bhd_lerobot.rollout.plots import Trajectory, draw_scene
+from bhd_lerobot.rollout.plots import BAD, GOOD, Trajectory, draw_panel
 
-GOOD, BAD = "#0072B2", "#D55E00"
 _INK, _FAINT = "#1c2733", "#9aa5b1"
 # Colour and hatch of each way in which an episode ends.
 OUTCOMES: dict[str, tuple[str, str]] = {
@@ -55,55 +54,50 @@ _STYLE: Any = {
 def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
     """Return success rates and mean scores, or returns, with intervals, a row a brain; dashed: the baseline's."""
     name = "score" if "score" in brains[baseline].means else "reward"
-    columns = [
-        ("success rate", {label: one.success for label, one in brains.items()}, baseline, (-0.03, 1.03)),
-        (
-            f"mean {'score' if name == 'score' else 'return'}",
-            {label: one.means[name] for label, one in brains.items()},
-            baseline,
-            None,
-        ),
-    ]
-
-    def draw(figure: Figure) -> None:
-        for axes, (title, estimates, reference, limits) in zip(
-            np.atleast_1d(figure.subplots(1, 2, sharey=True)), columns, strict=True
-        ):
-            _draw_rows(axes, estimates, title, estimates[reference].value)
-            if limits:
-                axes.set_xlim(*limits)
-                axes.xaxis.set_major_formatter(lambda x, _: f"{100 * x:.0f} %")
-            else:
-                _include(axes, 0.0)
-
-    return _svg(draw, (10.0, 0.9 + 0.5 * len(brains)))
+    rates = {label: _scaled(one.success, 100) for label, one in brains.items()}
+    means = {label: one.means[name] for label, one in brains.items()}
+    what = f"mean {'score' if name == 'score' else 'return'}"
+    return _columns(
+        [
+            ("success rate [%]", rates, rates[baseline].value, (-3.0, 103.0)),
+            (what, means, means[baseline].value, (0.0,)),
+        ]
+    )
 
 
 def paired_forest(paired: Mapping[str, PairedSummary]) -> str:
     """Return differences from the baseline with their intervals, a row for each other brain; dashed: no difference."""
     points = {label: _scaled(one.success, 100) for label, one in paired.items()}
-    columns: list[tuple[str, dict[str, Estimate], float, tuple[float, ...]]] = [
-        ("success rate, difference [points]", points, 0.0, (-10.0, 10.0))
-    ]
+    columns: list[Column] = [("success rate, difference [points]", points, 0.0, (-10.0, 10.0))]
     if any(one.rewards for one in paired.values()):
         for name, title in (("reward", "return"), ("max_reward", "largest reward")):
-            columns.append(
-                (f"{title}, difference", {label: one.rewards[name] for label, one in paired.items()}, 0.0, (0.0,))
-            )
+            estimates = {label: one.rewards[name] for label, one in paired.items()}
+            columns.append((f"{title}, difference", estimates, 0.0, (0.0,)))
     else:
         columns += [
             ("mean score, difference", {label: one.score for label, one in paired.items()}, 0.0, (0.0,)),
             ("mean score, ratio", {label: one.ratio for label, one in paired.items()}, 1.0, (0.0, 1.2)),
         ]
+    return _columns(columns)
+
+
+Column = tuple[str, dict[str, Estimate], float, tuple[float, ...]]
+"""A title, estimates by brain, the number that is dashed, and numbers that the axis holds, so that a small difference
+does not look like a large one."""
+
+
+def _columns(columns: Sequence[Column]) -> str:
+    """Return columns of estimates: a mark, its interval, and the numbers as text, in a row for each brain."""
 
     def draw(figure: Figure) -> None:
         for axes, (title, estimates, reference, always) in zip(
-            figure.subplots(1, 3, sharey=True), columns, strict=True
+            figure.subplots(1, len(columns), sharey=True), columns, strict=True
         ):
             _draw_rows(axes, estimates, title, reference)
-            _include(axes, *always)
+            low, high = axes.get_xlim()
+            axes.set_xlim(min(low, *always), max(high, *always))
 
-    return _svg(draw, (10.0, 0.9 + 0.5 * len(paired)))
+    return _svg(draw, (10.0, 0.9 + 0.5 * len(columns[0][1])))
 
 
 def outcome_bars(brains: Mapping[str, BrainSummary]) -> str:
@@ -163,7 +157,7 @@ def trajectory_grid(trajectories: Mapping[str, Mapping[int, Trajectory]]) -> str
         for column, number in enumerate(chosen):
             axes = grid[row][column]
             if number in ran:
-                _draw_trajectory(axes, ran[number])
+                draw_panel(axes, ran[number])
             else:
                 axes.set_axis_off()
         grid[row][0].set_ylabel(label, fontsize=10)
@@ -183,18 +177,7 @@ def notable_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown
     return sorted([*ranked, *(n for n in numbers if n not in ranked)][:shown])
 
 
-def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:
-    draw_scene(axes, trajectory.scene)
-    colour, style = (GOOD, "-") if trajectory.success else (BAD, (0, (3, 1)))
-    axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=colour, linestyle=style, linewidth=1.2)
-    axes.plot(*trajectory.xy[0], marker="o", color=colour, markersize=3.5)
-    if not trajectory.success:
-        axes.plot(*trajectory.xy[-1], marker="X", color=BAD, markersize=8, markeredgecolor="white")
-    axes.set_title(trajectory.title, fontsize=8, color=_INK)
-
-
 def _draw_rows(axes: Axes, estimates: Mapping[str, Estimate], title: str, reference: float) -> None:
-    """Draw a row for each estimate: a mark, its interval, and the numbers as text."""
     if math.isfinite(reference):
         axes.axvline(reference, color=_FAINT, linestyle=(0, (4, 3)), linewidth=1.2, zorder=0)
     for row, one in enumerate(estimates.values()):
@@ -231,12 +214,6 @@ def _draw_spread(axes: Axes, row: int, values: np.ndarray, success: Sequence[boo
         picked = shown[mask[shown]]
         edge = {"linewidths": 1.0} if marker == "x" else {"linewidths": 0}
         axes.scatter(values[picked], height[picked], s=13, color=colour, marker=marker, alpha=0.55, zorder=3, **edge)
-
-
-def _include(axes: Axes, *values: float) -> None:
-    """Widen an axis to hold some values, so that a small difference does not look like a large one."""
-    low, high = axes.get_xlim()
-    axes.set_xlim(min(low, *values), max(high, *values))
 
 
 def _scaled(one: Estimate, factor: float) -> Estimate:

@@ -20,7 +20,8 @@ from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 SHOWN = 40  # episodes of a run that are drawn: a panel takes 0.1 s, and more are no longer looked at one by one
 
 _FREE, _WALL = "#f4f1ea", "#8a8478"
-_COLOURS = {True: "#1b7f4d", False: "#c0392b", None: "#3b4a5a"}
+GOOD, BAD = "#0072B2", "#D55E00"  # of the palette of Okabe and Ito, for colour-blind people
+_COLOURS = {True: GOOD, False: BAD, None: "#3b4a5a"}
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: s
         if trajectory is None:
             axes.set_axis_off()
         else:
-            _draw_panel(axes, trajectory)
+            draw_panel(axes, trajectory)
     figure.supxlabel(f"circle: start, square: end{', cross: failure' * has_outcomes(trajectories)}", fontsize=7.5)
     figure.savefig(path, dpi=110)
 
@@ -92,12 +93,14 @@ def _grid(count: int) -> tuple[int, int]:
     return min(columns, max(count, 1)), max(1, -(-count // columns))
 
 
-def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
+def draw_panel(axes: Axes, trajectory: Trajectory) -> None:
+    """Draw an episode: a line, dashed after a failure, from a circle to a square, or to the cross of a failure."""
     draw_scene(axes, trajectory.scene)
-    color = _COLOURS[trajectory.success]
-    axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
+    color, is_failure = _COLOURS[trajectory.success], trajectory.success is False
+    style: Any = (0, (3, 1)) if is_failure else "-"
+    axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linestyle=style, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
-    marker, size, width = ("s", 5, 1.2) if trajectory.success is not False else ("x", 7, 2.0)
+    marker, size, width = ("x", 7, 2.0) if is_failure else ("s", 5, 1.2)
     axes.plot(*trajectory.xy[-1], color=color, markerfacecolor="none", markeredgewidth=width, marker=marker, ms=size)
     title = trajectory.title
     # The font has no Chinese characters.
@@ -200,19 +203,19 @@ def draw_divergence(
     left, rows = above.subplots(), differences.subplots(len(curves), 1, squeeze=False)[:, 0]
     draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
-    left.plot(replayed[:, 0], replayed[:, 1], color=_COLOURS[False], linewidth=1.1, label="replayed")
+    left.plot(replayed[:, 0], replayed[:, 1], color=BAD, linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False, fontsize=9)
     differences.supylabel("largest difference between replay and recording", fontsize=9)
     for row, (label, values) in enumerate(curves.items()):
         axes = rows[row]
-        axes.plot(time, values, color=_COLOURS[False], linewidth=1.3)
+        axes.plot(time, values, color=BAD, linewidth=1.3)
         axes.set_title(label, fontsize=9, loc="left")
         axes.grid(alpha=0.3)
         axes.tick_params(labelbottom=row == len(curves) - 1)
         if not np.any(values):
             axes.set_yticks([0.0])
-            where = {"transform": axes.transAxes, "ha": "center", "color": _COLOURS[True]}
+            where = {"transform": axes.transAxes, "ha": "center", "color": GOOD}
             axes.text(0.5, 0.7, "identical, to the last bit", **where)
     axes.set_xlabel("time [s]")
     figure.savefig(path, dpi=110)
