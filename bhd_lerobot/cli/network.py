@@ -41,12 +41,7 @@ def add_map(command: argparse.ArgumentParser) -> None:
 
 
 def node_of(options: argparse.Namespace) -> Node:
-    """Return the node of a command; register the types of its mapping.
-
-    Raises:
-        ConfigError: an option cannot be.
-        RealtimeError: the network cannot be used.
-    """
+    """Return the node of a command; register the types of its mapping."""
     for option, kind in (("--wait", Positive), ("--window", Positive), ("--seconds", Positive), ("-n", Count)):
         check_option(option, getattr(options, option.lstrip("-"), None), kind)
     network = NetworkConfig(options.domain, options.interface, list(options.peers), options.distro)

@@ -27,12 +27,7 @@ INTERRUPTED = 128 + signal.SIGINT
 
 
 def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[], str] = "Stopped.") -> int:
-    """Run a program, whose exit status may be None for 0; return the status.
-
-    An error of this package, or a missing permission, is printed without a traceback and gives status 2. Ctrl-C prints
-    `interrupted` and gives 130, and the status is that of other programs where nothing reads what is printed, as of
-    ``| head -1``.
-    """
+    """Run a program; return its status: 2 after an error of ours, without a traceback, and 130 after Ctrl-C."""
     # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
@@ -71,11 +66,9 @@ def _is_unread() -> bool:
 
 @dataclass(frozen=True)
 class Program:
-    """What a command does with its configuration.
+    """What a command does with its configuration; `main` returns the exit status, where None is 0.
 
     Attributes:
-        config_class: a dataclass.
-        main: gets the configuration, and returns the exit status; None is 0.
         read: what makes the configuration of a command line; `parse` if None.
         interrupted: what is printed after Ctrl-C.
     """
@@ -89,16 +82,7 @@ class Program:
 def run(
     program: "Program | Callable[[CommandLine], Program]", arguments: Sequence[str] | None = None, command: str = ""
 ) -> int:
-    """Run a program, or that which a command line chooses.
-
-    Args:
-        program: it, or what chooses it.
-        arguments: by default those of this process.
-        command: whose configurations come with this package: `record`, `train` or `eval`.
-
-    Returns:
-        The exit status; 0 after the help.
-    """
+    """Run a program, or that which a command line chooses."""
     from bhd_lerobot.options.help import help_of
     from bhd_lerobot.options.parse import CommandLine, parse, read_line
     from bhd_lerobot.options.plugins import load_named, load_plugins

@@ -90,11 +90,7 @@ class Options:
 
 
 def check_options(config: Any, prefix: str | None = None) -> None:
-    """Check the fields of a dataclass.
-
-    Raises:
-        ConfigError: the message names the option, its value and the valid ones.
-    """
+    """Check the fields of a dataclass."""
     before = getattr(config, "option_prefix", "") if prefix is None else prefix
     for name, kind in declared_types(config.__class__).items():
         check_option(f"{before}{name}", getattr(config, name), kind)

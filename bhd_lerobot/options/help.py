@@ -57,10 +57,7 @@ def summary_of(config_class: type) -> str:
 
 
 def meanings_of(config_class: type) -> dict[str, str]:
-    """Return what each field means, by name, as far as the class or one of its bases says so.
-
-    This package describes fields in docstrings, LeRobot in docstrings or in comments above or beside the field.
-    """
+    """Return what each field means, by name, as far as the class or one of its bases says so."""
     result = dict(_OF_LEROBOT)
     for one in reversed(config_class.__mro__):
         if not dataclasses.is_dataclass(one):
@@ -115,13 +112,7 @@ def type_word(kind: Any) -> str:
 
 
 def help_of(config_class: type, chosen: Mapping[str, str], shipped: Sequence[str] = ()) -> str:
-    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option.
-
-    Args:
-        config_class: of the program.
-        chosen: types, by the options that choose them.
-        shipped: configurations of the program that come with this package.
-    """
+    """Return the help of a program: its options in groups, but only those of the types that were chosen, by option."""
     width = max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
     lines = textwrap.wrap(summary_of(config_class), width)
     lines += ["", "Options are written --key=value, or nested in a YAML file: --config_path=FILE.", ""]

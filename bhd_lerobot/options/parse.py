@@ -1,8 +1,7 @@
 """From a YAML file and command-line overrides to a checked configuration.
 
 LeRobot's own parser stops at the first unknown key with a list of every option there is. Here the message names the
-key, the nearest one that exists, and the valid ones on that level. Both read the same files: `--config_path=FILE` and
-`--a.b=value`, with `type` choosing among registered classes.
+key, the nearest one that exists, and the valid ones on that level.
 """
 
 import copy
@@ -49,7 +48,7 @@ class CommandLine:
 
     Attributes:
         options: values, by the full names of their options; without `config_path`.
-        path: what `config_path` names: a configuration file, or the folder of a run, which holds one.
+        path: what `config_path` names: a file, or the folder of a run, which holds one.
     """
 
     options: dict[str, Any]
@@ -81,7 +80,6 @@ def read_line(arguments: Sequence[str] | CommandLine, command: str = "") -> Comm
     """Return what a command line says: ``--config_path=FILE``, ``--a.b=value`` or ``--a.b value``; values are YAML.
 
     Args:
-        arguments: of the command; a line that was read before is returned as it is.
         command: whose configurations `--config_path` can name, too; see `shipped`.
     """
     if isinstance(arguments, CommandLine):
@@ -118,7 +116,6 @@ def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -
     """Return the configuration that plain values, nested, stand for.
 
     Args:
-        config_class: a dataclass.
         values: by the names of its fields; values with an exponent and entries that are nothing are replaced.
         prefix: what stands before the fields' names in messages, ``"robot."``, for example.
     """
@@ -313,12 +310,10 @@ def _allows_none(kind: Any) -> bool:
 
 
 def choices_of(kind: Any, *, of_lerobot: bool = False) -> dict[str, type]:
-    """Return the registered classes of a choice type, or of one that may be nothing; empty if it is none.
+    """Return the registered classes of a choice type, or of one that may be None; empty if it is none.
 
     Args:
-        kind: the type.
-        of_lerobot: import what LeRobot itself has to choose from, robots, teleoperators or cameras, which takes a
-            moment; of a type without any choice that is always done.
+        of_lerobot: import what LeRobot itself has to choose from; done for a type without choices.
     """
     kind = _without_none(kind)
     if not (isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry)):

@@ -55,13 +55,10 @@ def import_plugins() -> Iterator[tuple[str, str]]:
 
 
 def load_lerobot(module: str) -> None:
-    """Import all of LeRobot's robots, teleoperators or cameras, which register themselves.
-
-    One whose driver is not installed is left out: it says what it needs when it is made.
+    """Import all robots, teleoperators or cameras of LeRobot, which register themselves; not those without a driver.
 
     Args:
-        module: `lerobot.robots`, `lerobot.teleoperators`, `lerobot.cameras`, or a module in one of them; nothing is
-            done for others.
+        module: `lerobot.robots`, `lerobot.teleoperators`, `lerobot.cameras` or a module in one; others do nothing.
     """
     package = ".".join(module.split(".")[:2])
     if package not in _CHOICES:

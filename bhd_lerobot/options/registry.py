@@ -12,7 +12,7 @@ class Registry[T](Mapping[str, T]):
 
     Args:
         word: what one of them is called in messages.
-        own: those of this package. A text is where one is, ``"module:Name"``, for what takes long to import.
+        own: those of this package; a text, ``"module:Name"``, for what takes long to import.
         choices: draccus's registry of their configurations, if they have any.
     """
 

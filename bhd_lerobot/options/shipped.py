@@ -11,20 +11,12 @@ if not _FOLDER.is_dir():  # a checkout
 
 
 def shipped_names(command: str) -> list[str]:
-    """Return the names of a command's configurations.
-
-    Args:
-        command: `record`, `train` or `eval`.
-    """
+    """Return the names of the configurations of a command: `record`, `train` or `eval`."""
     return sorted(path.stem for path in (_FOLDER / command).glob("*.yaml"))
 
 
 def found_config(path: Path, command: str) -> Path:
-    """Return the file or folder that `--config_path` names: what lies there, or a configuration of this package.
-
-    Raises:
-        ConfigError: it is a name, without folder and suffix, of neither.
-    """
+    """Return the file or folder that `--config_path` names: what lies there, or a configuration of this package."""
     if path.exists() or path.name != str(path) or path.suffix not in ("", ".yaml"):
         return path
     if path.stem in (names := shipped_names(command)):

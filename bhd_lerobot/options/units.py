@@ -16,11 +16,7 @@ def other_units(
 ) -> Iterator[tuple[str, str, str]]:
     """Yield name and both values of each option that gives the numbers of two devices another meaning.
 
-    Of robots of this package there is none: their numbers are in SI units. What only one of them has is not compared.
-
-    Args:
-        recorded, present: options of the robots, or of a robot and its leader, as plain values.
-        units_only: compare only what says the units.
+    What only one of them has is not compared, nor robots of this package, whose numbers are in SI units.
     """
     if "clock" in recorded or "clock" in present:
         return

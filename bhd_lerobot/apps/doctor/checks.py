@@ -1,7 +1,4 @@
-"""The doctor's checks, each of one thing, and the table of everything that they can find to be wrong.
-
-What a check reads can be given to it, for tests.
-"""
+"""The doctor's checks, each of one thing, and the table of everything that they can find to be wrong."""
 
 import os
 import platform
@@ -275,10 +272,7 @@ def check_disk(
 
 
 def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) -> list[Finding]:
-    """Compare a measurement with what robots need [Hz]: its latest wake-up, because one is enough to stop a robot.
-
-    Its plant waits for a command until the time-out [s].
-    """
+    """Compare the latest wake-up, as one is enough to stop a robot, with rates [Hz] and the time-out [s]."""
     if outcome.kind != "value":
         return [wrong("latency.error", _error(outcome), error=_error(outcome))]
     worst = outcome.value["max"]

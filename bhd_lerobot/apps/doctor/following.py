@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 
 
 def following_latency(times: Array, commands: Array, observed: Array) -> float | None:
-    """Return after how long what is observed follows commands [s]; None if they do not show it.
-
-    Args:
-        times: of the frames [s], shape (n,).
-        commands: applied from each of these times on, shape (n,).
-        observed: at each of these times, shape (n,).
-    """
+    """Return after how long what is observed follows commands, arrays of shape (n,) [s]; None if it is not seen."""
     if len(times) < 3 or np.ptp(commands) < _LEAST_CHANGE or np.ptp(observed) < _LEAST_CHANGE:
         return None
     lags = np.arange(0.0, _MOST_S + _STEP_S, _STEP_S)
@@ -36,11 +30,7 @@ def following_latency(times: Array, commands: Array, observed: Array) -> float |
 
 
 def describe_following(root: Path) -> str:
-    """Return how late the robot of a dataset follows its commands, and which option that is, as text.
-
-    Raises:
-        ConfigError: the dataset does not show it.
-    """
+    """Return how late the robot of a dataset follows its commands, and which option that is, as text."""
     state = load_state(root)
     features = state.info["features"]
     vectors = {

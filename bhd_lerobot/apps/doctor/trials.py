@@ -113,11 +113,7 @@ def encode() -> dict[str, Any]:
 
 
 def render() -> dict[str, Any]:
-    """Render one image of a simulation; return the driver's name and how far apart its brightest and darkest are.
-
-    Raises:
-        RenderingError: no OpenGL works here.
-    """
+    """Render one image of a simulation; return the driver's name and how far apart its brightest and darkest are."""
     from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
     from bhd_lerobot.sim.camera import Camera
     from bhd_lerobot.sim.world import World
@@ -131,10 +127,7 @@ def render() -> dict[str, Any]:
 
 
 def list_plugins() -> dict[str, list[str]]:
-    """Return the types of robots and teleoperators that LeRobot knows after it has searched for plug-ins.
-
-    Also what each plug-in of other packages has registered, and which could not be imported, in sentences.
-    """
+    """Return the types of robots and teleoperators that LeRobot knows after it has searched for plug-ins."""
     from lerobot.cameras.configs import CameraConfig
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig

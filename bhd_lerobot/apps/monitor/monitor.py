@@ -46,14 +46,7 @@ def running() -> list[LiveBlock]:
 
 
 def find(name: str | None) -> LiveBlock:
-    """Return the block of a running robot.
-
-    Args:
-        name: the robot's id; the only one that runs if None.
-
-    Raises:
-        RealtimeError: there is none, or several; the message lists those that run.
-    """
+    """Return the block of the robot with this id, or of the only one that runs if None; or raise a `RealtimeError`."""
     blocks = running()
     chosen = [block for block in blocks if name in (None, block.name)]
     for block in blocks:
@@ -73,13 +66,7 @@ def find(name: str | None) -> LiveBlock:
 class Keys:
     """Keys of a terminal, on a thread of their own: a stop does not wait for an image that is being drawn.
 
-    Args:
-        estop: what an emergency stop does.
-        source: the keys of a terminal, or None if there is none.
-
-    Attributes:
-        quit: set when the user wants to leave.
-        pressed: how often the emergency stop was pressed.
+    `quit` is set when the user wants to leave; `pressed` counts the emergency stops.
     """
 
     def __init__(self, estop: Callable[[], None], source: KeySource | None) -> None:
@@ -117,15 +104,7 @@ class Keys:
 def watch(
     sampler: Sampler, show: Callable[[MonitorState], None], keys: Keys, period_s: float, end: float
 ) -> str | None:
-    """Show states until the user leaves, time is up, or the robot ends; return as text how it ended, or None.
-
-    Args:
-        sampler: where states come from.
-        show: shows a state.
-        keys: when the user leaves.
-        period_s: between two states [s].
-        end: when time is up, monotonic [s].
-    """
+    """Show states until the user leaves, the time [s] is up, or the robot ends; return as text how it did."""
     while True:
         ended = sampler.end()
         show(sampler.sample())

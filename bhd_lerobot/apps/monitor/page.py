@@ -24,11 +24,7 @@ _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
 
 
 class LivePage:
-    """What the page is sent of a running robot: an episode of one frame, which is the newest.
-
-    Args:
-        block: the robot's, from `LiveBlock.watch`.
-    """
+    """What the page is sent of a running robot: an episode of one frame, which is the newest."""
 
     def __init__(self, block: LiveBlock) -> None:
         self._block = block
@@ -39,8 +35,7 @@ class LivePage:
         """Return how many scenes there have been, and the newest state as plain values.
 
         Args:
-            seen: how many there had been in the message before, or -1: what changes with the scene only is left out
-                where it did not.
+            seen: how many there had been in the message before, or -1: a scene that did not change is left out.
         """
         block, words = self._block, self._block.words
         count, scene = block.scene
@@ -88,11 +83,7 @@ async def _stream(request: web.Request, live: LivePage, end: asyncio.Event) -> w
 
 @contextmanager
 def served(block: LiveBlock, port: int) -> Iterator[str]:
-    """Serve the page of a running robot, on a thread of its own; yield its address.
-
-    Raises:
-        ConfigError: the port cannot be had.
-    """
+    """Serve the page of a running robot, on a thread of its own; yield its address."""
     started: Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
     async def work() -> None:

@@ -110,12 +110,7 @@ def _finite(value: Any) -> Any:
 
 
 class Sampler:
-    """Reads the block of a running robot; changes nothing in it.
-
-    Args:
-        block: the block, from `LiveBlock.watch`.
-        clock: monotonic time [ns], the robot's.
-    """
+    """Reads the block of a running robot, by the robot's monotonic clock [ns]; changes nothing in it."""
 
     def __init__(self, block: LiveBlock, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._block, self._clock = block, clock

@@ -23,14 +23,7 @@ _NOTHING = "–"
 
 
 def render(state: MonitorState, *, height: int | None = None, message: str = "", keys: str = KEYS) -> Group:
-    """Return the image of a state.
-
-    Args:
-        state: what is shown.
-        height: lines that there are; all that is needed if None.
-        message: shown instead of the keys.
-        keys: the last line; there is none if empty.
-    """
+    """Return the image of a state in at most `height` lines, the last of which is the message or the keys."""
     last = [Text((message or keys)[:WIDTH], "bold yellow" if message else "dim")] if message or keys else []
     rows = list(_rows(state))
     width = min(24, max(len(label) for label, _ in rows))

@@ -44,13 +44,8 @@ class _Content:
 class ViewedDataset:
     """The dataset behind the page. Every method may be called from any thread.
 
-    Args:
-        root: where it lies.
-
     Raises:
-        DatasetError: there is no dataset.
-        DatasetLockedError: it is being recorded or repaired.
-        DatasetCorruptError: a file is missing or cannot be read.
+        DatasetError: there is no dataset, it is being written, or a file is missing or cannot be read.
     """
 
     def __init__(self, root: Path) -> None:
@@ -83,11 +78,7 @@ class ViewedDataset:
         return self._content.state
 
     def reload(self) -> None:
-        """Read the dataset again if its files have changed.
-
-        Raises:
-            DatasetError: it is gone, is being written, or cannot be read; what was read before stays.
-        """
+        """Read the dataset again if its files have changed; if that fails, what was read before stays."""
         with self._lock:
             if stamp_of(self.root) != self._content.stamp:
                 self._content = self._read()
@@ -105,12 +96,7 @@ class ViewedDataset:
         return self._content.summary
 
     def packed(self, index: int) -> bytes:
-        """Return an episode as `packing` makes bytes of it.
-
-        Raises:
-            DatasetError: there is no such episode, or the dataset has changed on disk.
-            DatasetCorruptError: its file cannot be read.
-        """
+        """Return an episode as `packing` makes bytes of it; raise a `DatasetError` if it cannot be read as it was."""
         content = self._content
         key = (content.stamp, index)
         with self._lock:  # one reader at a time: two processors are not made faster by ten
@@ -126,12 +112,7 @@ class ViewedDataset:
             return packed
 
     def mark(self, index: int, wanted: Any) -> None:
-        """Mark an episode, and read the dataset again; see `mark_episode`.
-
-        Raises:
-            ConfigError: what is wanted is no mark.
-            DatasetError: there is no such episode, or the dataset cannot be changed; it is as it was.
-        """
+        """Mark an episode, and read the dataset again; see `mark_episode`."""
         with self._lock:
             self._check_unchanged()
             mark_episode(self.root, index, wanted)
@@ -150,13 +131,7 @@ class ViewedDataset:
         return path if path.is_file() else None
 
     def download(self, index: int, key: str | None) -> bytes | None:
-        """Return an episode's numbers as CSV, or a camera's video of it as MP4; None if there is no such video.
-
-        Raises:
-            DatasetError: there is no such episode, or the dataset has changed on disk.
-            DatasetCorruptError: its file cannot be read.
-            UnsupportedDatasetError: the video cannot be cut without encoding it again.
-        """
+        """Return an episode's numbers as CSV, or a camera's video of it as MP4; None if there is no such video."""
         state = self.state
         row = _row(state, index)
         with self._lock:
@@ -170,12 +145,7 @@ class ViewedDataset:
             return to_video(path, span, row["length"], state.info["fps"])
 
     def image(self, index: int, key: str, frame: int) -> bytes | None:
-        """Return the image of a camera whose images lie in the data files, or None if there is no such image.
-
-        Raises:
-            DatasetError: there is no such episode, or the dataset has changed on disk.
-            DatasetCorruptError: its file cannot be read.
-        """
+        """Return the image of a camera whose images lie in the data files, or None if there is no such image."""
         feature = self.state.info["features"].get(key)
         row = _row(self.state, index)
         if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:

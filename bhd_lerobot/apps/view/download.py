@@ -14,12 +14,7 @@ from bhd_lerobot.datasets.format.video_splice import splice
 
 
 def to_csv(state: DatasetState, table: pa.Table) -> bytes:
-    """Return an episode as CSV: a line a frame, a column for each number, named ``feature.name``, and for each text.
-
-    Args:
-        state: the dataset.
-        table: the episode's columns.
-    """
+    """Return an episode as CSV: a line a frame, a column for each number, named ``feature.name``, and for each text."""
     fps = state.info["fps"]
     columns: dict[str, pa.Array | pa.ChunkedArray] = {
         "frame": pa.array(range(len(table))),
@@ -39,13 +34,7 @@ def to_csv(state: DatasetState, table: pa.Table) -> bytes:
 
 
 def to_video(path: Path, span: tuple[float, float], length: int, fps: float) -> bytes:
-    """Return an episode's part of a video as MP4, without encoding it again.
-
-    Args:
-        path: the file, which holds the videos of many episodes.
-        span: where the episode begins and ends in it [s].
-        length: the episode's frames.
-        fps: frames per second.
+    """Return an episode's part of a video, from begin to end [s], as MP4, without encoding it again.
 
     Raises:
         DatasetCorruptError: the video cannot be read, or ends too early.

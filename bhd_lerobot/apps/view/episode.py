@@ -33,13 +33,7 @@ _HIDDEN = (
 
 
 def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
-    """Return an episode's description and arrays, packed.
-
-    Args:
-        state: the dataset.
-        row: the episode.
-        table: its columns.
-    """
+    """Return an episode's description and arrays, packed."""
     features = state.info["features"]
     columns = {key: values for key in table.column_names if (values := numbers(table[key], len(table))) is not None}
     widths = {key: values.shape[1] for key, values in columns.items()}

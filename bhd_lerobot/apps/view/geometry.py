@@ -43,11 +43,6 @@ def views_of(
     Arrays of a base: ``base`` (frames, 3), x, y [m] and yaw [rad] in the world. Of an arm, in the base frame:
     ``capsules`` (frames, capsules, 6), the two ends [m] of each; ``tool`` (frames, 3) [m]; and ``objects``
     (frames, objects, 7), position [m] and unit quaternion w, x, y, z, NaN where there is none.
-
-    Args:
-        robot: the robot's type.
-        features: the dataset's features.
-        columns: an episode's numeric columns, each of shape (frames, numbers).
     """
     body = body_of(robot)
     observed = columns.get(keys.OBSERVATION_STATE)

@@ -72,13 +72,8 @@ def unit_of(name: str, robot: str | None) -> str:
 def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str | None) -> list[dict[str, Any]]:
     """Return what is plotted: sections with a title, each a list of plots, each a list of lines.
 
-    A line has a label and states which number of which column it is; ``applied`` marks the command that was carried out
-    beside the requested one.
-
-    Args:
-        features: the dataset's features.
-        widths: how many numbers a frame of each numeric column has.
-        robot: the robot's type.
+    A line has a label and the number of its column; ``applied`` marks the command that was carried out beside the
+    requested one.
     """
     result = []
 

@@ -33,11 +33,7 @@ def new_token() -> str:
 
 
 def guard(token: str) -> Middleware:
-    """Return the middleware that refuses strangers.
-
-    Args:
-        token: what a request that changes something must bring in `TOKEN_HEADER`.
-    """
+    """Return the middleware that refuses strangers, and changes without the token in `TOKEN_HEADER`."""
 
     @web.middleware
     async def refuse_strangers(

@@ -13,17 +13,11 @@ _FIELDS = {"outcome": str, "intervention": list, "clear_interventions": bool, "n
 
 
 def mark_episode(root: Path, index: int, wanted: Any) -> None:
-    """Mark an episode as the page wants it, with `bhd_lerobot.datasets.edit.mark.mark`.
+    """Mark an episode as the page wants it.
 
     Args:
-        root: the dataset.
-        index: the episode.
         wanted: any of ``outcome``, a name; ``intervention``, first and last frame; ``clear_interventions``, true or
-            false; ``note``, text.
-
-    Raises:
-        ConfigError: it is something else.
-        DatasetError: the dataset cannot be changed; it is as it was.
+            false; ``note``, text. Else a `ConfigError` is raised.
     """
     if not isinstance(wanted, Mapping):
         raise ConfigError(f"A mark is an object with some of {', '.join(_FIELDS)}; got {wanted!r}.")

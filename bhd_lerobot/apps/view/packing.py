@@ -23,8 +23,7 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> bytes:
 
     Args:
         header: plain values, without a key ``arrays``. Numbers that are not finite become null.
-        arrays: by name, each of any shape. Booleans become uint8, and whole numbers int32, or float64 if they are too
-            large for that.
+        arrays: Booleans become uint8, and whole numbers int32, or float64 if they are too large for that.
     """
     described: dict[str, Any] = {}
     body: list[bytes] = []
@@ -42,11 +41,7 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> bytes:
 
 
 def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Return the header and the arrays that `pack` made bytes of; what the page does, for tests and other clients.
-
-    Raises:
-        ValueError: these are not such bytes.
-    """
+    """Return header and arrays of what `pack` made, or raise a ValueError; as the page does, for tests."""
     start = len(MAGIC) + 4
     if content[: len(MAGIC)] != MAGIC:
         raise ValueError(f"The content begins with {content[:4]!r}, not with {MAGIC!r}.")

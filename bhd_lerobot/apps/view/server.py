@@ -58,14 +58,7 @@ def application(dataset: ViewedDataset) -> web.Application:
 
 @asynccontextmanager
 async def listening(app: web.Application, port: int) -> AsyncIterator[str]:
-    """Serve an application on this machine alone; yield its address.
-
-    Args:
-        port: 0 for any free one.
-
-    Raises:
-        ConfigError: the port cannot be had.
-    """
+    """Serve an application on this machine alone, on any free port if 0; yield its address."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port is {port}; it must be between 0 and 65535. 0 takes any that is free.")
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
@@ -87,12 +80,7 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
     """Serve the page of a dataset until SIGINT or SIGTERM; return which it was.
 
     Args:
-        dataset: what is shown.
-        port: 0 for any free one.
         ready: is called with the page's address as soon as it can be opened.
-
-    Raises:
-        ConfigError: the port cannot be had.
     """
     loop = asyncio.get_running_loop()
     stop: asyncio.Future[signal.Signals] = loop.create_future()
