@@ -9,7 +9,8 @@ from bhd_lerobot.bodies.arenas import Arena as Arena
 from bhd_lerobot.bodies.arenas import make_arena as make_arena
 from bhd_lerobot.bodies.arenas import register_arena as register_arena
 from bhd_lerobot.bodies.body import Arm as Arm
-from bhd_lerobot.bodies.body import MobileBase as MobileBase
+from bhd_lerobot.bodies.body import Body as Body
+from bhd_lerobot.bodies.body import Drive as Drive
 from bhd_lerobot.bodies.body import Shape as Shape
 from bhd_lerobot.bodies.differential_base import differential_base as differential_base
 from bhd_lerobot.bodies.tabletop import TableObject as TableObject

@@ -5,7 +5,9 @@ it from a `Body`, so that a simulated and a real robot are limited by the same f
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, reduce
+from operator import add
 from typing import Any, Literal
 
 import numpy as np
@@ -60,20 +62,26 @@ class Rates:
         return self.control_hz // self.fps
 
 
-@dataclass(frozen=True)
-class CommandLimits:
-    """Limits of a velocity command, one value for each command dimension.
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits of commands, one value for each command dimension, which is a velocity or a position.
 
     Attributes:
         names: the command dimensions, in the order of the action features.
-        velocity: largest magnitude [m/s or rad/s].
-        acceleration: largest change per second in normal motion [m/s^2 or rad/s^2].
-        stop_deceleration: largest change per second when the robot has to stop, on an emergency stop for example
+        velocity: largest magnitude of a velocity, or speed of a position [m/s or rad/s].
+        acceleration: largest change of it per second in normal motion [m/s^2 or rad/s^2].
+        stop_deceleration: largest change of it per second when the robot has to stop, on an emergency stop for example
             [m/s^2 or rad/s^2].
-        command_timeout_s: age at which the last command is no longer trusted and the robot ramps to zero [s].
+        command_timeout_s: age at which the last command is no longer trusted and the robot stops [s].
         jerk: largest change of the acceleration in normal motion, per second [m/s^3 or rad/s^3]; if left out, what
             takes the acceleration from nothing to its limit in a seventh of a second: with more a TurtleBot3 rocks on
             its caster, and its true speed goes more than 5 % beyond what it is commanded.
+        lower: smallest position [rad, or m for a gripper]; infinite for a velocity, as are all that follow.
+        upper: largest position [rad or m].
+        stop_jerk: largest change of the acceleration when a position has to stop at once [rad/s^3 or m/s^3].
+        effort: largest torque or force of a position's servo [N m or N].
+        setpoint_jerk: largest change of the acceleration while positions are followed [rad/s^3 or m/s^3]; 20 times
+            `jerk` if left out. A smaller one follows a stream later and overshoots more where it ends.
     """
 
     names: tuple[str, ...]
@@ -82,26 +90,70 @@ class CommandLimits:
     stop_deceleration: tuple[float, ...]
     command_timeout_s: float
     jerk: tuple[float, ...] = ()
+    lower: tuple[float, ...] = ()
+    upper: tuple[float, ...] = ()
+    stop_jerk: tuple[float, ...] = ()
+    effort: tuple[float, ...] = ()
+    setpoint_jerk: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.jerk:
-            object.__setattr__(self, "jerk", tuple(7.0 * value for value in self.acceleration))
-        for name in ("velocity", "acceleration", "stop_deceleration", "jerk"):
-            values = getattr(self, name)
-            if len(values) != len(self.names) or not all(0 < v < float("inf") for v in values):
-                raise ConfigError(f"{name} is {values}; it needs {len(self.names)} positive finite numbers.")
-        if not 0 < self.command_timeout_s < float("inf"):
+        n = len(self.names)
+        unlimited = (math.inf,) * n
+        position = bool(self.lower)
+        for name, default in (
+            ("jerk", tuple(7.0 * value for value in self.acceleration)),
+            ("lower", (-math.inf,) * n),
+            *((name, unlimited) for name in ("upper", "stop_jerk", "effort")),
+        ):
+            if not getattr(self, name):
+                object.__setattr__(self, name, default)
+        if not self.setpoint_jerk:
+            jerk = tuple(20.0 * value for value in self.jerk) if position else unlimited
+            object.__setattr__(self, "setpoint_jerk", jerk)
+        if not len(self.lower) == len(self.upper) == n:
+            raise ConfigError(f"lower and upper need {n} numbers each.")
+        for name in ("velocity", "acceleration", "stop_deceleration", "jerk", "stop_jerk", "effort", "setpoint_jerk"):
+            values, may_be_infinite = getattr(self, name), name in ("stop_jerk", "effort", "setpoint_jerk")
+            if len(values) != n or not all(
+                0 < value < math.inf or (may_be_infinite and value == math.inf == high)
+                for value, high in zip(values, self.upper, strict=True)
+            ):
+                raise ConfigError(f"{name} is {values}; it needs {n} positive finite numbers.")
+        for low, high in zip(self.lower, self.upper, strict=True):
+            if not (-math.inf < low < high < math.inf or (low, high) == (-math.inf, math.inf)):
+                raise ConfigError(f"lower is {self.lower} and upper is {self.upper}; each range must be finite.")
+        if not 0 < self.command_timeout_s < math.inf:
             raise ConfigError(
                 f"command_timeout_s is {self.command_timeout_s}; it must be positive and finite. "
                 "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
             )
 
+    @property
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The smallest and the largest value of each command, be it a velocity or a position."""
+        positions = [math.isfinite(low) for low in self.lower]
+        lower = (low if one else -most for one, low, most in zip(positions, self.lower, self.velocity, strict=True))
+        upper = (high if one else most for one, high, most in zip(positions, self.upper, self.velocity, strict=True))
+        return tuple(lower), tuple(upper)
 
-@dataclass(frozen=True)
-class WheelDrive:
-    """Two driven wheels on one axis, each with a velocity servo.
+    def __add__(self, other: "Limits") -> "Limits":
+        """Return the limits of both, one after the other, with the shorter time-out."""
+        joined: dict[str, Any] = {
+            one.name: getattr(self, one.name) + getattr(other, one.name)
+            for one in fields(self)
+            if one.name != "command_timeout_s"
+        }
+        return Limits(**joined, command_timeout_s=min(self.command_timeout_s, other.command_timeout_s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """Two driven wheels on one axis, each with a velocity servo, and the base that they move.
+
+    A command is the forward speed [m/s] and the yaw rate [rad/s].
 
     Attributes:
+        limits: limits of the commands.
         joints: joint names, left then right.
         actuators: actuator names, left then right.
         wheel_radius: rolling radius [m].
@@ -110,8 +162,15 @@ class WheelDrive:
         max_torque: largest wheel torque [N m].
         servo_gain: torque per speed error of the velocity servo [N m s/rad].
         encoder_ticks: encoder counts in one wheel revolution.
+        touch_sensor: name of the contact sensor that counts touches with the scene.
+        radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
+        height: height of the robot [m].
+        outline: rectangles around the middle of the wheel axis that together hold the robot, seen from above: rear,
+            front, and half the width of each [m].
+        stalled_s: a wheel that turns less than half as far as commanded for so long is blocked [s].
     """
 
+    limits: Limits
     joints: tuple[str, str]
     actuators: tuple[str, str]
     wheel_radius: float
@@ -120,6 +179,11 @@ class WheelDrive:
     max_torque: float
     servo_gain: float
     encoder_ticks: int
+    touch_sensor: str = "touch"
+    radius: float
+    height: float
+    outline: tuple[tuple[float, float, float], ...]
+    stalled_s: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -183,41 +247,6 @@ class CameraSpec:
                 f"The image of camera {self.name!r} is {self.width!r} x {self.height!r} px; "
                 "both must be positive whole numbers."
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PositionLimits(CommandLimits):
-    """Limits of a position command, one value for each command dimension.
-
-    `velocity` is the largest speed of the commanded position, `acceleration` its largest acceleration.
-
-    Attributes:
-        lower: smallest position [rad, or m for a gripper].
-        upper: largest position [rad or m].
-        stop_jerk: largest change of the acceleration when the robot has to stop at once [rad/s^3 or m/s^3].
-        effort: largest torque or force of the servo [N m or N].
-        setpoint_jerk: largest change of the acceleration while setpoints are followed [rad/s^3 or m/s^3]; 20 times
-            `jerk` if left out. A smaller one follows a stream later and overshoots more where it ends.
-    """
-
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
-    stop_jerk: tuple[float, ...]
-    effort: tuple[float, ...]
-    setpoint_jerk: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.setpoint_jerk:
-            object.__setattr__(self, "setpoint_jerk", tuple(20.0 * value for value in self.jerk))
-        for name in ("stop_jerk", "effort", "setpoint_jerk"):
-            values = getattr(self, name)
-            if len(values) != len(self.names) or not all(0 < v < float("inf") for v in values):
-                raise ConfigError(f"{name} is {values}; it needs {len(self.names)} positive finite numbers.")
-        if len(self.lower) != len(self.names) or len(self.upper) != len(self.names):
-            raise ConfigError(f"lower and upper need {len(self.names)} numbers each.")
-        if not all(-float("inf") < low < high < float("inf") for low, high in zip(self.lower, self.upper, strict=True)):
-            raise ConfigError(f"lower is {self.lower} and upper is {self.upper}; each range must be finite.")
 
 
 OBSTACLE = "obstacle_"
@@ -328,78 +357,7 @@ class GripperSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
-    """A robot's hardware.
-
-    Attributes:
-        name: body name, for example ``"turtlebot3_burger"``.
-        mjcf: MJCF document of the robot alone, without floor or scene; empty for a robot that is not simulated, whose
-            forces and torques are then not known from its motion either.
-        root: name of the root body, which carries a free joint if the robot moves.
-        limits: limits of the commands it takes.
-        cameras: the cameras, by name.
-        physics_hz: default physics rate [Hz].
-        control_hz: default control rate [Hz].
-        least_physics_hz: physics rate below which its simulation shakes [Hz].
-        least_control_hz: control rate below which its controller takes its own motion for a fault [Hz].
-    """
-
-    name: str
-    mjcf: str
-    root: str
-    limits: CommandLimits
-    cameras: dict[str, CameraSpec] = field(default_factory=dict)
-    physics_hz: int = 200
-    control_hz: int = 200
-    least_physics_hz: int = 1
-    least_control_hz: int = 1
-
-    def check_rates(self, rates: Rates, *, is_simulated: bool = True) -> None:
-        """Check that the robot can be simulated and controlled at some rates.
-
-        Raises:
-            ConfigError: a rate is too low; the message gives the nearest that work.
-        """
-        least = self.least_control_hz, self.least_physics_hz if is_simulated else 1
-        if rates.control_hz >= least[0] and rates.physics_hz >= least[1]:
-            return
-        most = 4 * max(least[0], rates.control_hz)
-        control = range(-(-least[0] // rates.fps) * rates.fps, most + rates.fps, rates.fps)
-        pairs = [(hz, -(-max(least[1], rates.physics_hz) // hz) * hz) for hz in control]
-        near = min(pairs, key=lambda pair: (pair[1] != rates.physics_hz, abs(pair[0] - rates.control_hz), pair[1]))
-        raise ConfigError(
-            f"control_hz is {rates.control_hz} and physics_hz is {rates.physics_hz}; the {self.name} needs at least "
-            f"{least[0]} and {least[1]} Hz, or it shakes and stops with false faults. The nearest that work at fps = "
-            f"{rates.fps}: control_hz = {near[0]}, physics_hz = {near[1]}."
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class MobileBase(Body):
-    """A base on two driven wheels.
-
-    Attributes:
-        drive: the wheels.
-        lidar: the range finder, or None.
-        touch_sensor: name of the contact sensor that counts touches with the scene.
-        radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
-        height: height of the robot [m].
-        stalled_s: a wheel that turns less than half as far as commanded for so long is blocked [s].
-        outline: rectangles around the middle of the wheel axis that together hold the robot, seen from above: rear,
-            front, and half the width of each [m].
-    """
-
-    drive: WheelDrive
-    lidar: LidarSpec | None
-    touch_sensor: str = "touch"
-    radius: float
-    height: float
-    outline: tuple[tuple[float, float, float], ...]
-    stalled_s: float = 0.3
-
-
-@dataclass(frozen=True, kw_only=True)
-class Arm(Body):
+class Arm:
     """An arm with a gripper, mounted on a table.
 
     The base frame is frame 0 of the chain; the table's top is its plane z = 0. A command is the position of each joint
@@ -426,7 +384,7 @@ class Arm(Body):
         blocked_s: an arm with such a joint, whose servo gives all it has, is stopped after so long [s].
     """
 
-    limits: PositionLimits
+    limits: Limits
     chain: ArmChain
     gripper: GripperSpec
     servo_stiffness: tuple[float, ...]
@@ -449,15 +407,99 @@ class Arm(Body):
         return tuple(damping / stiffness + self.latency_s for damping, stiffness in servos)
 
 
-def without_jerk_limits[T: MobileBase | Arm](body: T) -> T:
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """A robot's hardware: what it is made of. A part that it does not have is None.
+
+    Attributes:
+        name: body name, for example ``"turtlebot3_burger"``.
+        mjcf: MJCF document of the robot alone, without floor or scene; empty for a robot that is not simulated, whose
+            forces and torques are then not known from its motion either.
+        root: name of the root body, which carries a free joint if the robot moves.
+        drive: the wheels and the base that they move.
+        arm: the arm with its gripper.
+        lidar: the range finder.
+        cameras: the cameras, by name.
+        physics_hz: default physics rate [Hz].
+        control_hz: default control rate [Hz].
+        least_physics_hz: physics rate below which its simulation shakes [Hz].
+        least_control_hz: control rate below which its controller takes its own motion for a fault [Hz].
+    """
+
+    name: str
+    mjcf: str
+    root: str
+    drive: Drive | None = None
+    arm: Arm | None = None
+    lidar: LidarSpec | None = None
+    cameras: dict[str, CameraSpec] = field(default_factory=dict)
+    physics_hz: int = 200
+    control_hz: int = 200
+    least_physics_hz: int = 1
+    least_control_hz: int = 1
+
+    @cached_property
+    def limits(self) -> Limits:
+        """Limits of the commands that it takes: those of the drive, and then those of the arm.
+
+        Raises:
+            ConfigError: it has neither.
+        """
+        limits = [part.limits for part in (self.drive, self.arm) if part is not None]
+        if not limits:
+            raise ConfigError(f"The body {self.name!r} takes no commands: it has neither a drive nor an arm.")
+        return reduce(add, limits)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """What is read of it, in order: the wheels, the arm's joints, and the gripper's opening."""
+        wheels = self.drive.joints if self.drive is not None else ()
+        return (*wheels, *self.arm.chain.joints, "gripper") if self.arm is not None else wheels
+
+    def need[P: (Drive, Arm, LidarSpec)](self, part: type[P]) -> P:
+        """Return a part.
+
+        Raises:
+            ConfigError: it does not have it.
+        """
+        found = {Drive: self.drive, Arm: self.arm, LidarSpec: self.lidar}[part]
+        if not isinstance(found, part):
+            raise ConfigError(f"The robot {self.name!r} has no {_PARTS[part]}, which is needed here.")
+        return found
+
+    def check_rates(self, rates: Rates, *, is_simulated: bool = True) -> None:
+        """Check that the robot can be simulated and controlled at some rates.
+
+        Raises:
+            ConfigError: a rate is too low; the message gives the nearest that work.
+        """
+        least = self.least_control_hz, self.least_physics_hz if is_simulated else 1
+        if rates.control_hz >= least[0] and rates.physics_hz >= least[1]:
+            return
+        most = 4 * max(least[0], rates.control_hz)
+        control = range(-(-least[0] // rates.fps) * rates.fps, most + rates.fps, rates.fps)
+        pairs = [(hz, -(-max(least[1], rates.physics_hz) // hz) * hz) for hz in control]
+        near = min(pairs, key=lambda pair: (pair[1] != rates.physics_hz, abs(pair[0] - rates.control_hz), pair[1]))
+        raise ConfigError(
+            f"control_hz is {rates.control_hz} and physics_hz is {rates.physics_hz}; the {self.name} needs at least "
+            f"{least[0]} and {least[1]} Hz, or it shakes and stops with false faults. The nearest that work at fps = "
+            f"{rates.fps}: control_hz = {near[0]}, physics_hz = {near[1]}."
+        )
+
+
+_PARTS: dict[type, str] = {Drive: "drive", Arm: "arm", LidarSpec: "lidar"}
+
+
+def without_jerk_limits(body: Body) -> Body:
     """Return a body whose accelerations may change at once when setpoints are followed."""
-    limits: Any = body.limits
-    unlimited = (_NO_JERK_LIMIT,) * len(limits.names)
-    if isinstance(limits, PositionLimits):
-        limits = replace(limits, setpoint_jerk=unlimited)
-    else:
-        limits = replace(limits, jerk=unlimited)
-    return replace(body, limits=limits)
+    drive, arm = body.drive, body.arm
+    if drive is not None:
+        jerk = (_NO_JERK_LIMIT,) * len(drive.limits.names)
+        drive = replace(drive, limits=replace(drive.limits, jerk=jerk))
+    if arm is not None:
+        jerk = (_NO_JERK_LIMIT,) * len(arm.limits.names)
+        arm = replace(arm, limits=replace(arm.limits, setpoint_jerk=jerk))
+    return replace(body, drive=drive, arm=arm)
 
 
 @dataclass(frozen=True)

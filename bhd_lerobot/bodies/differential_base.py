@@ -1,6 +1,6 @@
 """A base on two driven wheels, made of a few numbers: for robots of which there is no model."""
 
-from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, MobileBase, WheelDrive
+from bhd_lerobot.bodies.body import Body, CameraSpec, Drive, LidarSpec, Limits
 from bhd_lerobot.errors import ConfigError
 
 _TYRE = 0.009  # [m] half the width of a wheel
@@ -85,7 +85,7 @@ def differential_base(
     command_timeout_s: float = 0.5,
     camera_width: int = 320,
     camera_height: int = 240,
-) -> MobileBase:
+) -> Body:
     """Return a box on two wheels in its middle and a caster at either end, with a lidar on top and a camera in front.
 
     Args:
@@ -128,19 +128,19 @@ def differential_base(
         i_x=inertia / 4, i_y=inertia / 2, gain=_SERVO_GAIN * scale, torque=_SERVO_TORQUE * scale,
     )  # fmt: skip
     rim = max(max_velocity[0], max_velocity[1] * half_track)
-    return MobileBase(
+    return Body(
         name=name,
         mjcf=mjcf,
         root="base",
-        limits=CommandLimits(
-            names=("x.vel", "theta.vel"),
-            velocity=max_velocity,
-            acceleration=(2.5, 3.2),
-            stop_deceleration=(2.5, 20.0),
-            command_timeout_s=command_timeout_s,
-        ),
         least_physics_hz=91,  # the servos' time constant is 11 ms, see _SERVO_GAIN; in longer steps the base rocks
-        drive=WheelDrive(
+        drive=Drive(
+            limits=Limits(
+                names=("x.vel", "theta.vel"),
+                velocity=max_velocity,
+                acceleration=(2.5, 3.2),
+                stop_deceleration=(2.5, 20.0),
+                command_timeout_s=command_timeout_s,
+            ),
             joints=("wheel_left", "wheel_right"),
             actuators=("wheel_left", "wheel_right"),
             wheel_radius=wheel_radius,
@@ -149,13 +149,13 @@ def differential_base(
             max_torque=_SERVO_TORQUE * scale,
             servo_gain=_SERVO_GAIN * scale,
             encoder_ticks=4096,
+            radius=float((max(length / 2, wheel_radius) ** 2 + (half_track + _TYRE) ** 2) ** 0.5),
+            height=top + 2 * _LIDAR_OVER,
+            outline=(
+                (-length / 2, length / 2, width / 2),
+                (-wheel_radius, wheel_radius, half_track + _TYRE),
+            ),
         ),
         lidar=LidarSpec(site="lidar", beams=360, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
-        radius=float((max(length / 2, wheel_radius) ** 2 + (half_track + _TYRE) ** 2) ** 0.5),
-        height=top + 2 * _LIDAR_OVER,
-        outline=(
-            (-length / 2, length / 2, width / 2),
-            (-wheel_radius, wheel_radius, half_track + _TYRE),
-        ),
     )

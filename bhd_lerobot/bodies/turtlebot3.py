@@ -23,7 +23,7 @@ is what the tyres can carry (a yaw deceleration of 20 rad/s^2 needs 0.5 N at eac
 
 from importlib import resources
 
-from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, MobileBase, WheelDrive
+from bhd_lerobot.bodies.body import Body, CameraSpec, Drive, LidarSpec, Limits
 
 WHEEL_RADIUS = 0.033  # [m], [urdf]
 WHEEL_SEPARATION = 0.160  # [m], [urdf]
@@ -45,7 +45,7 @@ def turtlebot3_burger(
     command_timeout_s: float = 0.5,
     camera_width: int = 320,
     camera_height: int = 240,
-) -> MobileBase:
+) -> Body:
     """Return the Burger.
 
     Args:
@@ -57,19 +57,19 @@ def turtlebot3_burger(
     Raises:
         ConfigError: a value is out of range.
     """
-    return MobileBase(
+    return Body(
         name="turtlebot3_burger",
         mjcf=resources.files(__package__).joinpath("turtlebot3_burger.xml").read_text(encoding="utf-8"),
         root="base",
-        limits=CommandLimits(
-            names=("x.vel", "theta.vel"),
-            velocity=(MAX_LINEAR, MAX_ANGULAR),
-            acceleration=(2.5, 3.2),
-            stop_deceleration=(2.5, 20.0),
-            command_timeout_s=command_timeout_s,
-        ),
         least_physics_hz=91,  # the servos' time constant is 11 ms, see SERVO_GAIN; in longer steps the base rocks
-        drive=WheelDrive(
+        drive=Drive(
+            limits=Limits(
+                names=("x.vel", "theta.vel"),
+                velocity=(MAX_LINEAR, MAX_ANGULAR),
+                acceleration=(2.5, 3.2),
+                stop_deceleration=(2.5, 20.0),
+                command_timeout_s=command_timeout_s,
+            ),
             joints=("wheel_left", "wheel_right"),
             actuators=("wheel_left", "wheel_right"),
             wheel_radius=WHEEL_RADIUS,
@@ -81,6 +81,9 @@ def turtlebot3_burger(
             max_torque=1.4,
             servo_gain=SERVO_GAIN,
             encoder_ticks=4096,
+            radius=0.124,  # the rear corners of the hull; the outer rims of the tyres are at 0.095 m
+            height=0.192,
+            outline=((-0.102, 0.038, 0.070), (-0.033, 0.033, 0.089)),  # hull and wheels, as in turtlebot3_burger.xml
         ),
         lidar=LidarSpec(
             site="lidar",
@@ -92,7 +95,4 @@ def turtlebot3_burger(
             ahead=SCANNER_AHEAD,
         ),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
-        radius=0.124,  # the rear corners of the hull; the outer rims of the tyres are at 0.095 m
-        height=0.192,
-        outline=((-0.102, 0.038, 0.070), (-0.033, 0.033, 0.089)),  # hull and wheels, as in turtlebot3_burger.xml
     )

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Literal
 
-from bhd_lerobot.bodies.body import Arm, ArmChain, CameraSpec, Capsule, GripperSpec, PositionLimits
+from bhd_lerobot.bodies.body import Arm, ArmChain, Body, CameraSpec, Capsule, GripperSpec, Limits
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -75,7 +75,7 @@ def ur5(
     command_timeout_s: float = 0.14,
     camera_width: int = 320,
     camera_height: int = 240,
-) -> Arm:
+) -> Body:
     """Return the UR5 with its gripper.
 
     Args:
@@ -96,44 +96,46 @@ def ur5(
     turn = 2 * math.pi
     effort = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # [N m], [torque]
     torque = actuation == "torque"
-    return Arm(
+    return Body(
         name="ur5",
         mjcf=resources.files(__package__).joinpath("ur5.xml").read_text(encoding="utf-8"),
         root="base",
-        limits=PositionLimits(
-            names=(*(f"{joint}.pos" for joint in JOINTS), "gripper.pos"),
-            lower=(*(-turn,) * 6, 0.0),
-            upper=(*(turn,) * 6, MAX_OPENING),
-            velocity=(*(MAX_JOINT_SPEED,) * 6, 0.150),
-            acceleration=(8.0, 8.0, 10.0, 15.0, 15.0, 15.0, 2.0),
-            jerk=(80.0, 80.0, 100.0, 150.0, 150.0, 150.0, 40.0),
-            stop_deceleration=(12.0, 12.0, 15.0, 20.0, 20.0, 20.0, 4.0),
-            stop_jerk=(400.0, 400.0, 500.0, 700.0, 700.0, 700.0, 200.0),
-            effort=(*effort, 60.0),
-            command_timeout_s=command_timeout_s,
+        arm=Arm(
+            limits=Limits(
+                names=(*(f"{joint}.pos" for joint in JOINTS), "gripper.pos"),
+                lower=(*(-turn,) * 6, 0.0),
+                upper=(*(turn,) * 6, MAX_OPENING),
+                velocity=(*(MAX_JOINT_SPEED,) * 6, 0.150),
+                acceleration=(8.0, 8.0, 10.0, 15.0, 15.0, 15.0, 2.0),
+                jerk=(80.0, 80.0, 100.0, 150.0, 150.0, 150.0, 40.0),
+                stop_deceleration=(12.0, 12.0, 15.0, 20.0, 20.0, 20.0, 4.0),
+                stop_jerk=(400.0, 400.0, 500.0, 700.0, 700.0, 700.0, 200.0),
+                effort=(*effort, 60.0),
+                command_timeout_s=command_timeout_s,
+            ),
+            chain=ArmChain(
+                joints=JOINTS,
+                a=_A,
+                d=_D,
+                alpha=_ALPHA,
+                tool=(0.0, 0.0, 0.150),
+                capsules=(*_CAPSULES, *obstacles),
+                disjoint=(*_DISJOINT, *((obstacle.name, link) for obstacle in obstacles for link in _MOVING)),
+                min_distance=0.005,
+                min_manipulability=0.003,
+            ),
+            gripper=GripperSpec(joints=("finger_left", "finger_right"), actuator="gripper", max_opening=MAX_OPENING),
+            servo_stiffness=(40_000.0, 40_000.0, 40_000.0, 8_000.0, 8_000.0, 8_000.0, 8_000.0),
+            servo_damping=(800.0, 800.0, 450.0, 80.0, 80.0, 80.0, 150.0),
+            actuators=(*JOINTS, "gripper"),
+            actuation=actuation,
+            brake_damping=tuple(most / _BRAKING_SPEED for most in effort) if torque else (),
+            brake_slip=tuple(_SLIP * most for most in effort) if torque else (),
+            # The tool points down, 0.49 m before the base and 0.11 m to its left, 0.28 m above the table.
+            home=(math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, MAX_OPENING),
+            payload=_PAYLOAD,
+            load=load,
         ),
-        chain=ArmChain(
-            joints=JOINTS,
-            a=_A,
-            d=_D,
-            alpha=_ALPHA,
-            tool=(0.0, 0.0, 0.150),
-            capsules=(*_CAPSULES, *obstacles),
-            disjoint=(*_DISJOINT, *((obstacle.name, link) for obstacle in obstacles for link in _MOVING)),
-            min_distance=0.005,
-            min_manipulability=0.003,
-        ),
-        gripper=GripperSpec(joints=("finger_left", "finger_right"), actuator="gripper", max_opening=MAX_OPENING),
-        servo_stiffness=(40_000.0, 40_000.0, 40_000.0, 8_000.0, 8_000.0, 8_000.0, 8_000.0),
-        servo_damping=(800.0, 800.0, 450.0, 80.0, 80.0, 80.0, 150.0),
-        actuators=(*JOINTS, "gripper"),
-        actuation=actuation,
-        brake_damping=tuple(most / _BRAKING_SPEED for most in effort) if torque else (),
-        brake_slip=tuple(_SLIP * most for most in effort) if torque else (),
-        # The tool points down, 0.49 m before the base and 0.11 m to its left, 0.28 m above the table.
-        home=(math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, MAX_OPENING),
-        payload=_PAYLOAD,
-        load=load,
         cameras={name: CameraSpec(name, camera_width, camera_height) for name in ("scene", "wrist")},
         physics_hz=500,
         control_hz=500,

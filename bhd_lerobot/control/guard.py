@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.errors import ConfigError
 
@@ -59,8 +59,8 @@ class WireLimits:
         Raises:
             ConfigError: neither a base nor an arm, or an arm that is to take twists.
         """
-        if isinstance(body, MobileBase):
-            drive, limits = body.drive, body.limits
+        if body.drive is not None:
+            drive, limits = body.drive, body.drive.limits
             stop = np.maximum(limits.acceleration, limits.stop_deceleration)
             sideways = stop[1] * drive.wheel_separation / 2  # [m/s^2] of a wheel that turns the base
             if takes == "twist":
@@ -73,12 +73,11 @@ class WireLimits:
             return cls(-largest, largest, change * _TOLERANCE, np.full(2, np.inf), np.zeros(2))
         if takes == "twist":
             raise ConfigError(f"The plant takes twists (Plant.takes), and the body {body.name!r} is no base.")
-        if not isinstance(body, Arm):
-            raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; no limits are known for its actuators.")
-        reference = body.limits
-        lead = np.asarray(body.lead_s)
+        arm = body.need(Arm)
+        reference = arm.limits
+        lead = np.asarray(arm.lead_s)
         hardest = np.maximum(reference.acceleration, reference.stop_deceleration)
-        if body.actuation == "torque":
+        if arm.actuation == "torque":
             lead[:] = 0.0
         # A reference that stops at the end of its range is led beyond it by no more than this: the largest value of
         # lead * v - v^2 / (2 a).
@@ -88,7 +87,7 @@ class WireLimits:
         bend = hardest / control_hz * (1 / control_hz + 2 * lead) * _TOLERANCE
         start = np.ones(len(change))
         start[-1] = np.nan  # what is gripped is not let go of: the opening commanded is not the one that is
-        if body.actuation == "torque":
+        if arm.actuation == "torque":
             effort = np.asarray(reference.effort[:-1])
             lower[:-1], upper[:-1] = -effort, effort
             change[:-1] = effort / (FULL_TORQUE_S * control_hz) * _TOLERANCE

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.plant import PlantReading
@@ -165,14 +165,13 @@ class ReadingCheck:
         self.oldest_ns, self.ahead_ns = _SLACK_PERIODS * period, period
         self.problem = self.silence = ""
         self._motion: MotionCheck | None = None
-        if isinstance(body, Arm):
-            if body.actuation == "torque":
-                self._motion = MotionCheck(body, n, control_hz)
-            self._names: tuple[str, ...] = (*body.chain.joints, "gripper")
-            speed = np.array([*body.limits.velocity[:-1], np.inf])
-        elif isinstance(body, MobileBase):
-            self._names, speed = body.drive.joints, np.full(2, body.drive.max_wheel_speed)
-        speed = _FASTER * speed / NANOSECONDS  # [rad/ns]
+        self._names = body.joints
+        speeds = [body.drive.max_wheel_speed] * 2 if body.drive is not None else []
+        if body.arm is not None:
+            if body.arm.actuation == "torque":
+                self._motion = MotionCheck(body.arm, n, control_hz)
+            speeds += [*body.arm.limits.velocity[:-1], np.inf]
+        speed = _FASTER * np.array(speeds) / NANOSECONDS  # [rad/ns]
         self._near = np.full((n, len(speed)), np.nan)  # follows the positions no faster than joints can turn
         self._elapsed, self._stamp = np.zeros((2, n), np.int64)
         self._wrong, self._beyond = np.zeros(n, np.bool_), np.zeros_like(self._near)

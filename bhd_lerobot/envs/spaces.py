@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ActionError
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.task import Task
@@ -34,7 +34,7 @@ def _state_space(simulation: Simulation) -> spaces.Box:
     names, body = simulation.observation_names, simulation.body
     low = np.full(len(names), -np.inf, np.float32)
     high = np.full(len(names), np.inf, np.float32)
-    if isinstance(body, MobileBase) and body.lidar is not None:
+    if body.lidar is not None:
         beams = [column for column, name in enumerate(names) if name.startswith("scan_")]
         low[beams], high[beams] = body.lidar.range_min, body.lidar.range_max
     return spaces.Box(low, high, dtype=np.float32)
@@ -86,13 +86,11 @@ def action_bounds(body: Body, names: tuple[str, ...]) -> tuple[NDArray[np.float6
     A base: plus and minus its largest speeds. An arm: the range of each joint; or, for tool poses, a cube around the
     base that holds all that the arm could reach, and the quaternion's -1 to 1.
     """
-    if not isinstance(body, Arm):
-        largest = np.asarray(body.limits.velocity)
-        return -largest, largest
     limits = body.limits
-    if names == limits.names:
-        return np.asarray(limits.lower), np.asarray(limits.upper)
-    chain = body.chain
+    if names == limits.names or body.arm is None:
+        low, high = limits.bounds
+        return np.asarray(low), np.asarray(high)
+    chain = body.arm.chain
     reach = float(np.abs(chain.a).sum() + np.abs(chain.d).sum() + np.linalg.norm(chain.tool))
-    low = np.array([*[-reach] * 3, *[-1.0] * 4, limits.lower[-1]])
-    return low, np.array([*[reach] * 3, *[1.0] * 4, limits.upper[-1]])
+    lower, upper = limits.lower[-1], limits.upper[-1]
+    return np.array([*[-reach] * 3, *[-1.0] * 4, lower]), np.array([*[reach] * 3, *[1.0] * 4, upper])

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode, video_frames
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
@@ -78,7 +76,7 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         draw_trajectories(trajectories, path, what)
         return (
             path.read_bytes(),
-            f"{what}: the trajectory of {'the tool' if isinstance(body_of(summary.robot_type), Arm) else 'the base'}",
+            f"{what}: the trajectory of {'the tool' if simulation.body.arm else 'the base'}",
         )
 
 

@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Range
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
@@ -104,9 +103,7 @@ class RandomBrain(NoopBrain):
                 f"The brain 'random' knows no range for the actions {', '.join(robot.action_names)}. It drives a "
                 "simulated base, and an arm with --robot.action_space=joint."
             )
-        speeds = np.array(limits.velocity)
-        bounds = (limits.lower, limits.upper) if isinstance(limits, PositionLimits) else (-speeds, speeds)
-        self._lower, self._upper = np.array(bounds[0]), np.array(bounds[1])
+        self._lower, self._upper = np.array(limits.bounds)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start anew from each episode's seed."""

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.mailbox import Mailbox
@@ -18,7 +17,8 @@ _REST_S = 0.002  # between two checks of the planner for a request
 
 
 def _dof(cerebellum: Cerebellum) -> int:
-    return len(cerebellum.body.chain.joints) if isinstance(cerebellum.body, Arm) else 0
+    arm = cerebellum.body.arm
+    return 0 if arm is None else len(arm.chain.joints)
 
 
 def _goals_of(cerebellum: Cerebellum) -> Any:

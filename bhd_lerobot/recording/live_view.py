@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, unknown_name
@@ -101,7 +100,7 @@ class LiveView:
         self._scan = np.array([i for i, name in enumerate(names) if name.startswith("scan_")], np.intp)
         self._floats = [(i, name) for i, name in enumerate(names) if not name.startswith("scan_")]
         self._cameras, body = tuple(robots.camera_shapes), robots.body
-        lidar = body.lidar if isinstance(body, MobileBase) else None
+        lidar = body.lidar if body else None
         self._range_max = lidar.range_max if lidar is not None else np.inf
         self._images: dict[str, NDArray[np.uint8]] = {}
         self._frames: deque[tuple[dict[str, Any], dict[str, Any]]] = deque(maxlen=_WAITING)

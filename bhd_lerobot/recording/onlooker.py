@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.commands import Command, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.timing import TimingStatistics
@@ -104,7 +103,7 @@ class Onlooker:
         """Return whether a command is followed; zero speed is none for a base that nobody drives."""
         if state["mode"][0] != Mode.TRACKING:
             return False
-        stands = isinstance(self.body, MobileBase) and not state["requested"].any()
+        stands = self.body.drive is not None and not state["requested"].any()
         return not (stands and state["command_age_ns"])
 
     # --- an episode, see `Robots` ------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import without_jerk_limits
+from bhd_lerobot.bodies.body import Arm, without_jerk_limits
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import JOINTS
@@ -92,8 +92,9 @@ class ArmHost(Host):
 
     def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
         body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
+        arm = body.need(Arm)
         self.plant = plant
-        self.kinematics = ArmKinematics(body.chain, body.limits)
+        self.kinematics = ArmKinematics(arm.chain, arm.limits)
         ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":

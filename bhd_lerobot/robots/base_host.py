@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase, without_jerk_limits
+from bhd_lerobot.bodies.body import Drive, LidarSpec, without_jerk_limits
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
 from bhd_lerobot.control.base.controller import BaseController
@@ -41,16 +41,15 @@ class BaseHost(Host):
     knows: frozenset[str] | None = frozenset({"base_pose_in_world"})
 
     def __init__(self, config: "MobileBaseConfig", plant: Plant, **options: Any) -> None:
-        body: MobileBase = config.body() if config.jerk_limits else without_jerk_limits(config.body())
-        if body.lidar is None:
-            raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
+        body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
+        drive, lidar = body.need(Drive), body.need(LidarSpec)
         self.plant = plant
         monitor = None
         if config.collision_monitor:
-            monitor = CollisionMonitor(body, body.lidar, plant.n, config.control_hz, config.beams)
+            monitor = CollisionMonitor(drive, lidar, plant.n, config.control_hz, config.beams)
         gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
         self._controller = BaseController(
-            body, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
+            drive, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
         )
         super().__init__(
             config,
@@ -61,7 +60,7 @@ class BaseHost(Host):
             observation_names=observation_names(config),
             **options,
         )
-        self.sensor_period_s = 1 / body.lidar.rate_hz
+        self.sensor_period_s = 1 / lidar.rate_hz
         self._start = np.zeros((plant.n, 3))  # where odometry began, in the scene: x, y [m], yaw [rad]
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

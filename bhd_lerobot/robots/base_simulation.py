@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena, make_arena
+from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
@@ -38,11 +39,10 @@ class BaseSimulation(BaseHost, Simulation):
 
     def __init__(self, config: "MobileBaseConfig", n: int = 1, threads: int | None = None) -> None:
         body = config.body()
-        if body.lidar is None:
-            raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
+        drive, lidar = body.need(Drive), body.need(LidarSpec)
         world = World(body, n, physics_hz=config.physics_hz, threads=threads)
-        self.lidar = Lidar(world, body.lidar, config.beams)
-        self._radius, self._fastest = body.radius, np.asarray(body.limits.velocity)
+        self.lidar = Lidar(world, lidar, config.beams)
+        self._radius, self._fastest = drive.radius, np.asarray(drive.limits.velocity)
         super().__init__(
             config,
             SimulatedPlant(world),
@@ -50,11 +50,11 @@ class BaseSimulation(BaseHost, Simulation):
             camera_names=tuple(body.cameras) if config.camera else (),
         )
         self._reading = PlantReading(n, self._controller.joints)
-        self._touch = self.world.sensor(body.touch_sensor)[:, 0]
+        self._touch = self.world.sensor(drive.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
         self._touched = np.zeros(n, np.bool_)
-        self.scan_rate_hz = body.lidar.rate_hz
-        self._scan_ticks = config.control_hz // body.lidar.rate_hz
+        self.scan_rate_hz = lidar.rate_hz
+        self._scan_ticks = config.control_hz // lidar.rate_hz
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
@@ -91,7 +91,7 @@ class BaseSimulation(BaseHost, Simulation):
     @classmethod
     def start_scene(cls, config: "MobileBaseConfig") -> Arena:
         """Return the configured arena."""
-        return make_arena(config.arena, config.seed, robot_radius=config.body().radius)
+        return make_arena(config.arena, config.seed, robot_radius=config.body().need(Drive).radius)
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Put robots into arenas, at rest at their start."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.arenas import ARENAS
-from bhd_lerobot.bodies.body import MobileBase, Rates
+from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Whole, check_options
 from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
@@ -67,7 +67,7 @@ class BhdRobotConfig(RobotConfig):
         check_options(self, "robot.")
         _ = self.rates
         if self.plant == "ros2":
-            self.plant = _ROS2_PLANTS[isinstance(self.body(), MobileBase)]
+            self.plant = _ROS2_PLANTS[self.body().drive is not None]
             self.clock = "realtime"
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silent_s)
             brain_s = self.realtime.brain_timeout_s
@@ -154,5 +154,5 @@ class MobileBaseConfig(BhdRobotConfig):
         self.check_rates()
 
     @abstractmethod
-    def body(self) -> MobileBase:
+    def body(self) -> Body:
         """Return the hardware that this configuration describes."""

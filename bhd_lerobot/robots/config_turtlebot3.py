@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.robots.config import MobileBaseConfig
 
@@ -14,7 +14,7 @@ from bhd_lerobot.robots.config import MobileBaseConfig
 class TurtleBot3Config(MobileBaseConfig):
     """Configuration of the robot type ``turtlebot3``: the options of a base."""
 
-    def body(self) -> MobileBase:
+    def body(self) -> Body:
         """Return the hardware that this configuration describes."""
         return turtlebot3_burger(
             lidar_noise_std=self.lidar_noise_std,

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.bodies.body import OBSTACLE, Arm, Capsule
+from bhd_lerobot.bodies.body import OBSTACLE, Body, Capsule
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
@@ -71,7 +71,7 @@ class UR5Config(BhdRobotConfig):
                 )
         self.check_rates()
 
-    def body(self) -> Arm:
+    def body(self) -> Body:
         """Return the hardware that this configuration describes."""
         return ur5(
             load=self.payload,

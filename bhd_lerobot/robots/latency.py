@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.plant import SimulatedPlant
@@ -17,17 +16,18 @@ class LatePlant(Plant):
     """Passes readings on at once, and commands some ticks later, for each simulation its own number.
 
     Args:
+        actuators: how many there are.
         max_ticks: largest latency [ticks].
     """
 
-    def __init__(self, plant: SimulatedPlant, arm: Arm, max_ticks: int = MAX_LATENCY) -> None:
+    def __init__(self, plant: SimulatedPlant, actuators: int, max_ticks: int = MAX_LATENCY) -> None:
         self.n = plant.n
         self._plant = plant
         self._latency = np.zeros(plant.n, np.int64)
         self._late = False
         self._sims = np.arange(plant.n)
         self._largest = max_ticks
-        self._ring = np.zeros((max_ticks + 1, plant.n, len(arm.actuators)))
+        self._ring = np.zeros((max_ticks + 1, plant.n, actuators))
         self._ticks = 0
         self._waiting = np.zeros(plant.n, np.int64)  # ticks since the latency was set: before, nothing was commanded
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import JOINTS
@@ -61,7 +61,7 @@ class UR5Simulation(ArmHost, Simulation):
         self.table = Tabletop(world)
         super().__init__(
             config,
-            LatePlant(SimulatedPlant(world), body, round(MAX_LATENCY_S * config.control_hz)),
+            LatePlant(SimulatedPlant(world), len(body.limits.names), round(MAX_LATENCY_S * config.control_hz)),
             planning,
             world=world,
             camera_names=("scene", "wrist") if config.camera else (),
@@ -81,7 +81,7 @@ class UR5Simulation(ArmHost, Simulation):
             return ReachTask(ReachConfig(), 1, config.fps).sample(config.seed)
         if config.scene == "pick":
             return PickTask(PickConfig(), 1, config.fps).sample(config.seed)
-        return TableScene("empty", (), config.body().home)
+        return TableScene("empty", (), config.body().need(Arm).home)
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Put the arms and their objects where the scenes want them, at rest."""

@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
 
@@ -45,15 +45,16 @@ class SimulatedPlant:
         self.n = world.n
         body, efforts = world.body, world.efforts
         self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        if isinstance(body, Arm):
-            joints, names = body.chain.joints, body.actuators
-            positions, velocities = world.joint_slice(body.gripper.joints)
+        arm, drive = body.arm, body.drive
+        if arm is not None:
+            joints, names = arm.chain.joints, arm.actuators
+            positions, velocities = world.joint_slice(arm.gripper.joints)
             self._fingers = world.qpos[:, positions], world.qvel[:, velocities]
             self._grip = efforts[:, velocities.start]  # the force of their one actuator acts on each of them
-        elif isinstance(body, MobileBase):
-            joints, names = body.drive.joints, body.drive.actuators
+        elif drive is not None:
+            joints, names = drive.joints, drive.actuators
         else:
-            raise SimulationError(f"Body {body.name!r} is a {type(body).__name__}, which has no plant.")
+            raise SimulationError(f"Body {body.name!r} has neither a drive nor an arm: there is nothing to command.")
         positions, velocities = world.joint_slice(joints)
         self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
         self._effort = efforts[:, velocities]
@@ -61,7 +62,7 @@ class SimulatedPlant:
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
-        self._brakes = _Brakes(world, body) if isinstance(body, Arm) and body.brake_damping else None
+        self._brakes = _Brakes(world, arm) if arm is not None and arm.brake_damping else None
         # The views into the readings that are used, with the readings, which must live as long as their numbers count.
         self._views: dict[int, tuple[JointReading, _Views]] = {}
 
@@ -127,7 +128,7 @@ class _Brakes:
         self._velocity = world.qvel[:, world.joint_slice(arm.chain.joints)[1]]
         self._friction = np.asarray(arm.brake_slip) / np.asarray(arm.brake_damping)  # [rad/s]
         self._closed, self._ticks = np.zeros(world.n, np.bool_), np.zeros(world.n, np.int64)
-        self._closing_ticks = round(_CLOSING_S * arm.control_hz)
+        self._closing_ticks = round(_CLOSING_S * world.body.control_hz)
 
     def close(self, mask: NDArray[np.bool_]) -> None:
         """Close the brakes in `mask`, shape (n,), and open the others."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
+from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
@@ -33,12 +33,12 @@ def build_model(
         raise ConfigError(f"The MJCF of body {body.name!r} is not valid: {error}") from error
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    if isinstance(body, Arm):
-        add_table_stage(spec, body, fixtures)
-    elif isinstance(body, MobileBase):
-        _add_arena_stage(spec, body, pool_size)
+    if body.arm is not None:
+        add_table_stage(spec, body.root, body.arm, fixtures)
+    elif body.drive is not None:
+        _add_arena_stage(spec, body, body.drive.touch_sensor, pool_size)
     else:
-        raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; there are stages for Arm and MobileBase.")
+        raise ConfigError(f"The body {body.name!r} has neither a drive nor an arm: there is no scene for it.")
     try:
         model = spec.compile()
     except ValueError as error:
@@ -51,7 +51,7 @@ def build_model(
     return model
 
 
-def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> None:
+def _add_arena_stage(spec: mujoco.MjSpec, body: Body, touch_sensor: str, pool_size: int) -> None:
     """Add what stands around a base, and the sensor of its touches."""
     # Elliptic cones with a stiffer friction direction: with the defaults a wheel creeps through its contact by several
     # per cent, which would be an odometry error that no real tyre has.
@@ -70,7 +70,7 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
         fovy=46,
     )  # fmt: skip
     spec.add_sensor(
-        name=body.touch_sensor,
+        name=touch_sensor,
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=mujoco.mjtObj.mjOBJ_XBODY,
         objname=body.root,

@@ -26,13 +26,13 @@ TABLE_TOP = "table_top"  # what is seen of it
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 
 
-def add_table_stage(spec: mujoco.MjSpec, arm: Arm, fixtures: Sequence[Shape] = ()) -> None:
+def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence[Shape] = ()) -> None:
     """Add everything around an arm, and the arm's actuators, to the specification of its body.
 
     Fixtures stand on the table and do not give way; sensor ``force_fixture_<k>`` is the force that the k-th puts on the
     arm, in the base frame [N].
     """
-    _add_servos(spec, arm)
+    _add_servos(spec, root, arm)
     _add_options(spec)
     _add_room(spec)
     _add_table(spec)
@@ -43,13 +43,13 @@ def add_table_stage(spec: mujoco.MjSpec, arm: Arm, fixtures: Sequence[Shape] = (
     for number in range(MAX_OBJECTS):
         _add_object(spec, number)
     _add_target(spec)
-    _add_touch_sensors(spec, arm)
+    _add_touch_sensors(spec, root)
     for number, shape in enumerate(fixtures):
-        _add_fixture(spec, arm, number, shape)
+        _add_fixture(spec, root, number, shape)
     _add_start(spec, arm)
 
 
-def _add_servos(spec: mujoco.MjSpec, arm: Arm) -> None:
+def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
     """Add one actuator for each joint and the gripper's, with the arm's gains and limits."""
     positions = arm.actuation == "position"
     rows = zip(arm.actuators, arm.servo_stiffness, arm.servo_damping, arm.limits.effort, strict=True)
@@ -76,7 +76,7 @@ def _add_servos(spec: mujoco.MjSpec, arm: Arm) -> None:
         brake.set_to_damper(kv=damping)
     # The robot's own controller carries its own weight, with torque that counts against the limits.
     for body in spec.bodies:
-        if positions and body.name not in ("world", arm.root):
+        if positions and body.name not in ("world", root):
             body.gravcomp = 1.0
             for joint in body.joints:
                 joint.actgravcomp = True
@@ -207,13 +207,13 @@ def _add_target(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_touch_sensors(spec: mujoco.MjSpec, arm: Arm) -> None:
+def _add_touch_sensors(spec: mujoco.MjSpec, root: str) -> None:
     """Count contacts: of the whole arm with anything, the table and itself, and of the gripper with each object."""
     tree, one = mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_BODY
     pairs = [
-        ("touch_any", arm.root, None, None),
-        ("touch_table", arm.root, one, "table"),
-        ("touch_self", arm.root, tree, arm.root),
+        ("touch_any", root, None, None),
+        ("touch_table", root, one, "table"),
+        ("touch_self", root, tree, root),
         *((f"touch_object_{number}", "gripper", one, f"object_{number}") for number in range(MAX_OBJECTS)),
     ]
     for name, subtree, kind, other in pairs:
@@ -228,7 +228,7 @@ def _add_touch_sensors(spec: mujoco.MjSpec, arm: Arm) -> None:
         )
 
 
-def _add_fixture(spec: mujoco.MjSpec, arm: Arm, number: int, shape: Shape) -> None:
+def _add_fixture(spec: mujoco.MjSpec, root: str, number: int, shape: Shape) -> None:
     """Add something immovable to lean on, and the sensor of the force between it and the arm."""
     name, half, box = f"fixture_{number}", shape.height / 2, shape.kind == "box"
     body = spec.worldbody.add_body(
@@ -248,7 +248,7 @@ def _add_fixture(spec: mujoco.MjSpec, arm: Arm, number: int, shape: Shape) -> No
         objtype=mujoco.mjtObj.mjOBJ_BODY,
         objname=name,
         reftype=mujoco.mjtObj.mjOBJ_XBODY,
-        refname=arm.root,
+        refname=root,
         intprm=[2, 3, 1],  # data: force; reduce: net force, in the world frame; num: one slot
     )
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.engine import mujoco
@@ -50,9 +49,9 @@ class Tabletop:
     """
 
     def __init__(self, world: World) -> None:
-        if not isinstance(world.body, Arm):
-            raise SimulationError(f"A tabletop is for arms; {world.body.name!r} is a {type(world.body).__name__}.")
-        self.world, self.arm = world, world.body
+        if world.body.arm is None:
+            raise SimulationError(f"A tabletop is for arms; {world.body.name!r} has none.")
+        self.world, self.arm = world, world.body.arm
         model = world.model
         self._field = {name: world.model_field(name) for name in _FIELDS}
         self._bodies = np.array([model.body(f"object_{k}").id for k in range(MAX_OBJECTS)])

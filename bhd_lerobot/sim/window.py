@@ -2,7 +2,6 @@
 
 import os
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.camera import Pose
 from bhd_lerobot.sim.engine import mujoco
@@ -57,7 +56,7 @@ class Window:
         with self._viewer.lock():
             self._viewer.opt.geomgroup[:] = [1, 1, 0, 0, 0, 0]  # as the cameras see it
             self._viewer.opt.sitegroup[:] = 0
-            is_base = isinstance(world.body, MobileBase)
+            is_base = world.body.drive is not None
             self._viewer.cam.lookat[:] = (0.0, 0.0, 0.0) if is_base else _ARM
             self._viewer.cam.distance = _DISTANCE[is_base]
 

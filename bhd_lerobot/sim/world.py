@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
+from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
 from bhd_lerobot.sim.efforts import MeanEfforts
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
@@ -131,12 +131,12 @@ class World:
     ) -> None:
         if n < 1:
             raise SimulationError(f"A world needs at least one simulation, got n = {n}.")
-        if fixtures and not isinstance(body, Arm):
-            raise SimulationError(f"Fixtures stand on an arm's table; {body.name!r} is a {type(body).__name__}.")
+        if fixtures and body.arm is None:
+            raise SimulationError(f"Fixtures stand on an arm's table; {body.name!r} has no arm.")
         self.body = body
         self.n = n
         self.physics_hz = physics_hz or body.physics_hz
-        self.pool_size = pool_size = pool_size if isinstance(body, MobileBase) else 0
+        self.pool_size = pool_size = pool_size if body.drive else 0
         self.model = build_model(body, self.physics_hz, pool_size, fixtures)
         # One simulation is stepped by the calling thread; more threads would only add hand-overs.
         self._batch = mujoco_batch.Batch(self.model, n, nthread=1 if n == 1 else threads or 0)
@@ -174,7 +174,7 @@ class World:
             SimulationError: the poses do not fit, or the body is an arm and there are poses.
         """
         ids = self.selected(ids)
-        if isinstance(self.body, Arm):
+        if self.body.arm is not None:
             if poses is not None:
                 self._need_base("Start poses")
             self._reset_arm(ids)
@@ -206,13 +206,13 @@ class World:
             SimulationError: the body is no arm.
         """
         ids = self.selected(ids)
-        if not isinstance(self.body, Arm):
-            raise SimulationError(f"hold() is for arms; {self.body.name!r} is a {type(self.body).__name__}.")
-        joints = len(self.body.chain.joints)
-        fingers = self.joint_slice(self.body.gripper.joints)[0]
-        self.ctrl[ids, :joints] = self.qpos[ids, :joints] if self.body.actuation == "position" else 0.0
+        if (arm := self.body.arm) is None:
+            raise SimulationError(f"hold() is for arms; {self.body.name!r} has none.")
+        joints = len(arm.chain.joints)
+        fingers = self.joint_slice(arm.gripper.joints)[0]
+        self.ctrl[ids, :joints] = self.qpos[ids, :joints] if arm.actuation == "position" else 0.0
         self.ctrl[ids, joints] = self.qpos[ids, fingers.start] + self.qpos[ids, fingers.start + 1]
-        if self.body.actuation == "torque":
+        if arm.actuation == "torque":
             bias = self.derived("qfrc_bias")
             self.forward(ids)
             self.ctrl[ids, :joints] = bias[ids, :joints]
@@ -495,8 +495,8 @@ class World:
         return np.asarray(getattr(owner, name.removeprefix("opt.")))
 
     def _need_base(self, what: str) -> None:
-        if not isinstance(self.body, MobileBase):
-            raise SimulationError(f"{what} is for mobile bases; {self.body.name!r} is a {type(self.body).__name__}.")
+        if self.body.drive is None:
+            raise SimulationError(f"{what} is for mobile bases; {self.body.name!r} has no drive.")
 
     def selected(self, ids: Ids) -> NDArray[np.intp]:
         """Return the numbers of the simulations that `ids` names."""

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS
-from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.options.declared import OneOf, Positive
 from bhd_lerobot.tasks.task import BaseTask, Event, Outcome, TaskConfig
@@ -39,9 +38,9 @@ class FreeTask(BaseTask):
 
     def sample(self, seed: int) -> Any:
         """Return where a simulated robot is; None if it is not known what robot it is."""
-        if isinstance(self.body, MobileBase):
+        if self.body and self.body.drive:
             return self.arena(self.config.arena, seed)
-        return TableScene("empty", (), self.body.home) if isinstance(self.body, Arm) else None
+        return TableScene("empty", (), self.body.arm.home) if self.body and self.body.arm else None
 
     def instruction(self, scene: Any) -> str:
         """Return the instruction."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive
 from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
@@ -161,7 +160,7 @@ class PickTask(ArmTask):
         return TableScene(
             name="pick",
             objects=tuple(objects[place] for place in places),
-            posture=_HOME,
+            posture=self.arm.home,
             target_object=places.index(0),
             instruction=phrase.format(name),
             variation=variation,
@@ -255,7 +254,6 @@ class PickTask(ArmTask):
 
 
 _NOTHING = np.array([float(name == "qw") for name in OBJECT_FIELDS])  # zeros, and the identity
-_HOME = ur5().home
 
 
 def _target_first(objects: Sequence[TableObject], target: int) -> list[TableObject]:

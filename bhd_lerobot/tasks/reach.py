@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
@@ -182,5 +182,5 @@ def _draw_target(rng: np.random.Generator, kinematics: ArmKinematics) -> tuple[f
 
 @cache
 def _kinematics() -> tuple[ArmKinematics, tuple[float, ...]]:
-    arm = ur5()
+    arm = ur5().need(Arm)
     return ArmKinematics(arm.chain, arm.limits), arm.home

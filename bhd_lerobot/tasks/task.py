@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import BURGER_RADIUS, Arena, make_arena
-from bhd_lerobot.bodies.body import Body, MobileBase
+from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Options
 from bhd_lerobot.options.registry import Registry
@@ -69,7 +70,7 @@ def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
         task: the task's type; None if it is not known.
         body: the robot's hardware; None if it is not known.
     """
-    grasping = (Event.WRONG_OBJECT, Event.DROPPED) if isinstance(body, MobileBase) else ()
+    grasping = (Event.WRONG_OBJECT, Event.DROPPED) if body and body.drive else ()
     known = getattr(TASKS[task], "never", ()) if task and task in TASKS else ()  # of one that is not known, anything
     never = {event.cause for event in (*known, *grasping)}
     return tuple(name for name in OUTCOMES if name not in never)
@@ -235,7 +236,7 @@ class BaseTask(ConfiguredTask):
 
     def arena(self, name: str, seed: int, random_start: bool = False) -> Arena:
         """Return an arena that this robot can get through."""
-        radius = self.body.radius if isinstance(self.body, MobileBase) else BURGER_RADIUS
+        radius = self.body.drive.radius if self.body and self.body.drive else BURGER_RADIUS
         return make_arena(name, seed, random_start, robot_radius=radius)
 
 
@@ -243,6 +244,11 @@ class ArmTask(ConfiguredTask):
     """What the tasks of arms have in common; their scenes are `TableScene`."""
 
     robot_kind = "arm"
+
+    @property
+    def arm(self) -> Arm:
+        """The robot's arm; a UR5 where the robot is not known."""
+        return (self.body or ur5()).need(Arm)
 
 
 class PathLengths:

@@ -8,7 +8,7 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Rates
+from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals
 from bhd_lerobot.control.kernels import never_compiled
@@ -27,15 +27,15 @@ class GoalStreamer:
     LeRobot's `Robot` takes setpoints only; a brain that gives goals drives it through this.
 
     Args:
-        arm: the arm.
+        body: the robot, with an arm.
         rates: the rates.
         start: where the arm's reference is now, joint angles [rad] and the gripper's opening [m], shape (7,).
     """
 
-    def __init__(self, arm: Arm, rates: Rates, start: NDArray[np.float64]) -> None:
+    def __init__(self, body: Body, rates: Rates, start: NDArray[np.float64]) -> None:
         self._rates = rates
         with never_compiled():  # LeRobot's loop has begun
-            self._controller = ArmController(arm, 1, rates.control_hz, rates.ticks_per_frame)
+            self._controller = ArmController(body, 1, rates.control_hz, rates.ticks_per_frame)
         self._reading = PlantReading(1, self._controller.joints)
         self._reading.position[0] = start
         self._controller.configure(np.zeros(1, np.intp), self._reading)
@@ -147,7 +147,7 @@ class BhdBrain(Teleoperator):
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             if not is_for(robot_of_brain(self.config.brain), robot.name):
-                is_arm = isinstance(robot.host.body, Arm)
+                is_arm = robot.host.body.arm is not None
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
@@ -184,7 +184,7 @@ class BhdBrain(Teleoperator):
     def _stream(self, robot: BhdRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
         """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
         body, rates = robot.host.body, robot.host.rates
-        if not isinstance(body, Arm) or body.actuation != "position":
+        if body.arm is None or body.arm.actuation != "position":
             raise ConfigError(
                 f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5 with robot.control = servo."
             )

@@ -112,7 +112,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         if GRIPPER not in observation:
             raise ConfigError(f"The observation has {', '.join(observation)}; bhd_keyboard_arm needs {GRIPPER}, too.")
         if self.config.action_space == "tool":
-            self._target = ToolTarget(observation, body if isinstance(body, Arm) else ur5(), say)
+            self._target = ToolTarget(observation, (body or ur5()).need(Arm), say)
         else:
             self._target = JointTarget(observation)
         self._opening = self._opening_target = float(observation[GRIPPER])
@@ -162,7 +162,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         (robot,) = robots
         if robot is not self._robot:
             body = robot.host.body
-            if list(robot.action_names) != list(self.action_features) or not isinstance(body, Arm):
+            if list(robot.action_names) != list(self.action_features) or body.arm is None:
                 raise ConfigError(
                     f"bhd_keyboard_arm gives {', '.join(self.action_features)}; the {robot.name} takes "
                     f"{', '.join(robot.action_names)}. An arm and its keys have one action space, tool or joint: give "

@@ -93,8 +93,8 @@ class ToolTarget:
 
     names: tuple[str, ...] = POSE_NAMES
 
-    def __init__(self, observation: Mapping[str, Any], body: Arm, report: Callable[[str], None]) -> None:
-        self._kinematics = ArmKinematics(body.chain, body.limits)
+    def __init__(self, observation: Mapping[str, Any], arm: Arm, report: Callable[[str], None]) -> None:
+        self._kinematics = ArmKinematics(arm.chain, arm.limits)
         self._report = report
         self._posture = _read(observation, JOINT_NAMES)
         self._position, self._rotation = self._measured(observation)

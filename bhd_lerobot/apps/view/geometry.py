@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.apps.view.groups import names_of, scan_of
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.bodies.body import Arm, Drive
 from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
@@ -52,7 +52,7 @@ def views_of(
     arrays: Arrays = {}
     scan = scan_of(names)
     if scan is not None:
-        lidar = body.lidar if isinstance(body, MobileBase) else None
+        lidar = body.lidar if body else None
         about["scan"] = {
             "column": keys.OBSERVATION_STATE,
             "first": scan[0],
@@ -60,52 +60,53 @@ def views_of(
             "range_max": lidar.range_max if lidar else None,
             "x": lidar.ahead if lidar else 0.0,
         }
-    if isinstance(body, Arm) and (joints := _joints(body, names, observed, physics)) is not None:
-        capsules = body.chain.capsules
+    arm, drive = (body.arm, body.drive) if body else (None, None)
+    if arm is not None and (joints := _joints(arm, names, observed, physics)) is not None:
+        capsules = arm.chain.capsules
         palm = next(number for number, capsule in enumerate(capsules) if capsule.name == "palm")
         about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": palm}
-        arrays |= _arm(body, *joints)
-        if physics is not None and physics.shape[1] > _arm_state(body):
-            arrays["objects"] = _objects(body, physics)
-    elif isinstance(body, MobileBase) and physics is not None and physics.shape[1] > _BASE_STATE:
-        about["base"] = {"from": "simulator", **_shape(body)}
+        arrays |= _arm(arm, *joints)
+        if physics is not None and physics.shape[1] > _arm_state(arm):
+            arrays["objects"] = _objects(arm, physics)
+    elif drive is not None and physics is not None and physics.shape[1] > _BASE_STATE:
+        about["base"] = {"from": "simulator", **_shape(drive)}
         w, x, y, z = physics[:, 3:7].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         arrays["base"] = np.column_stack([physics[:, :2], yaw]).astype(np.float32)
     elif observed is not None and {"x.pos", "y.pos", "theta.pos"} <= set(names):
-        about["base"] = {"from": "odometry", **_shape(body)}
+        about["base"] = {"from": "odometry", **_shape(drive)}
         arrays["base"] = observed[:, [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]]
     return about, arrays
 
 
-def _shape(body: Body | None) -> dict[str, Any]:
+def _shape(drive: Drive | None) -> dict[str, Any]:
     """Return how a base is drawn [m]; one that is not known is a box of 0.2 m."""
-    if not isinstance(body, MobileBase):
+    if drive is None:
         return {"radius": 0.1, "height": 0.2, "outline": [(-0.1, 0.1, 0.07)]}
-    return {"radius": body.radius, "height": body.height, "outline": body.outline}
+    return {"radius": drive.radius, "height": drive.height, "outline": drive.outline}
 
 
-def _arm_state(body: Arm) -> int:
+def _arm_state(arm: Arm) -> int:
     """Return how many numbers the position of an arm with a gripper of two fingers and of all objects has."""
-    return len(body.chain.joints) + 2 + 7 * MAX_OBJECTS
+    return len(arm.chain.joints) + 2 + 7 * MAX_OBJECTS
 
 
 def _joints(
-    body: Arm, names: list[str], observed: NDArray | None, physics: NDArray | None
+    arm: Arm, names: list[str], observed: NDArray | None, physics: NDArray | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return joint positions (frames, joints) and the gripper's opening (frames,), of the simulator if it is there."""
-    dof = len(body.chain.joints)
-    if physics is not None and physics.shape[1] > _arm_state(body):
+    dof = len(arm.chain.joints)
+    if physics is not None and physics.shape[1] > _arm_state(arm):
         return physics[:, :dof].astype(np.float64), physics[:, dof : dof + 2].sum(axis=1).astype(np.float64)
-    wanted = [f"{joint}.pos" for joint in body.chain.joints]
+    wanted = [f"{joint}.pos" for joint in arm.chain.joints]
     if observed is None or not set(wanted) <= set(names):
         return None
     opening = observed[:, names.index("gripper.pos")] if "gripper.pos" in names else np.zeros(len(observed))
     return observed[:, [names.index(name) for name in wanted]].astype(np.float64), opening.astype(np.float64)
 
 
-def _arm(body: Arm, joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
-    chain = body.chain
+def _arm(arm: Arm, joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
+    chain = arm.chain
     kinematics = ForwardKinematics(chain)
     frames = kinematics.frames(joints)
     capsules = np.empty((len(joints), len(chain.capsules), 2, 3), np.float32)
@@ -120,11 +121,9 @@ def _arm(body: Arm, joints: NDArray[np.float64], opening: NDArray[np.float64]) -
     return {"capsules": capsules.reshape(len(joints), -1, 6), "tool": tool.astype(np.float32)}
 
 
-def _objects(body: Arm, physics: NDArray) -> NDArray[np.float32]:
+def _objects(arm: Arm, physics: NDArray) -> NDArray[np.float32]:
     objects = (
-        physics[:, len(body.chain.joints) + 2 : _arm_state(body)]
-        .reshape(len(physics), MAX_OBJECTS, 7)
-        .astype(np.float32)
+        physics[:, len(arm.chain.joints) + 2 : _arm_state(arm)].reshape(len(physics), MAX_OBJECTS, 7).astype(np.float32)
     )
     objects[objects[..., 2] > _AWAY_M] = np.nan
     return objects

@@ -6,12 +6,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.bodies.body import Arm, PositionLimits
 from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
@@ -64,15 +62,9 @@ def limits_of(robot_type: str | None) -> Limits:
     body = body_of(robot_type)
     if body is None:
         return {}
-    limits = body.limits
-    if isinstance(limits, PositionLimits):
-        low, high = np.asarray(limits.lower), np.asarray(limits.upper)
-    else:
-        high = np.asarray(limits.velocity)
-        low = -high
-    ranges = dict(zip(limits.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+    ranges = dict(zip(body.limits.names, zip(*body.limits.bounds, strict=True), strict=True))
     # What a base measures, slip and all, may be a little more than its command.
-    return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if isinstance(body, Arm) else {})}
+    return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if body.arm else {})}
 
 
 def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.held import HeldObjects
@@ -85,12 +85,12 @@ class ArmController(Controller):
         planning: who plans goals; they are planned in the tick that they start in if None.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
-        limits = arm.limits
+    def __init__(self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
+        arm, limits = body.need(Arm), body.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
-        self.goals = GoalManager(arm, n, control_hz, planning)
-        share = acceleration_share(arm)  # setpoints are not planned: their torques have to suffice in any posture
+        self.goals = GoalManager(body, n, control_hz, planning)
+        share = acceleration_share(body)  # setpoints are not planned: their torques have to suffice in any posture
         calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
         clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)
         self.setpoints = SetpointFilter(calm, n, control_hz, frame_ticks, clearance)
@@ -122,7 +122,7 @@ class ArmController(Controller):
         self._forward = ForwardKinematics(arm.chain)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
-        self._bend = 0.9 * WireLimits.of(arm, control_hz).bend[:-1]
+        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:-1]
         self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
         self._stamp_ns, self._silent_ticks, self._late_s = 0, 0, self._relief.late_s  # the same array
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.arm.wrench import tool_wrench
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
@@ -60,14 +60,15 @@ class ForceLimit:
         ConfigError: the largest force is not positive.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, largest: float, *, wrench: bool = False) -> None:
+    def __init__(self, body: Body, n: int, control_hz: int, largest: float, *, wrench: bool = False) -> None:
+        arm = body.need(Arm)
         if not largest > 0.0:
             raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
         self.largest, self._load = largest, arm.load
         self._hung: NDArray[np.int64] = np.zeros(n, np.int64)  # estimates at rest with a load that was not declared
         self._most_hung = round(_LOAD_S / _PERIOD_S)
         self._pull = np.zeros(n)
-        self._dynamics, self._forward = ArmDynamics(arm), ForwardKinematics(arm.chain)
+        self._dynamics, self._forward = ArmDynamics(body), ForwardKinematics(arm.chain)
         self._dof = dof = self._dynamics.dof
         effort = np.asarray(arm.limits.effort[:dof])
         self._certain = effort.max() / effort  # weights: torques are as wrong as their motors are large

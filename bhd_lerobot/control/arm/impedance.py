@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
 from bhd_lerobot.control.arm.equilibrium import SPEED, TURN_SPEED, Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
@@ -60,7 +60,7 @@ class ImpedanceController(Controller):
         wrench: the feed-forward wrench in force, force [N] and moment [N m] in the base frame, shape (n, 6).
 
     Args:
-        arm: the arm; its actuation is ``"torque"``.
+        body: the robot; the actuation of its arm is ``"torque"``.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
         max_force: a larger force between the tool and its surroundings is a protective stop [N].
@@ -71,14 +71,15 @@ class ImpedanceController(Controller):
 
     width = WIDTH
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int, max_force: float = 150.0) -> None:
+    def __init__(self, body: Body, n: int, control_hz: int, frame_ticks: int, max_force: float = 150.0) -> None:
+        arm = body.need(Arm)
         if arm.actuation != "torque":
-            raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
+            raise ConfigError(f"The arm {body.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
         if not arm.brake_damping:
-            raise ConfigError(f"The arm {arm.name!r} has no brakes (Arm.brake_damping); impedance needs them.")
+            raise ConfigError(f"The arm {body.name!r} has no brakes (Arm.brake_damping); impedance needs them.")
         self.arm, self.n, self._max_force = arm, n, max_force
         self.joints = len(arm.limits.names)
-        self.dynamics = ArmDynamics(arm)
+        self.dynamics = ArmDynamics(body)
         dof = self.dynamics.dof
         self.contact = ContactObserver(n, dof, control_hz, OBSERVER_GAIN)
         self.contact_wrench = self.contact.wrench

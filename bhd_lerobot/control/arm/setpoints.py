@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import PositionLimits
+from bhd_lerobot.bodies.body import Limits
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 from bhd_lerobot.control.kernels import clamp, kernel, largest_change
 from bhd_lerobot.control.messages import Limit
@@ -140,7 +140,7 @@ class SetpointFilter:
 
     def __init__(
         self,
-        limits: PositionLimits,
+        limits: Limits,
         n: int,
         control_hz: int,
         frame_ticks: int,

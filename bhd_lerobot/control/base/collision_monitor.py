@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import LidarSpec, MobileBase
+from bhd_lerobot.bodies.body import Drive, LidarSpec
 
 MARGIN = 0.02  # [m] beside the robot's outline: twice the noise of an LDS-01
 _DELAY_S = 0.03  # from a measurement to wheels that brake: two ticks and the servos' time constant, 11 ms
@@ -30,25 +30,25 @@ class CollisionMonitor:
     moves only where it was.
 
     Args:
-        body: limits, radius and lidar.
+        drive: limits, radius and outline.
         lidar: the lidar.
         n: number of bases.
         control_hz: ticks a second [Hz].
         beams: ranges in a scan, counter-clockwise from ahead.
     """
 
-    def __init__(self, body: MobileBase, lidar: LidarSpec, n: int, control_hz: int, beams: int) -> None:
+    def __init__(self, drive: Drive, lidar: LidarSpec, n: int, control_hz: int, beams: int) -> None:
         self.beams = beams
         angle = 2 * np.pi * np.arange(beams) / beams
         self._directions, self._ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1), lidar.ahead
         self._range_min, self._range_max = lidar.range_min, lidar.range_max
-        fastest = body.limits.velocity[0]
-        self._deceleration = _SHARE * body.limits.stop_deceleration[0]
-        self._largest_change = np.asarray(body.limits.stop_deceleration) / control_hz
-        self._outline = body.outline
+        fastest = drive.limits.velocity[0]
+        self._deceleration = _SHARE * drive.limits.stop_deceleration[0]
+        self._largest_change = np.asarray(drive.limits.stop_deceleration) / control_hz
+        self._outline = drive.outline
         self._oldest_ticks = round(_OLDEST_SCANS * control_hz / lidar.rate_hz)
         way = fastest * (_OLDEST_SCANS / lidar.rate_hz + _DELAY_S) + fastest**2 / (2 * self._deceleration)
-        self._reach = body.radius + MARGIN + way  # what is farther cannot matter before the scan is too old
+        self._reach = drive.radius + MARGIN + way  # what is farther cannot matter before the scan is too old
         self._near: list[NDArray[np.float64]] = [np.zeros((0, 2))] * n  # returns in the frame of the odometry [m]
         self._too_near: list[NDArray[np.bool_]] = [np.zeros(0, np.bool_)] * n  # nearer than the lidar can measure
         width = round(math.radians(_BESIDE_DEG) / (2 * np.pi) * beams)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
 from bhd_lerobot.control.base.diff_drive import DiffDrive, wheels_from_twist
 from bhd_lerobot.control.base.limits import limit_command
@@ -108,7 +108,7 @@ class BaseController(Controller):
     twist itself for a base whose own controller turns it into those.
 
     Args:
-        body: limits and wheels.
+        drive: limits and wheels.
         n: number of bases.
         control_hz: ticks a second [Hz].
         monitor: what keeps them from driving into what their scans show, the first values of the reading's sensors.
@@ -124,7 +124,7 @@ class BaseController(Controller):
 
     def __init__(
         self,
-        body: MobileBase,
+        drive: Drive,
         n: int,
         control_hz: int,
         *,
@@ -133,7 +133,7 @@ class BaseController(Controller):
         takes: str = "actuators",
         latency_s: float = 0.0,
     ) -> None:
-        limits, drive = body.limits, body.drive
+        limits = drive.limits
         self._monitor, self._gyro = monitor, gyro
         self.width = width = len(limits.names)
         self.drive = DiffDrive(drive, n)
@@ -160,11 +160,11 @@ class BaseController(Controller):
         self._turned, self._looks = np.zeros(n), np.zeros((n, 3), np.int64)
         # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
         self._ticks, self._dt = 0, 1 / control_hz
-        self._period = max(1, round(body.stalled_s / _LOOKS * control_hz))
+        self._period = max(1, round(drive.stalled_s / _LOOKS * control_hz))
         self._look_at = np.tile([self._period, 0, -1], (n, 1))
         self._late = np.zeros((n, self.joints, 1 + math.ceil(latency_s * control_hz / self._period - 1e-9)))
         self._stamp_ns, self._first = np.zeros(n, np.int64), np.zeros((n, self.joints))
-        self._patience_s, self._latency_s = body.stalled_s + latency_s, latency_s
+        self._patience_s, self._latency_s = drive.stalled_s + latency_s, latency_s
         wheels = 1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed
         turn, error = drive.wheel_radius / drive.wheel_separation, drive.max_torque / drive.servo_gain
         change = np.array([limits.acceleration, limits.stop_deceleration]) / control_hz

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import WheelDrive
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.control.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class DiffDrive:
     A twist is the forward speed [m/s] and the yaw rate [rad/s]; wheels are left, right.
     """
 
-    def __init__(self, drive: WheelDrive, n: int) -> None:
+    def __init__(self, drive: Drive, n: int) -> None:
         self.drive = drive
         self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
         self.odometry: Array = np.zeros((n, 3))

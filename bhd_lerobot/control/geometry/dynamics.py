@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.versions import check_version
@@ -68,20 +68,21 @@ class ArmDynamics:
         ConfigError: the MJCF has other joints than the arm's chain and gripper, no tool, or the opening is impossible.
     """
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, body: Body) -> None:
+        arm = body.need(Arm)
         opening = arm.home[-1]
         if not 0.0 <= opening <= arm.gripper.max_opening:
             raise ConfigError(
                 f"The gripper's opening is {opening} m; it must be between 0 and {arm.gripper.max_opening} m."
             )
-        whole = _parse(arm)
+        whole = _parse(body)
         joints, wanted = tuple(whole.names)[1:], (*arm.chain.joints, *arm.gripper.joints)
         if joints != wanted:
-            raise ConfigError(f"The MJCF of {arm.name!r} has the joints {joints}; it needs {wanted}.")
+            raise ConfigError(f"The MJCF of {body.name!r} has the joints {joints}; it needs {wanted}.")
         posture = pinocchio.neutral(whole)
         if not whole.existFrame(TOOL_SITE):
-            if not re.search(rf"<site\b[^>]*\bname=[\"']{TOOL_SITE}[\"']", arm.mjcf):
-                raise ConfigError(f"The MJCF of {arm.name!r} has no site {TOOL_SITE!r}, the tool centre point.")
+            if not re.search(rf"<site\b[^>]*\bname=[\"']{TOOL_SITE}[\"']", body.mjcf):
+                raise ConfigError(f"The MJCF of {body.name!r} has no site {TOOL_SITE!r}, the tool centre point.")
             _add_tool(whole, arm, posture)
         posture[-2:] = opening / 2
         locked = [whole.getJointId(name) for name in arm.gripper.joints]
@@ -131,19 +132,20 @@ class ArmDynamics:
         return torque
 
 
-def acceleration_share(arm: Arm) -> float:
+def acceleration_share(body: Body) -> float:
     """Return the share of an arm's accelerations that its motors can give in any posture, with its declared load.
 
     All joints at once, in the worst directions: for motions that are not planned. An arm without a load is taken to be
     able to do what its limits say.
     """
-    if not arm.load or not arm.mjcf:
+    arm = body.need(Arm)
+    if not arm.load or not body.mjcf:
         return 1.0
     dof = len(arm.chain.joints)
     lower, upper = np.asarray(arm.limits.lower[:dof]), np.asarray(arm.limits.upper[:dof])
     acceleration, effort = np.asarray(arm.limits.acceleration[:dof]), np.asarray(arm.limits.effort[:dof])
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, dof))
-    terms = ArmDynamics(arm).terms(postures, np.zeros_like(postures))
+    terms = ArmDynamics(body).terms(postures, np.zeros_like(postures))
     room = effort - np.abs(terms.gravity)
     return float(np.clip((room / (SWING * np.abs(terms.mass) @ acceleration)).min(), _LEAST_SHARE, 1.0))
 
@@ -162,12 +164,12 @@ def _add_tool(whole: pinocchio.Model, arm: Arm, posture: Array) -> None:
     whole.addFrame(pinocchio.Frame(TOOL_SITE, last, 0, data.oMi[last].actInv(tool), pinocchio.FrameType.OP_FRAME))
 
 
-def _parse(arm: Arm) -> pinocchio.Model:
+def _parse(body: Body) -> pinocchio.Model:
     """Return the model of the whole MJCF; the parser reads files only."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{arm.name}.xml"
-        path.write_text(arm.mjcf, encoding="utf-8")
+        path = Path(folder) / f"{body.name}.xml"
+        path.write_text(body.mjcf, encoding="utf-8")
         try:
             return pinocchio.buildModelFromMJCF(str(path))
         except (ValueError, RuntimeError) as error:
-            raise ConfigError(f"The MJCF of {arm.name!r} is not valid: {error}") from error
+            raise ConfigError(f"The MJCF of {body.name!r} is not valid: {error}") from error

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import ArmChain, PositionLimits
+from bhd_lerobot.bodies.body import ArmChain, Limits
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry import inverse_kinematics
 from bhd_lerobot.control.geometry.collision import CollisionModel
@@ -52,7 +52,7 @@ class ArmKinematics(ForwardKinematics):
         ConfigError: the chain has another structure than the closed form can solve, or too few limits.
     """
 
-    def __init__(self, chain: ArmChain, limits: PositionLimits) -> None:
+    def __init__(self, chain: ArmChain, limits: Limits) -> None:
         super().__init__(chain)
         if len(limits.names) < DOF:
             raise ConfigError(f"There are limits for {len(limits.names)} commands; the arm has {DOF} joints.")

@@ -5,7 +5,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Capsule
+from bhd_lerobot.bodies.body import Arm, Body, Capsule
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.motion.planner import GoalPlanner
@@ -44,8 +44,9 @@ class GoalManager:
         planning: who plans; planned in the tick that a goal starts in if None.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, planning: Planning | None = None) -> None:
-        self.planner = GoalPlanner(arm, control_hz)
+    def __init__(self, body: Body, n: int, control_hz: int, planning: Planning | None = None) -> None:
+        arm = body.need(Arm)
+        self.planner = GoalPlanner(body, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import HELD, OBSTACLE, Arm, Capsule
+from bhd_lerobot.bodies.body import HELD, OBSTACLE, Arm, Body, Capsule
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.dynamics import SWING, ArmDynamics, acceleration_share
@@ -54,14 +54,15 @@ class GoalPlanner:
     """Plans goals of one arm.
 
     Args:
-        arm: limits and geometry.
+        body: limits and geometry of its arm.
         control_hz: ticks a second [Hz].
 
     Raises:
         VersionError: Ruckig is not installed.
     """
 
-    def __init__(self, arm: Arm, control_hz: int) -> None:
+    def __init__(self, body: Body, control_hz: int) -> None:
+        arm = body.need(Arm)
         load_ruckig()  # not in the tick that plans the first goal
         self.arm, self.hz = arm, control_hz
         self.kinematics = ArmKinematics(arm.chain, arm.limits)
@@ -70,9 +71,9 @@ class GoalPlanner:
         self.stop_limits = MotionLimits.of(arm.limits, stop=True)
         self._arm, self._gripper = slice(0, dof), slice(dof, dof + 1)
         # Without a load the limits leave the motors room enough.
-        self._dynamics = ArmDynamics(arm) if arm.load and arm.mjcf else None
+        self._dynamics = ArmDynamics(body) if arm.load and body.mjcf else None
         self._collision = self.kinematics.collision  # of the arm and what it holds, for the plan that is made
-        self._calm = self.limits.scaled(1.0, acceleration_share(arm))
+        self._calm = self.limits.scaled(1.0, acceleration_share(body))
 
     def check(self, command: BrainCommand) -> PlanFailure | None:
         """Return what is wrong with a goal whatever the arm's state, or None."""

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import PositionLimits
+from bhd_lerobot.bodies.body import Limits
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.errors import VersionError
 from bhd_lerobot.versions import check_version
@@ -100,7 +100,7 @@ class MotionLimits:
     upper: Array
 
     @classmethod
-    def of(cls, limits: PositionLimits, *, stop: bool = False) -> Self:
+    def of(cls, limits: Limits, *, stop: bool = False) -> Self:
         """Return the limits of normal motion, or those of a stop."""
         acceleration, jerk = (
             (limits.stop_deceleration, limits.stop_jerk) if stop else (limits.acceleration, limits.jerk)

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, MobileBase, PositionLimits
+from bhd_lerobot.bodies.body import Arm, Body, LidarSpec
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns, find_scan
@@ -82,7 +82,7 @@ class StallWatch:
 
     def __init__(self, frames: int, robot: RobotFeatures) -> None:
         self._window, self._dt = frames + 1, 1.0 / robot.fps
-        self._is_base = isinstance(robot.body, MobileBase)
+        self._is_base = robot.body is not None and robot.body.drive is not None
         names = _TWIST if self._is_base else _body_of(robot).limits.names[:-1]
         self._width = 2 if self._is_base else len(names)
         self._columns = find_columns(robot.observation_names, names, "dagger", "observation")
@@ -128,10 +128,8 @@ class DisagreementWatch(_FrameCounter):
                 f"{', '.join(robot.action_names)}. Leave it out, or drive a simulated base, or an arm with "
                 "--robot.action_space=joint."
             )
-        if isinstance(limits, PositionLimits):
-            self._range = np.array(limits.upper) - np.array(limits.lower)
-        else:
-            self._range = 2 * np.array(limits.velocity)
+        lower, upper = limits.bounds
+        self._range = np.array(upper) - np.array(lower)
 
     def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Count the frames of disagreement."""
@@ -145,12 +143,11 @@ class BaseCollisionWatch(Watch):
 
     cause = "about to collide"
 
-    def __init__(self, horizon_s: float, robot: RobotFeatures, body: MobileBase) -> None:
-        assert body.lidar is not None
+    def __init__(self, horizon_s: float, robot: RobotFeatures, body: Body) -> None:
         self._scan, self._angles = find_scan(robot.observation_names, "dagger")
         self._twist = find_columns(robot.action_names, _TWIST, "dagger", "action")
         self._limit = np.array(body.limits.velocity)
-        self._footprint, self._no_return = Footprint.of(body), body.lidar.range_max - _ROUNDING
+        self._footprint, self._no_return = Footprint.of(body), body.need(LidarSpec).range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
 
     def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
@@ -183,17 +180,17 @@ class ArmCollisionWatch(Watch):
 
     cause = "about to collide"
 
-    def __init__(self, robot: RobotFeatures, body: Arm) -> None:
-        limits, dof = body.limits, len(body.chain.joints)
+    def __init__(self, robot: RobotFeatures, arm: Arm) -> None:
+        limits, dof = arm.limits, len(arm.chain.joints)
         joints, actions = limits.names[:dof], robot.action_names
         self._position = find_columns(robot.observation_names, joints, "dagger", "observation")
         speeds = [name.replace(".pos", ".vel") for name in joints]
         self._velocity = find_columns(robot.observation_names, speeds, "dagger", "observation")
         self._actions = find_columns(actions, joints, "dagger", "action") if set(joints) <= set(actions) else None
-        self._model, self._fps = ArmKinematics(body.chain, limits).collision, robot.fps
+        self._model, self._fps = ArmKinematics(arm.chain, limits).collision, robot.fps
         self._speed, self._change = np.array(limits.velocity[:dof]), np.array(limits.acceleration[:dof])
         self._delay = self._change / np.array(limits.jerk[:dof])
-        self._least = body.chain.min_distance
+        self._least = arm.chain.min_distance
 
     def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Compare the postures on the way to rest with the table and with each other."""
@@ -216,11 +213,11 @@ class ArmCollisionWatch(Watch):
 
 def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
     """Return what watches a robot for collisions."""
-    match robot.body:
-        case MobileBase(lidar=lidar) as base if lidar is not None:
-            return BaseCollisionWatch(horizon_s, robot, base)
-        case Arm() as arm:
-            return ArmCollisionWatch(robot, arm)
+    body = robot.body
+    if body is not None and body.drive is not None and body.lidar is not None:
+        return BaseCollisionWatch(horizon_s, robot, body)
+    if body is not None and body.arm is not None:
+        return ArmCollisionWatch(robot, body.arm)
     raise ConfigError(
         "brain.collision_s foresees collisions of simulated arms and of simulated bases with a lidar, not of a robot "
         f"with the actions {', '.join(robot.action_names)}. Leave it out: --brain.collision_s=null."

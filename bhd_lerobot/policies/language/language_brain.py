@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError, NothingFitsError, PerceptionError
@@ -86,6 +87,7 @@ class LanguageBrain(PickBrain):
         self._planner = planner or RulePlanner()
         self.perceiver = Perceiver(self.settings.perception) if self.settings.perception.path else None
         self._sights: dict[int, _Sight] = {}
+        self._home: tuple[float, ...] = ()
 
     @property
     def uses_images(self) -> bool:  # type: ignore[override]
@@ -100,6 +102,7 @@ class LanguageBrain(PickBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the gripper, and the objects or the camera that shows them."""
         super().bind(robot)
+        self._home = (robot.body or ur5()).need(Arm).home
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
 
@@ -246,13 +249,10 @@ class LanguageBrain(PickBrain):
         work.stage, work.plan, work.grasp, self._sights[sim].objects = "home", None, None, None
         return BrainCommand(
             self.new_id(sim, "home"),
-            joint_target=_HOME[:-1],
+            joint_target=self._home[:-1],
             max_velocity=_HOME_SPEED,
             max_acceleration=_HOME_CHANGE,
         )
-
-
-_HOME = ur5().home
 
 
 def _otherwise(objects: Sequence[SeenObject]) -> Iterator[Sequence[SeenObject]]:

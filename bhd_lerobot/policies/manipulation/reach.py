@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
@@ -30,10 +31,11 @@ class ReachBrain(GoalBrain):
         super().__init__(config or ReachBrainConfig())
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._tries: dict[int, int] = {}
-        self._home = ur5().home
+        self._home: tuple[float, ...] = ()
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the target."""
+        """Find the target, and home."""
+        self._home = (robot.body or ur5()).need(Arm).home
         self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:

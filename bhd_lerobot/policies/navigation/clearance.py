@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
 
 Array = NDArray[np.float64]
 
@@ -44,10 +44,10 @@ class Footprint(NamedTuple):
     half_track: float
 
     @classmethod
-    def of(cls, body: MobileBase) -> Self:
+    def of(cls, body: Body) -> Self:
         """Return the footprint of a base with a lidar."""
-        assert body.lidar is not None
-        return cls(body.outline, body.lidar.ahead, body.drive.wheel_separation / 2)
+        drive = body.need(Drive)
+        return cls(drive.outline, body.need(LidarSpec).ahead, drive.wheel_separation / 2)
 
     def distance(self, x: Array, y: Array) -> Array:
         """Return the distance from points in the robot's frame to its outline [m], 0 inside."""

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Positive, Range, Share
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
@@ -71,7 +70,7 @@ class DrivingBrain(ConfiguredBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist, and prepare the look-up table for this shape and this number of beams."""
         config = self.config
-        if not isinstance(robot.body, MobileBase) or robot.body.lidar is None:
+        if robot.body is None or robot.body.drive is None or robot.body.lidar is None:
             raise ConfigError(
                 f"The brain {self.name!r} needs to know the shape of its robot; it drives simulated bases with a lidar."
             )

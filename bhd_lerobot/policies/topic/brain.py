@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import BrainStoppedError, ConfigError, RealtimeError, unknown_name
 from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
@@ -59,7 +58,7 @@ class TopicBrain(ConfiguredBrain):
         self._link.open(patience_s=None)
 
     def _default(self, robot: RobotFeatures) -> MappingConfig:
-        if isinstance(robot.body, MobileBase):
+        if robot.body and robot.body.drive:
             msgtype = TWIST_TYPE if self.config.network.distro == "humble" else STAMPED_TWIST
             return MappingConfig(action=entries(BASE_TOPIC, msgtype, robot.action_names))
         numbered = enumerate(robot.action_names)

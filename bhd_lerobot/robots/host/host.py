@@ -12,7 +12,6 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
@@ -261,11 +260,9 @@ class Host(ABC):
     @property
     def columns(self) -> dict[str, tuple[str, ...]]:
         """What frames and reports hold beside observation and action: names of the values by key, none for a number."""
-        body = self.body
-        joints = body.drive.joints if isinstance(body, MobileBase) else body.limits.names
         columns: dict[str, tuple[str, ...]] = {
             keys.COMMAND_AGE: (),
-            keys.EFFORT: tuple(f"{joint.removesuffix('.pos')}.effort" for joint in joints),
+            keys.EFFORT: tuple(f"{joint}.effort" for joint in self.body.joints),
         }
         if self.config_wrench:
             columns[keys.WRENCH] = tuple(f"tool_{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")

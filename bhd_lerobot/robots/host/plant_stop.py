@@ -65,8 +65,9 @@ class ServoStop:
 class TorqueStop:
     """Torque motors that carry the arm's weight; its brakes stop it."""
 
-    def __init__(self, arm: Arm) -> None:
-        self._dynamics = ArmDynamics(arm)
+    def __init__(self, body: Body) -> None:
+        arm = body.need(Arm)
+        self._dynamics = ArmDynamics(body)
         self._effort = np.asarray(arm.limits.effort[:-1])
         self._actuators = np.asarray(arm.home)[None].copy()
 
@@ -89,6 +90,6 @@ PlantStop = WheelStop | ServoStop | TorqueStop
 
 def make_stop(body: Body, joints: int) -> PlantStop:
     """Return how a robot is stopped."""
-    if not isinstance(body, Arm):
+    if body.arm is None:
         return WheelStop(joints)
-    return TorqueStop(body) if body.actuation == "torque" else ServoStop(body)
+    return TorqueStop(body) if body.arm.actuation == "torque" else ServoStop(body.arm)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import Arm, Body, Rates
+from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
@@ -111,7 +111,7 @@ class LiveProcess:
         self._connection = connection
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
-        dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
+        dof = len(spec.body.arm.chain.joints) if spec.body.arm else 0
         planning = planning_link(self._block, dof, spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
         self._host: Host

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import ArmChain, MobileBase, WheelDrive
+from bhd_lerobot.bodies.body import Arm, ArmChain, Drive
 from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
@@ -36,16 +36,17 @@ def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = Non
     if robot_type == "ur5":
         return _ur5()
     body = body_of(robot_type)
-    return RobotView(lidar=body.lidar) if isinstance(body, MobileBase) else RobotView()
+    return RobotView(lidar=body.lidar) if body else RobotView()
 
 
 def _turtlebot3(*, is_simulated: bool) -> RobotView:
     body = turtlebot3_burger()
+    drive = body.need(Drive)
     model = ElementTree.fromstring(body.mjcf)
     camera = _find(model, "camera", "front")
     return RobotView(
         lidar=body.lidar,
-        noise=_base_noise(body.drive) if is_simulated else None,
+        noise=_base_noise(drive) if is_simulated else None,
         frames=(
             StaticFrame(FOOTPRINT_FRAME, "base_link", _BASE_LINK),
             StaticFrame("base_link", "caster_back_link", _CASTER, _WHEEL_TURN),
@@ -56,14 +57,14 @@ def _turtlebot3(*, is_simulated: bool) -> RobotView:
         joints=tuple(
             JointFrame(**vars(_on_base_link(f"{wheel}_link", _place(_find(model, "body", wheel)), _WHEEL_TURN)),
                        joint=f"{wheel}_joint")
-            for wheel in body.drive.joints
+            for wheel in drive.joints
         ),
         fovy={"front": math.radians(float(camera.get("fovy", "nan")))},
         wheels=_WHEELS,
     )  # fmt: skip
 
 
-def _base_noise(drive: WheelDrive) -> BaseNoise:
+def _base_noise(drive: Drive) -> BaseNoise:
     """Return the noise of the simulated base. Its speed sensors and gyroscope have none but that of single precision.
 
     Of odometry it is the rounding of the encoders' counts, at the start and now, each uniform over one count. Slip is
@@ -83,6 +84,7 @@ def _base_noise(drive: WheelDrive) -> BaseNoise:
 
 def _ur5() -> RobotView:
     body = ur5()
+    chain = body.need(Arm).chain
     model = ElementTree.fromstring(body.mjcf)
     camera = _find(model, "camera", "wrist")
     ahead = _place(camera) - _place(_find(model, "site", "tool"))
@@ -92,10 +94,10 @@ def _ur5() -> RobotView:
             StaticFrame("base_link", ARM_FRAME, _ORIGIN, _HALF_TURN),
             StaticFrame("wrist_3_link", "flange", _ORIGIN, (0.5, -0.5, -0.5, -0.5)),
             StaticFrame("flange", "tool0", _ORIGIN, (0.5, 0.5, 0.5, 0.5)),
-            StaticFrame("tool0", TOOL_FRAME, body.chain.tool),
+            StaticFrame("tool0", TOOL_FRAME, chain.tool),
             StaticFrame(TOOL_FRAME, "wrist_optical_frame", _three(ahead), _optical(camera)),
         ),
-        joints=_links(body.chain),
+        joints=_links(chain),
         fovy={"wrist": math.radians(float(camera.get("fovy", "nan")))},
     )
 

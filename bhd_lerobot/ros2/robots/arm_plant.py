@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
@@ -34,12 +34,12 @@ class ArmPlant(Ros2Plant):
     usual_latency_s = 0.1
     moves = 0.05  # [rad] of a joint
 
-    def __init__(self, config: Any, body: Arm) -> None:
+    def __init__(self, config: Any, body: Body) -> None:
         if config.ros2.scan_yaw is not None:
             raise ConfigError(f"robot.ros2.scan_yaw is {config.ros2.scan_yaw}; an arm has no scanner.")
-        joints = body.chain.joints
+        joints = body.need(Arm).chain.joints
         self._count = len(joints)
-        self._opening = body.home[-1]
+        self._opening = body.need(Arm).home[-1]
         self._rest: NDArray[np.float64] | None = None  # the joints at the first command
         find_type(ur.SAFETY_MODE)
         states = columns("/joint_states", JOINTS, [f"{joint}.{end}" for end in ("pos", "vel") for joint in joints])

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
@@ -30,12 +30,11 @@ class BasePlant(Ros2Plant):
     usual_latency_s = 0.3
     moves = 0.05  # [m/s] of a wheel
 
-    def __init__(self, config: Any, body: MobileBase) -> None:
-        if body.lidar is None:
-            raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
+    def __init__(self, config: Any, body: Body) -> None:
+        drive, lidar = body.need(Drive), body.need(LidarSpec)
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
-        self._half_track, self._wheel_radius = body.drive.wheel_separation / 2, body.drive.wheel_radius
+        self._half_track, self._wheel_radius = drive.wheel_separation / 2, drive.wheel_radius
         node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         twist_type = TWIST_TYPE if config.ros2.distro == "humble" else STAMPED_TWIST
         inputs = [
@@ -43,7 +42,7 @@ class BasePlant(Ros2Plant):
             InputSpec(
                 "/scan",
                 SCAN,
-                scan_reader(config.ros2, "/scan", body.lidar, beams),
+                scan_reader(config.ros2, "/scan", lidar, beams),
                 SENSOR_DATA,
                 max(_SCAN_SILENCE_S, config.ros2.silent_s),
             ),

@@ -36,11 +36,8 @@ class ArmTopics(Topics):
     def __init__(
         self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView, joint_states_hz: float
     ) -> None:
-        body = host.body
-        if not isinstance(body, Arm):
-            raise AssertionError(f"{host.config.type} is no arm.")
         self._host, self._counts, self._view, self._rate_hz = host, counts, view, joint_states_hz
-        self._names = [f"{joint}_joint" for joint in body.chain.joints]
+        self._names = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._count = len(self._names)
         self._command: NDArray[np.float64] = host.bridge.latest["command"].copy()  # joints, then the gripper
         self._motion: _Motion | None = None  # what is followed

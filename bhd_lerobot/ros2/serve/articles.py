@@ -95,9 +95,7 @@ class TrajectoryController(Topics):
     """
 
     def __init__(self, host: LiveHost, node: Node, follow: Callable[[Any], bool]) -> None:
-        body = host.body
-        assert isinstance(body, Arm)
-        self._joints = [f"{joint}_joint" for joint in body.chain.joints]
+        self._joints = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._publisher = node.publisher(CONTROLLER_TOPIC, CONTROLLER)
         self._inputs = [Input(node.subscription(TRAJECTORY_TOPIC, "trajectory_msgs/msg/JointTrajectory"), follow)]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
@@ -39,17 +39,16 @@ class BaseTopics(Topics):
 
     def __init__(self, host: LiveHost, node: Node, view: views.RobotView) -> None:
         body = host.body
-        if not isinstance(body, MobileBase) or body.lidar is None:
-            raise AssertionError(f"{host.config.type} is no base with a lidar.")
-        self._host, self._view, self._drive = host, view, body.drive
+        lidar = body.need(LidarSpec)
+        self._host, self._view, self._drive = host, view, body.need(Drive)
         beams = host.config.beams
         names = list(host.observation_names)
         self._gyro = [names.index(name) for name in GYRO]
         self._ranges = slice(names.index("scan_000.pos"), names.index("scan_000.pos") + beams)
-        self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=body.lidar)
+        self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=lidar)
         self._odometry_part = OdometryPart("/odom", (*TWIST, *ODOMETRY))
         self._gyro_part = FieldsPart("/imu", GYRO, **gyro_message())
-        self._scan_period_ns = NANOSECONDS // body.lidar.rate_hz
+        self._scan_period_ns = NANOSECONDS // lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
         self._odometry = node.publisher("/odom", OdometryPart.msgtype)

@@ -8,7 +8,6 @@ from typing import Any
 
 from rich.console import Console
 
-from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.recording.passive import PassiveRecording, RecordOptions
@@ -53,7 +52,7 @@ class BridgeConfig(ServiceConfig):
                 "robot.plant is not given; a bridge is in front of a robot that a plant drives: turtlebot3 or ur5 with "
                 "--robot.plant=ros2, or with a class, package.module:Class. `bhd-ros2 serve` serves a simulated robot."
             )
-        if isinstance(robot.body(), MobileBase):
+        if robot.body().drive is not None:
             robot.odometry = True  # a goal is reached by it
         elif robot.action_space != "joint":
             raise ConfigError(f"robot.action_space is {robot.action_space!r}; a bridge takes joint positions: 'joint'.")
@@ -107,8 +106,8 @@ def bridge(
         console.print(line, markup=False, soft_wrap=True)
 
     def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
-        goals: Goals = ArmGoals(host) if isinstance(host.body, Arm) else BaseGoals(host)
-        topics = (POSITION_TOPIC,) if isinstance(host.body, Arm) else (TWIST_TOPIC, *extra)
+        goals: Goals = ArmGoals(host) if host.body.arm is not None else BaseGoals(host)
+        topics = (POSITION_TOPIC,) if host.body.arm is not None else (TWIST_TOPIC, *extra)
         if recording is not None:
             recording.begin(host)
         ended = (lambda result: None) if recording is None else recording.goal_ended

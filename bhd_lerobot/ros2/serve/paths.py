@@ -35,11 +35,11 @@ class PlannedPath(Topics):
     """
 
     def __init__(self, host: LiveHost, node: Node, trajectory: Callable[[], JointTrajectory | None]) -> None:
-        planner, body = host.link.bridge_side.planner, host.body
-        if not isinstance(body, Arm) or planner is None:
+        planner, chain = host.link.bridge_side.planner, host.body.need(Arm).chain
+        if planner is None:
             raise AssertionError(f"{host.config.type} is no arm.")
         self._host, self._planner, self._trajectory = host, planner, trajectory
-        self._kinematics, self._dof = ForwardKinematics(body.chain), len(body.chain.joints)
+        self._kinematics, self._dof = ForwardKinematics(chain), len(chain.joints)
         self._shown: Any = None  # the plan that was published last
         self._path = node.publisher(PLAN_TOPIC, PATH, LATCHED)
         self._goal = node.publisher(GOAL_TOPIC, POSE, LATCHED)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from rich.console import Console
 
-from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Range
 from bhd_lerobot.robots.host.realtime import LiveHost
@@ -64,7 +63,7 @@ class ServeConfig(ServiceConfig):
                 "robot.plant."
             )
         robot.clock = "realtime"
-        if isinstance(robot.body(), MobileBase):
+        if robot.body().drive is not None:
             robot.odometry = robot.imu = True
         elif robot.action_space != "joint":
             raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
@@ -114,7 +113,7 @@ def serve(
 
 def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts, names: tuple[Names, ...]) -> list[Topics]:
     view = robot_view(config.robot.type)
-    is_arm = isinstance(host.body, Arm)
+    is_arm = host.body.arm is not None
     goals: Goals = ArmGoals(host) if is_arm else BaseGoals(host)
     parts: list[Topics]
     if is_arm:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.node import Node
@@ -19,7 +18,7 @@ class Setpoints(Topics):
 
     def __init__(self, host: LiveHost, node: Node, counts: Counts, taken: Callable[[], None], topic: str) -> None:
         self._host, self._counts, self._taken, self._topic = host, counts, taken, topic
-        is_arm = isinstance(host.body, Arm)
+        is_arm = host.body.arm is not None
         # Twists of Jazzy, and those of Humble and of most tutorials.
         types = (ur.FLOATS,) if is_arm else (STAMPED_TWIST, TWIST_TYPE)
         take = self._move if is_arm else self._drive
