@@ -66,7 +66,7 @@ def run(
     """Move an arm into something by setpoints of a steady speed [rad/s], and wait."""
     force = 150.0 if way != WAYS[2] else float("inf")
     arm = UR5Simulation(UR5Config(max_force=force), 1, threads=1, fixtures=fixtures)
-    arm.reset(np.zeros(1, np.intp), [TableScene("empty", (), arm.body.home)], [0])
+    arm.reset(np.zeros(1, np.intp), [TableScene("empty", (), arm.body.arm.home)], [0])
     if way != WAYS[0]:
         arm.cerebellum.controller.setpoints.clearance = None
     model = arm.world.copy_model(0)

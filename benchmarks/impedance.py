@@ -69,7 +69,8 @@ class Rig:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = ((0, 0, 1), (0, 1, 0), (-1, 0, 0)), _START
         self.world = World(arm, n, fixtures=(_WALL,) if wall else (), threads=1)
-        self.world.qpos[:, :6] = ArmKinematics(arm.chain, arm.limits).solve(pose, np.array(arm.home[:6])).postures[0]
+        kinematics = ArmKinematics(arm.arm.chain, arm.limits)
+        self.world.qpos[:, :6] = kinematics.solve(pose, np.array(arm.arm.home[:6])).postures[0]
         self.world.qpos[:, 6:8] = 0.0
         self.world.hold()
         self.controller = ImpedanceController(arm, n, _RATES.control_hz, _RATES.ticks_per_frame)

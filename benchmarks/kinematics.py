@@ -43,15 +43,15 @@ def main() -> int:
     """Measure, print the table, return 0 if the goal is met."""
     args = parse_options(__doc__, poses=1000, seed=0)
     arm = ur5()
-    kinematics = ArmKinematics(arm.chain, arm.limits)
+    kinematics = ArmKinematics(arm.arm.chain, arm.limits)
     rng = np.random.default_rng(args.seed)
     postures = admissible(kinematics, rng, args.poses)
     poses = np.ascontiguousarray(kinematics.tool(postures))
     seeds = postures + rng.uniform(-SEED_DISTANCE, SEED_DISTANCE, postures.shape)
-    closed = {"ours, closed form": lambda pose, seed: kinematics.solutions(pose), "eaik": eaik_solver(arm.chain)}
+    closed = {"ours, closed form": lambda pose, seed: kinematics.solutions(pose), "eaik": eaik_solver(arm.arm.chain)}
     if ur_analytic_ik is not None:
-        closed["ur_analytic_ik"] = ur_solver(arm.chain)
-    iterative = {"pink": pink_solver(arm.chain), "mink": mink_solver(arm.chain)}
+        closed["ur_analytic_ik"] = ur_solver(arm.arm.chain)
+    iterative = {"pink": pink_solver(arm.arm.chain), "mink": mink_solver(arm.arm.chain)}
     solvers = {"ours, all checks": lambda pose, seed: kinematics.solve(pose, seed).postures, **closed, **iterative}
 
     times = {name: np.empty(len(poses)) for name in solvers}

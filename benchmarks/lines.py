@@ -46,7 +46,7 @@ def measure(speed: float, lines: int, seed: int) -> tuple[np.ndarray, np.ndarray
     hz = arm.control_hz
     planner, rng = GoalPlanner(arm, hz), np.random.default_rng(seed)
     limits = planner.limits[slice(0, planner.dof)], ToolLimits(speed, MAX_TOOL_ACCELERATION)
-    posture = np.array(arm.home[: planner.dof])
+    posture = np.array(arm.arm.home[: planner.dof])
     times: list[tuple[float, float, float]] = []
     while len(times) < lines:
         goal = planner.kinematics.tool(posture)

@@ -28,7 +28,7 @@ def main() -> int:
     args = parse_options(__doc__, motions=100, seed=0)
     rng = np.random.default_rng(args.seed)
     simulation = UR5Simulation(UR5Config())
-    simulation.reset(np.zeros(1, np.intp), [TableScene("empty", (), simulation.body.home)], [0])
+    simulation.reset(np.zeros(1, np.intp), [TableScene("empty", (), simulation.body.arm.home)], [0])
     report = Report(f"{args.motions} motions each, seed {args.seed}")
     for what, found, unit, goal in (
         (f"distance from a straight line at {SPEED} m/s", lines(simulation, rng, args.motions), "m", PATH_GOAL_M),
@@ -98,7 +98,7 @@ def lines(simulation: UR5Simulation, rng: np.random.Generator, motions: int) -> 
 def settle(simulation: UR5Simulation, rng: np.random.Generator, motions: int) -> NDArray[np.float64]:
     """Return the settling time after each joint goal [s]."""
     times: list[float] = []
-    home = np.array(simulation.body.home[:6])
+    home = np.array(simulation.body.arm.home[:6])
     tries = 0
     while len(times) < motions:
         tries += 1

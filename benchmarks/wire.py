@@ -29,7 +29,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks._impedance_attacks import ATTACKS, attack
 from benchmarks._turns import status
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -74,13 +73,13 @@ class Judge:
         self._plant, self.n = simulation.cerebellum.plant, simulation.n
         body, hz = simulation.body, simulation.rates.control_hz
         limits = body.limits
-        if isinstance(body, Arm):
-            lead = np.asarray(body.lead_s)
+        if body.arm is not None:
+            lead = np.asarray(body.arm.lead_s)
             effort = np.asarray(limits.effort[:-1])
             change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
             bend = np.asarray(limits.stop_deceleration) * (1 / hz + 2 * lead) / hz
             lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
-            if body.actuation == "torque":
+            if body.arm.actuation == "torque":
                 lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
                 bend[:-1] = np.inf
         else:
@@ -132,7 +131,7 @@ def make(space: str, n: int) -> Any:
         space, {"action_space": "tool", "control": "impedance"}
     )
     arm = UR5Simulation(UR5Config(**options), n)
-    arm.reset(np.arange(n), [TableScene("empty", (), arm.body.home)] * n, range(n))
+    arm.reset(np.arange(n), [TableScene("empty", (), arm.body.arm.home)] * n, range(n))
     return arm
 
 
@@ -294,14 +293,14 @@ class Liar:
     def __init__(self, simulation: Any, lie: str, rng: np.random.Generator) -> None:
         self._plant, self.n, self._lie = simulation.cerebellum.plant, simulation.n, lie
         self._cerebellum, self._hz = simulation.cerebellum, simulation.rates.control_hz
-        joints = 6 if isinstance(simulation.body, Arm) else 2
+        joints = 6 if simulation.body.arm is not None else 2
         self._begin, self._tick = rng.integers(self._hz // 4, self._hz, self.n), 0
         self._rows, self._joint = np.arange(self.n), rng.integers(joints, size=self.n)
         self._by = rng.uniform(0.12, 3.0, self.n) * rng.choice([-1, 1], self.n)
         self._held, self._joints = np.zeros((self.n, joints)), joints
         self._found, self._stopped = np.zeros((self.n, joints)), np.zeros(self.n, np.bool_)
         self.moved, self.faster = np.zeros(self.n), np.zeros(self.n)
-        self._tool = ForwardKinematics(simulation.body.chain) if isinstance(simulation.body, Arm) else None
+        self._tool = ForwardKinematics(simulation.body.arm.chain) if simulation.body.arm is not None else None
         self._speeds = np.zeros((self._hz // 10, 2, self.n))  # of the fastest joint, and of the tool
         self._before, self._last = np.zeros((2, self.n)), np.full((self.n, joints), np.nan)
 

@@ -37,7 +37,7 @@ class PushWall:
         self.world = World(arm, fixtures=(WALL,))
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = FORWARD, START
-        found = ArmKinematics(arm.chain, arm.limits).solve(pose, np.array(arm.home[:-1]))
+        found = ArmKinematics(arm.arm.chain, arm.limits).solve(pose, np.array(arm.arm.home[:-1]))
         if found.code != ResultCode.SUCCEEDED:
             raise SystemExit(found.message)
         self.world.qpos[:, :6], self.world.qpos[:, 6:8] = found.postures[0], 0.0

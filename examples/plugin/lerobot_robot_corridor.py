@@ -11,7 +11,7 @@ import bhd_lerobot as bhd
 class RoverConfig(bhd.MobileBaseConfig):
     """Options of the robot type ``rover``."""
 
-    def body(self) -> bhd.MobileBase:
+    def body(self) -> bhd.Body:
         """Return a box of 24 by 18 by 8 cm on wheels of 12 cm."""
         return bhd.differential_base(
             "rover", wheel_radius=0.06, wheel_separation=0.20, size=(0.24, 0.18, 0.08), mass=2.5,
@@ -51,7 +51,7 @@ class CorridorConfig(bhd.TaskConfig):
 class Corridor(bhd.BaseTask):
     """Success: past the goal without a touch. Score: how much of the way was done."""
 
-    def __init__(self, config: CorridorConfig, n: int, fps: int, body: bhd.MobileBase | None = None) -> None:
+    def __init__(self, config: CorridorConfig, n: int, fps: int, body: bhd.Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self._x = np.zeros(n)
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, Rates, Shape
+from bhd_lerobot.bodies.body import CameraSpec, LidarSpec, Limits, Rates, Shape
 from bhd_lerobot.errors import BhdError, ConfigError
 from tests.cases import each_case
 
@@ -45,7 +45,7 @@ def test_a_rate_is_a_positive_whole_number(name: str, value: object) -> None:
         Rates(**rates)  # type: ignore[arg-type]
 
 
-def limits(**changes: object) -> CommandLimits:
+def limits(**changes: object) -> Limits:
     values = {
         "names": ("x.vel", "theta.vel"),
         "velocity": (0.2, 2.0),
@@ -53,7 +53,7 @@ def limits(**changes: object) -> CommandLimits:
         "stop_deceleration": (2.0, 20.0),
         "command_timeout_s": 0.5,
     }
-    return CommandLimits(**{**values, **changes})  # type: ignore[arg-type]
+    return Limits(**{**values, **changes})  # type: ignore[arg-type]
 
 
 @each_case("bad", [(0.2,), (0.2, 2.0, 1.0), (0.2, 0.0), (-0.2, 2.0), (0.2, math.inf), (math.nan, 2.0)])

@@ -54,10 +54,10 @@ def test_mass_and_dimensions_are_the_published_ones(model: mujoco.MjModel, data:
     points = surface_points(model, data)
     np.testing.assert_allclose(np.ptp(points, axis=0), (0.138, 0.178, 0.192), atol=0.003)
     assert points[:, 2].min() == pytest.approx(0.0, abs=1e-6)
-    assert points[:, 2].max() <= BODY.height
+    assert points[:, 2].max() <= BODY.drive.height
     reach = np.hypot(*points[:, :2].T).max()
-    assert reach <= BODY.radius <= reach + 0.005
-    assert BODY.radius == BURGER_RADIUS
+    assert reach <= BODY.drive.radius <= reach + 0.005
+    assert BODY.drive.radius == BURGER_RADIUS
 
 
 @pytest.mark.law

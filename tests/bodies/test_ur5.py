@@ -13,9 +13,9 @@ from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 
 BODY = ur5()
-CHAIN = BODY.chain
+CHAIN = BODY.arm.chain
 TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
-LAG = np.array(BODY.servo_damping) / np.array(BODY.servo_stiffness)  # velocity feed-forward of the servos [s]
+LAG = np.array(BODY.arm.servo_damping) / np.array(BODY.arm.servo_stiffness)  # velocity feed-forward of the servos [s]
 DT = 1 / BODY.physics_hz
 FINGERS = slice(6, 8)
 PAYLOAD = (
@@ -207,12 +207,12 @@ def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray)
 def test_the_actuators_are_those_of_the_arm(actuation: str) -> None:
     body = ur5(actuation=actuation)  # type: ignore[arg-type]
     model = World(body).model
-    for number, name in enumerate(body.actuators):
+    for number, name in enumerate(body.arm.actuators):
         actuator = model.actuator(name)
         assert actuator.id == number
         assert actuator.forcerange.tolist() == [-body.limits.effort[number], body.limits.effort[number]]
         if actuation == "position" or name == "gripper":
-            stiffness, damping = body.servo_stiffness[number], body.servo_damping[number]
+            stiffness, damping = body.arm.servo_stiffness[number], body.arm.servo_damping[number]
             assert actuator.gainprm[0] == stiffness
             assert actuator.biasprm[:3].tolist() == [0, -stiffness, -damping]
         else:

@@ -14,10 +14,10 @@ from bhd_lerobot.control.plant import Plant, PlantReading
 HZ, FRAME = 500, 20
 TICK_NS = NANOSECONDS // HZ
 ARM = ur5()
-HOME = np.array(ARM.home)
+HOME = np.array(ARM.arm.home)
 LIMITS = ARM.limits
 TIMEOUT_TICKS = round(LIMITS.command_timeout_s * HZ)
-LEAD = np.array(ARM.servo_damping) / np.array(ARM.servo_stiffness)
+LEAD = np.array(ARM.arm.servo_damping) / np.array(ARM.arm.servo_stiffness)
 STOP = np.array(LIMITS.stop_deceleration)
 
 

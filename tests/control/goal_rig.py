@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 HZ = 500
 ARM = ur5()
-HOME = np.array(ARM.home)
-KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
+HOME = np.array(ARM.arm.home)
+KINEMATICS = ArmKinematics(ARM.arm.chain, ARM.limits)
 LIMITS, STOP_LIMITS = MotionLimits.of(ARM.limits), MotionLimits.of(ARM.limits, stop=True)
 TOOL = KINEMATICS.tool(HOME[:6])
 ZEROS = np.zeros(7)

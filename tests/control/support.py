@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import WheelDrive
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.base.diff_drive import wheels_from_twist
@@ -21,7 +21,7 @@ TICK_NS = NANOSECONDS // HZ
 BODY = turtlebot3_burger()
 
 
-def wheel_speeds(twist: NDArray[np.float64], drive: WheelDrive = BODY.drive) -> NDArray[np.float64]:
+def wheel_speeds(twist: NDArray[np.float64], drive: Drive = BODY.drive) -> NDArray[np.float64]:
     """Return the wheel speeds of twists, shape (n, 2) [rad/s]."""
     wheels = np.empty_like(twist)
     wheels_from_twist(twist, 1.0 / drive.wheel_radius, drive.wheel_separation / 2 / drive.wheel_radius, wheels)
@@ -59,7 +59,7 @@ class PerfectPlant(Plant):
 class Rig:
     def __init__(self, n: int = 1, active: bool = True, takes: str = "actuators", **options: object) -> None:
         self.plant = PerfectPlant(n, takes)
-        controller = BaseController(BODY, n, HZ, takes=takes)
+        controller = BaseController(BODY.drive, n, HZ, takes=takes)
         self.cerebellum = Cerebellum(BODY, self.plant, HZ, controller, **options)  # type: ignore[arg-type]
         self.n = n
         self.now = 0

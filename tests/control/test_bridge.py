@@ -17,8 +17,9 @@ RATES = Rates(200, 200, 10)
 
 
 def perfect(n: int = 1, rates: Rates = RATES, timeout: float = 0.5) -> LockstepBridge:
-    body = dataclasses.replace(BODY, limits=dataclasses.replace(BODY.limits, command_timeout_s=timeout))
-    controller = BaseController(body, n, rates.control_hz)
+    limits = dataclasses.replace(BODY.limits, command_timeout_s=timeout)
+    body = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, limits=limits))
+    controller = BaseController(body.drive, n, rates.control_hz)
     bridge = LockstepBridge(Cerebellum(body, PerfectPlant(n), rates.control_hz, controller), rates, lambda: None)
     bridge.restart(np.arange(n))
     return bridge
@@ -26,7 +27,7 @@ def perfect(n: int = 1, rates: Rates = RATES, timeout: float = 0.5) -> LockstepB
 
 def simulated(n: int, rates: Rates) -> tuple[LockstepBridge, World]:
     world = World(BODY, n, physics_hz=rates.physics_hz)
-    controller = BaseController(BODY, n, rates.control_hz)
+    controller = BaseController(BODY.drive, n, rates.control_hz)
     cerebellum = Cerebellum(BODY, SimulatedPlant(world), rates.control_hz, controller)
     bridge = LockstepBridge(cerebellum, rates, lambda: world.step(rates.steps_per_tick))
     bridge.restart(np.arange(n))
@@ -65,7 +66,7 @@ def test_a_frame_longer_than_the_time_out_is_an_error_that_says_how_fast_is_enou
         perfect(rates=Rates(200, 200, 4), timeout=0.2)
     perfect(rates=Rates(200, 200, 5), timeout=0.2)
     with pytest.raises(ConfigError, match=r"200.*100"):  # a cerebellum of another rate
-        LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100, BaseController(BODY, 1, 100)), RATES, lambda: None)
+        LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100, BaseController(BODY.drive, 1, 100)), RATES, lambda: None)
 
 
 def test_a_chunk_is_one_command_a_frame() -> None:

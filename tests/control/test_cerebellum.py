@@ -317,7 +317,7 @@ def test_a_servo_beyond_its_torque_is_flagged_and_reported_with_its_torque() -> 
     weak = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, max_torque=0.06))
     plant = PerfectPlant()
     plant.write = lambda ctrl: np.copyto(plant.written, ctrl)  # type: ignore[method-assign]
-    cerebellum = Cerebellum(weak, plant, HZ, BaseController(weak, 1, HZ))
+    cerebellum = Cerebellum(weak, plant, HZ, BaseController(weak.drive, 1, HZ))
     cerebellum.request(Request.CONFIGURE)
     cerebellum.request(Request.ACTIVATE)
     cerebellum.offer(Setpoint(1, 0, np.array([[0.2, 0.0]])))
@@ -331,7 +331,7 @@ def test_a_servo_beyond_its_torque_is_flagged_and_reported_with_its_torque() -> 
 def test_wheels_that_are_too_slow_for_the_turning_limit_are_an_error() -> None:
     slow = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, max_wheel_speed=5.0))
     with pytest.raises(ConfigError, match=r"theta.vel is 2.84.*2\.06"):
-        BaseController(slow, 1, HZ)
+        BaseController(slow.drive, 1, HZ)
 
 
 def test_a_state_is_a_copy() -> None:

@@ -56,7 +56,7 @@ def test_whatever_joints_can_do_is_a_measurement(seed: int, every: int, stamped:
 )
 def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float, stamped: bool) -> None:
     check, reading = made(2, stamped)
-    where = np.tile(np.array(ur5().home), (2, 1))
+    where = np.tile(np.array(ur5().arm.home), (2, 1))
     for tick in range(10):
         where[0, joint] += FASTEST
         reading.position[:] = where
@@ -73,7 +73,7 @@ def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float, 
         assert wrong.tolist() == [True, False]
         np.testing.assert_array_equal(reading.position, where)
     if np.isfinite(jump) and abs(jump) < 100:
-        assert check.problem.startswith(f"{ur5().chain.joints[joint]} reads a change of {jump:.3f} rad within 2.0 ms")
+        assert check.problem.startswith(f"{ur5().joints[joint]} reads a change of {jump:.3f} rad within 2.0 ms")
     check.forget(np.arange(2))
     reading.position[:] = where + 1.0
     assert check.wrong_positions(reading, 200 * PERIOD) is None

@@ -302,7 +302,7 @@ def test_a_plant_that_takes_twists_moves_as_one_that_takes_wheel_speeds() -> Non
 def test_wheels_that_turn_and_a_gyroscope_that_says_otherwise_are_a_fault(turns: float, is_fault: bool) -> None:
     """Slipping wheels, an encoder that counts too much, a gyroscope that hangs: nobody can tell which, but it stops."""
     rig = base_rig(2)
-    controller = BaseController(support.BODY, 2, support.HZ, gyro=0)
+    controller = BaseController(support.BODY.drive, 2, support.HZ, gyro=0)
     rig.cerebellum = Cerebellum(support.BODY, rig.plant, support.HZ, controller, sensors=1)
     for request in (Request.CONFIGURE, Request.ACTIVATE):
         assert rig.request(request).accepted.all()

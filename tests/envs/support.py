@@ -22,7 +22,7 @@ def some_actions(name: str, frames: int, n: int = 1, seed: int = 0) -> np.ndarra
     """Return random actions that end some episodes early, shape (frames, n, a), of single precision."""
     rng = np.random.default_rng(seed)
     if name.startswith("UR5"):
-        home = np.array(ur5().home)
+        home = np.array(ur5().arm.home)
         actions = home + rng.uniform(-0.2, 0.2, (frames, n, len(home)))
     else:
         actions = np.array([0.22, 0.0]) + rng.uniform(-0.2, 0.2, (frames, n, 2))

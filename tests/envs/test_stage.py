@@ -94,7 +94,7 @@ def test_a_success_that_is_an_achievement_terminates() -> None:
     stage = Stage(make_settings("UR5Reach-v0").robot, make_settings("UR5Reach-v0").task)
     stage.reset(ONE, [0])
     stage.task.judge = lambda truth, running: (np.ones(1), np.full(1, int(Event.SUCCESS)))  # type: ignore[method-assign]
-    stepped = stage.step(np.array(stage.simulation.body.home)[None])
+    stepped = stage.step(np.array(stage.simulation.body.arm.home)[None])
     assert stepped.terminated.all()
     assert not stepped.truncated.any()
 

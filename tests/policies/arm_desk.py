@@ -19,7 +19,7 @@ from bhd_lerobot.tasks.task import Task, TaskConfig
 OBSERVED = ("shoulder_pan.pos", "gripper.pos")
 CUP = TableObject("cup", "red", 0.03, 0.03, 0.10, 0.5, 0.0)
 BOX = TableObject("box", "blue", 0.04, 0.03, 0.06, 0.4, 0.2)
-HOME = ur5().home
+HOME = ur5().arm.home
 
 
 def scene(*objects: TableObject, target: int = 0) -> TableScene:

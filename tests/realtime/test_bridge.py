@@ -32,7 +32,7 @@ class Rig:
             "requests": Mailbox.nbytes(request_dtype(0)),
             "events": Mailbox.nbytes(EVENT_DTYPE),
         }
-        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ))
+        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY.drive, 1, HZ))
         own = {name: np.asarray(value) for name, value in vars(self.cerebellum.state(0)).items()}
         numbers = [("tick", np.int64), ("due_ns", np.int64)]
         extended = np.dtype([*((name, value.dtype, value.shape) for name, value in own.items()), *numbers])

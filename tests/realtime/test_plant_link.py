@@ -195,9 +195,9 @@ def test_a_plant_that_misses_commands_makes_them_up_gradually(misses: float) -> 
         remote = RemotePlant(link, lambda clock=clock: clock[0])  # type: ignore[misc]
         guard = CommandGuard(link, 10 * TIMEOUT, Guard(limits, 1), period)
         guard.begin()
-        where, written = np.array(arm.home)[None], []
+        where, written = np.array(arm.arm.home)[None], []
         for tick in range(1200):
-            command = np.array(arm.home)
+            command = np.array(arm.arm.home)
             command[:6] += np.array([1, 0.5, -0.7, 1, 1, -1]) * (1 - np.cos(3.0 * min(tick, 1047) / 500))
             remote.write(command[None])
             clock[0] += period

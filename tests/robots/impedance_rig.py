@@ -17,7 +17,7 @@ from bhd_lerobot.sim.world import World
 Array = NDArray[np.float64]
 
 ARM = ur5(actuation="torque")
-KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
+KINEMATICS = ArmKinematics(ARM.arm.chain, ARM.limits)
 RATES = Rates(500, 500, 25)
 START = np.array([0.50, 0.11, 0.35])  # of the tool, which points along x
 WALL = Shape("box", 0.65, 0.11, 0.0, 0.05, 0.3, 0.7)  # its face is at x = 0.60
@@ -28,7 +28,7 @@ def forward_posture(place: Array = START) -> Array:
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     pose[:3, 3] = place
-    return KINEMATICS.solve(pose, np.array(ARM.home[:6])).postures[0]
+    return KINEMATICS.solve(pose, np.array(ARM.arm.home[:6])).postures[0]
 
 
 class Rig:

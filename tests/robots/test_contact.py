@@ -32,7 +32,7 @@ class Pusher:
         self, *, clearance: bool = True, measures: bool = False, fixtures: tuple[Shape, ...] = (), **config: Any
     ) -> None:
         self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
-        arm.reset(FIRST, [TableScene("empty", (), arm.body.home)], [0])
+        arm.reset(FIRST, [TableScene("empty", (), arm.body.arm.home)], [0])
         self.controller: Any = arm.cerebellum.controller
         if not clearance:
             self.controller.setpoints.clearance = None
@@ -264,7 +264,7 @@ def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
     cause: str, direction: tuple[float, ...], speed: float, seconds: float, stiffness: float, latency_s: float
 ) -> None:
     arm = UR5Simulation(UR5Config(), 1, threads=1)
-    scene = TableScene("empty", (), arm.body.home, variation=Variation(latency_s=latency_s))  # type: ignore[union-attr]
+    scene = TableScene("empty", (), arm.body.arm.home, variation=Variation(latency_s=latency_s))  # type: ignore[union-attr]
     arm.reset(FIRST, [scene], [0])
     if cause == "fault":
         arm.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)
@@ -300,7 +300,7 @@ def test_a_hard_push_that_stays_as_it_is_while_it_is_followed_is_no_load() -> No
 def test_an_arm_in_hold_is_watched_after_reset_and_activate_before_any_command() -> None:
     for direction in (UP, DOWN, ASIDE, ASKEW):
         arm = UR5Simulation(UR5Config(), 1, threads=1)
-        arm.reset(FIRST, [TableScene("empty", (), arm.body.home)], [0])  # type: ignore[union-attr]
+        arm.reset(FIRST, [TableScene("empty", (), arm.body.arm.home)], [0])  # type: ignore[union-attr]
         arm.cerebellum.estop.press()
         for _ in range(5):
             arm.step(None)
@@ -346,8 +346,8 @@ def test_an_arm_that_is_pressed_is_neither_reset_nor_activated_and_the_message_n
 def test_the_limit_of_force_holds_in_random_postures_and_directions() -> None:
     """Walls that come slowly: the true force, when the arm is stopped."""
     rng, body = np.random.default_rng(2), UR5Config().body()
-    postures = np.array(body.home)[:6] + rng.uniform(-1.2, 1.2, (200, 6))  # type: ignore[union-attr]
-    far = np.min(ArmKinematics(body.chain, body.limits).collision.distances(postures), axis=0) > 0.02  # type: ignore[union-attr]
+    postures = np.array(body.arm.home)[:6] + rng.uniform(-1.2, 1.2, (200, 6))  # type: ignore[union-attr]
+    far = np.min(ArmKinematics(body.arm.chain, body.limits).collision.distances(postures), axis=0) > 0.02  # type: ignore[union-attr]
     scenes = [TableScene("empty", (), (*posture, 0.04)) for posture in postures[far][:32]]
     arm = UR5Simulation(UR5Config(), len(scenes))
     arm.reset(np.arange(len(scenes)), scenes, range(len(scenes)))
@@ -381,7 +381,7 @@ def test_the_stop_of_an_arm_that_drives_fast_into_a_wall_needs_no_guard() -> Non
         scenes = [TableScene("empty", (), (*posture, 0.085)) for posture in postures + start]
         arm.reset(np.arange(n), scenes, range(n))
         Wall(arm, directions, 0.0, 1e9)
-        forward, action = ForwardKinematics(arm.body.chain), arm.cerebellum.command.copy()  # type: ignore[union-attr]
+        forward, action = ForwardKinematics(arm.body.arm.chain), arm.cerebellum.command.copy()  # type: ignore[union-attr]
         twist = np.concatenate((-directions * speed / 25, np.zeros((n, 3))), axis=1)[..., None]
         for _ in range(15):
             jacobian = np.ascontiguousarray(forward.jacobian(action[:, :6]))

@@ -30,7 +30,7 @@ class Lied:
         self.joints = np.asarray(joints)
         self.all = np.arange(len(self.joints))
         self.arm = arm = UR5Simulation(UR5Config(), len(self.joints))
-        arm.reset(self.all, [TableScene("empty", (), arm.body.home)] * len(self.joints), self.all.tolist())
+        arm.reset(self.all, [TableScene("empty", (), arm.body.arm.home)] * len(self.joints), self.all.tolist())
         self.cerebellum: Any = arm.cerebellum
         self.true: list[Array] = []
         self.modes: list[Array] = []

@@ -26,7 +26,7 @@ class Hand:
 
     def __init__(self, fixtures: tuple[Shape, ...] = (), box: TableObject = BOX, **config: Any) -> None:
         self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
-        arm.reset(FIRST, [TableScene("box", (box,), arm.body.home)], [0])
+        arm.reset(FIRST, [TableScene("box", (box,), arm.body.arm.home)], [0])
         self.limits = self.watchdog = self._goals = 0
         self.forces: list[float] = []
         contacts = Contacts(arm)

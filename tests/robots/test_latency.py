@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.body import Arm, Shape
+from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, Goals, ResultCode
@@ -44,7 +44,7 @@ class Line:
     def __init__(self, latency: list[int]) -> None:
         self.n = len(latency)
         self.plant = Plant(self.n)
-        self.late = LatePlant(self.plant, ARM)  # type: ignore[arg-type]
+        self.late = LatePlant(self.plant, 7)  # type: ignore[arg-type]
         self.late.set_latency(np.arange(self.n), latency)
         self.tick = 0
         self._ctrl, self._reading = np.zeros((self.n, 7)), PlantReading(self.n, 7)
@@ -105,15 +105,16 @@ class Declared(UR5Config):
 
     latency_s = 0.0
 
-    def body(self) -> Arm:
-        return dataclasses.replace(super().body(), latency_s=self.latency_s)
+    def body(self) -> Body:
+        body = super().body()
+        return dataclasses.replace(body, arm=dataclasses.replace(body.arm, latency_s=self.latency_s))
 
 
 def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> UR5Simulation:
     config = Declared(max_force=float("inf"))
     config.latency_s = latency if declared else 0.0
     arms = UR5Simulation(config, n, threads=1, **options)
-    scene = TableScene("empty", (), arms.body.home, variation=Variation(latency_s=latency))
+    scene = TableScene("empty", (), arms.body.arm.home, variation=Variation(latency_s=latency))
     arms.reset(np.arange(n), [scene] * n, range(n))
     return arms
 
@@ -122,7 +123,7 @@ def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> 
 @pytest.mark.parametrize("declared", [False, True])
 def test_late_servos_follow_far_setpoints_and_goals_without_a_protective_stop(declared: bool) -> None:
     arms, random = late_arms(0.05, declared), np.random.default_rng(0)
-    home = np.array(arms.body.home)
+    home = np.array(arms.body.arm.home)
     target = np.tile(home, (SIMS, 1))
     for frame in range(80):
         if frame % 10 == 0:

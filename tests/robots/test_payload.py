@@ -19,7 +19,7 @@ from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim.world import World
 
 FIRST = np.zeros(1, np.intp)
-HOME = np.array(ur5().home)
+HOME = np.array(ur5().arm.home)
 EFFORT = np.array(ur5().limits.effort[:6])
 BODY = '<body name="payload" pos="0 0 0.150"><inertial pos="0 0 0" mass="{}" diaginertia="1e-3 1e-3 1e-3"/></body>'
 

@@ -21,7 +21,7 @@ POSTURES, LIGHT_N, MOST_FREE_N = 6, 20.0, 80.0
 
 def start(n: int, control_hz: int, physics_hz: int, fixtures: tuple[Shape, ...] = ()) -> UR5Simulation:
     arm = UR5Simulation(UR5Config(control_hz=control_hz, physics_hz=physics_hz), n, threads=1, fixtures=fixtures)
-    arm.reset(np.arange(n), [TableScene("empty", (), arm.body.home)] * n, [0] * n)
+    arm.reset(np.arange(n), [TableScene("empty", (), arm.body.arm.home)] * n, [0] * n)
     return arm
 
 
@@ -31,7 +31,7 @@ def test_at_any_rates_free_goals_succeed_and_press_on_nothing(control_hz: int, p
     arm, rng, codes, most = start(POSTURES, control_hz, physics_hz), np.random.default_rng(1), [], 0.0
     for sim in range(POSTURES):
         turn = rng.uniform(-1.0, 1.0, 6) * (1.5, 0.2, 0.4, 1.0, 1.0, 1.0)
-        posture = tuple(np.asarray(arm.body.home[:6]) + turn)
+        posture = tuple(np.asarray(arm.body.arm.home[:6]) + turn)
         assert arm.controller.submit(sim, BrainCommand("free", joint_target=posture)) is None
     while arm.controller.busy.any():
         report = arm.step(None)

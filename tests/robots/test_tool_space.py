@@ -37,7 +37,7 @@ def test_quaternions_near_unit_length_are_normalised_and_others_refused() -> Non
 def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise() -> None:
     arm = UR5Simulation(UR5Config(tool_pose=True), 2, threads=1)
     noisy = replace(Variation(), sensor_noise=0.01)
-    scenes = [TableScene("empty", (), arm.body.home, variation=variation) for variation in (Variation(), noisy)]
+    scenes = [TableScene("empty", (), arm.body.arm.home, variation=variation) for variation in (Variation(), noisy)]
     arm.reset(np.arange(2), scenes, [0, 1])
     arm.step(np.repeat(arm.cerebellum.command[:1], 2, axis=0))
     state, _ = arm.sense()
@@ -59,7 +59,7 @@ def simulation():
 def start(simulation: UR5Simulation) -> np.ndarray:
     """Put all arms home; return the action that keeps them there."""
     ids = np.arange(simulation.n)
-    scenes = [TableScene("empty", (), simulation.body.home)] * simulation.n
+    scenes = [TableScene("empty", (), simulation.body.arm.home)] * simulation.n
     simulation.reset(ids, scenes, [0] * simulation.n)
     command = simulation.cerebellum.command
     return np.concatenate([pose_vectors(simulation.kinematics.tool(command[:, :6])), command[:, 6:]], axis=1)

@@ -84,7 +84,7 @@ def test_true_speeds_stay_within_five_per_cent_of_the_limits():
         "corners": rng.choice([-1, 1], (60, 2)) * full,
         "random": rng.uniform(-full, full, (60, 2)),
     }
-    arena = make_arena("empty", 0, robot_radius=base.body.radius)
+    arena = make_arena("empty", 0, robot_radius=base.body.drive.radius)
     for name, stream in streams.items():
         base.reset(np.zeros(1, np.intp), [arena], [0])
         fastest = np.zeros(3)

@@ -76,7 +76,7 @@ def test_a_tool_pose_that_cannot_be_taken_is_refused_with_the_reason(tmp_path):
 
 def test_noise_and_latency_belong_to_the_episode(tmp_path):
     simulation = UR5Simulation(UR5Config(), 2)
-    home = simulation.body.home
+    home = simulation.body.arm.home
     wild = TableScene("empty", (), home, variation=Variation(sensor_noise=0.001, latency_s=0.02))
     simulation.reset(np.arange(2), [wild, TableScene("empty", (), home)], [7, 7])
     seen = np.array([simulation.observe().state for _ in range(200)])
@@ -153,7 +153,7 @@ def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
 
 def test_an_impedance_with_too_much_latency_is_refused():
     simulation = UR5Simulation(UR5Config(control="impedance", action_space="tool"))
-    late = TableScene("empty", (), simulation.body.home, variation=Variation(latency_s=0.011))
+    late = TableScene("empty", (), simulation.body.arm.home, variation=Variation(latency_s=0.011))
     with pytest.raises(ConfigError, match=r"latency_s is 0\.011"):
         simulation.reset(FIRST, [late], [0])
 

@@ -86,7 +86,7 @@ def test_what_no_sensor_tells_is_for_brains_that_say_that_they_use_it(declared: 
 def script(kind: str) -> np.ndarray:
     time = np.arange(2 * FRAMES)
     if kind == "ur5":
-        home = np.array(UR5Config().body().home)
+        home = np.array(UR5Config().body().arm.home)
         return home + 0.02 * np.sin(time / 4)[:, None] * np.array([1, -1, 1, 2, -2, 3, 0.0])
     return np.stack([0.1 + 0.05 * np.sin(time / 3), 0.8 * np.cos(time / 5)], axis=1)
 

@@ -231,7 +231,7 @@ def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate
     with Peer("brain_node.py", goal(*ASIDE), *slowly, domain=arm.node.network.domain_number) as brain:
         brain.wait_event("command")
         arm.wait(lambda state: state.is_moving, "it moves")
-        arm.send("/forward_position_controller/commands", FLOATS, {"data": np.array([ur5().home[:6]])})
+        arm.send("/forward_position_controller/commands", FLOATS, {"data": np.array([ur5().arm.home[:6]])})
         summary = brain.wait_event("summary")
     assert (summary["once"], summary["twice"]) == (1, 0)
     states: list[Any] = []

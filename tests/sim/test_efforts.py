@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.sim.world import World
@@ -15,8 +14,8 @@ OTHERS = ("qfrc_bias", "qfrc_passive", "qfrc_constraint")
 
 def command(world: World, rng: np.random.Generator) -> None:
     """Command something that saturates some servos and others not."""
-    if isinstance(world.body, Arm):
-        joints = len(world.body.chain.joints)
+    if world.body.arm is not None:
+        joints = len(world.body.arm.chain.joints)
         world.ctrl[:, :joints] = world.qpos[:, :joints] + rng.normal(0.0, 0.005, (world.n, joints))
     else:
         world.ctrl[:] = rng.uniform(-40.0, 40.0, world.ctrl.shape)

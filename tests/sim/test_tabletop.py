@@ -21,7 +21,7 @@ from bhd_lerobot.sim.world import World
 from tests.cases import each_case
 
 BODY = ur5()
-HOME = np.array(BODY.home)
+HOME = np.array(BODY.arm.home)
 SPOTS = ((0.55, 0.28), (0.45, -0.20), (0.75, -0.05), (0.62, 0.05), (0.38, 0.33))
 
 
@@ -195,7 +195,7 @@ def test_friction_decides_whether_a_push_moves_an_object() -> None:
     scenes = []
     for friction in (0.3, 0.45, 0.55, 0.9):
         box = TableObject("box", "red", 0.04, 0.04, 0.04, 0.5, 0.3, friction=friction)
-        scenes.append(TableScene("", (box,), BODY.home))
+        scenes.append(TableScene("", (box,), BODY.arm.home))
     world = World(BODY, 4)
     table = Tabletop(world)
     table.place(scenes)
@@ -229,7 +229,7 @@ def test_cameras_turn_by_the_scene_s_angles_and_the_model_s_other_fields_stay() 
     world = World(BODY, 2)
     table = Tabletop(world)
     turns = {"camera_turn": (0.02, -0.01, 0.03), "wrist_turn": (0.0, 0.05, 0.0)}
-    scenes = [TableScene("", (), BODY.home, variation=Variation(**kind)) for kind in (turns, {})]
+    scenes = [TableScene("", (), BODY.arm.home, variation=Variation(**kind)) for kind in (turns, {})]
     for _ in range(2):  # a second time is not on top of the first
         table.place(scenes)
         for camera, turn in (("scene", turns["camera_turn"]), ("wrist", turns["wrist_turn"])):
@@ -243,7 +243,7 @@ def test_the_target_is_drawn_where_it_is_wanted_and_touches_nothing() -> None:
     pose = (0.4, -0.2, 0.1, math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
     world = World(BODY, 2)
     table = Tabletop(world)
-    table.place([TableScene("", (), BODY.home, target_pose=each) for each in (pose, None)])
+    table.place([TableScene("", (), BODY.arm.home, target_pose=each) for each in (pose, None)])
     for sim in range(2):
         model = world.copy_model(sim)
         data = mujoco.MjData(model)
@@ -278,7 +278,7 @@ def test_a_box_s_tape_lies_along_its_length_or_across_and_nothing_but_looks_diff
     box = TableObject("box", "blue", 0.045, 0.025, 0.08, 0.5, 0.0)
     world = World(BODY, 2)
     table = Tabletop(world)
-    table.place([TableScene("", (replace(box, style=style),), BODY.home) for style in ("usual", "across")])
+    table.place([TableScene("", (replace(box, style=style),), BODY.arm.home) for style in ("usual", "across")])
     along, across = (world.copy_model(sim) for sim in (0, 1))
     body = along.body("object_0")
     own = [number for number in range(along.ngeom) if along.geom_bodyid[number] == body.id]
@@ -349,7 +349,7 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
     np.testing.assert_array_equal(reading.velocity, 0)
     command = np.arange(21.0).reshape(3, 7) / 100
     plant.write(command)
-    for number, name in enumerate(world.body.actuators):  # type: ignore[attr-defined]
+    for number, name in enumerate(world.body.arm.actuators):  # type: ignore[attr-defined]
         np.testing.assert_array_equal(world.ctrl[:, world.model.actuator(name).id], command[:, number])
     world.step(5)
     plant.read(reading)
@@ -360,12 +360,12 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
 @each_case(
     ("call", "message"),
     [
-        (lambda arm: arm.base_pose, "'ur5' is a Arm"),
-        (lambda arm: arm.place([()]), "'ur5' is a Arm"),
-        (lambda arm: arm.rays("tool", np.array([[1.0, 0.0, 0.0]])), "'ur5' is a Arm"),
-        (lambda arm: arm.reset(poses=np.zeros((1, 3))), "'ur5' is a Arm"),
-        (lambda _: Tabletop(World(turtlebot3_burger())), "is a MobileBase"),
-        (lambda _: World(turtlebot3_burger()).hold(), "is a MobileBase"),
+        (lambda arm: arm.base_pose, "'ur5' has no drive"),
+        (lambda arm: arm.place([()]), "'ur5' has no drive"),
+        (lambda arm: arm.rays("tool", np.array([[1.0, 0.0, 0.0]])), "'ur5' has no drive"),
+        (lambda arm: arm.reset(poses=np.zeros((1, 3))), "'ur5' has no drive"),
+        (lambda _: Tabletop(World(turtlebot3_burger())), "'turtlebot3_burger' has none"),
+        (lambda _: World(turtlebot3_burger()).hold(), "'turtlebot3_burger' has none"),
         (lambda arm: Tabletop(arm).place([random_scene(0)] * 2), "2 scenes were given for 1"),
         (lambda arm: Tabletop(arm).place([TableScene("short", (), (0.0,) * 6)], [0]), "posture"),
         (lambda arm: arm.site("toool"), "Did you mean 'tool'"),

@@ -344,7 +344,7 @@ def test_touch_is_felt_at_a_box_and_not_on_the_floor() -> None:
     low = Shape("box", 0.3, 0.08, 0.0, 0.05, 0.05, 0.05)  # it meets a wheel
     world.place([[Shape("box", 0.3, 0.0, 0.0, 0.05, 0.3)], [], [low]])
     world.reset()
-    touch = world.sensor(BODY.touch_sensor)
+    touch = world.sensor(BODY.drive.touch_sensor)
     drive(world, 0.2, 0.0, 0.8)
     assert not touch.any()
     felt = np.zeros(3, np.bool_)

@@ -42,7 +42,7 @@ SCENE = TableScene(
         TableObject("box", "blue", 0.04, 0.03, 0.06, 0.4, 0.2, yaw=0.7, shade=(0.05, -0.2, 0.5)),
         TableObject("box", "green", 0.03, 0.02, 0.08, 0.6, -0.2),
     ),
-    posture=ur5().home,
+    posture=ur5().arm.home,
     target_object=1,
     instruction="pick up the blue box",
 )

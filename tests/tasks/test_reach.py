@@ -20,9 +20,9 @@ from tests.tasks.support import Judged
 
 FPS = 20
 ARM = ur5()
-KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
+KINEMATICS = ArmKinematics(ARM.arm.chain, ARM.limits)
 TARGET = (0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0)
-SCENE = TableScene("reach", (), ARM.home, target_pose=TARGET)
+SCENE = TableScene("reach", (), ARM.arm.home, target_pose=TARGET)
 
 
 class Run(Judged):
@@ -56,13 +56,13 @@ def test_every_target_can_be_reached_and_every_start_is_free() -> None:
     for seed in range(60):
         scene = task.sample(seed)
         start = np.array(scene.posture[:6])
-        assert np.abs(start - ARM.home[:6]).max() <= 0.3
-        assert scene.posture[6] == ARM.home[6]
+        assert np.abs(start - ARM.arm.home[:6]).max() <= 0.3
+        assert scene.posture[6] == ARM.arm.home[6]
         assert KINEMATICS.check(start) == ResultCode.SUCCEEDED
         assert scene.target_pose is not None
         x, y, z, *quaternion = scene.target_pose
         pose = Pose((x, y, z), tuple(quaternion))
-        for posture in (start, np.array(ARM.home[:6])):
+        for posture in (start, np.array(ARM.arm.home[:6])):
             found = KINEMATICS.solve(pose.matrix(), posture)
             assert found.code == ResultCode.SUCCEEDED
         assert np.allclose(KINEMATICS.tool(found.postures[0]), pose.matrix(), atol=1e-6)
@@ -81,7 +81,7 @@ def test_randomisation_changes_the_world_and_not_the_task() -> None:
 
 
 def test_without_spread_it_starts_at_home() -> None:
-    assert ReachTask(ReachConfig(start_spread_rad=0.0), 1, FPS).sample(3).posture == ARM.home
+    assert ReachTask(ReachConfig(start_spread_rad=0.0), 1, FPS).sample(3).posture == ARM.arm.home
 
 
 def test_the_target_is_reported_to_the_brain() -> None:

@@ -100,5 +100,5 @@ def test_stock_record_and_replay_work(tmp_path, monkeypatch):
         assert 5 <= int(frames) <= fps + 1
     base, arm = (json.loads(action) for *_, action in recorded)
     assert np.allclose(base, [0.2, 0.0])
-    assert not np.allclose(arm, UR5Config().body().home, atol=0.05)  # it was on its way
+    assert not np.allclose(arm, UR5Config().body().arm.home, atol=0.05)  # it was on its way
     assert lines.count("REPLAYED") == 2

@@ -33,7 +33,7 @@ from tests.waiting import until
 FRAME = 0.04  # [s]
 DOWN = (0.0, 1.0, 0.0, 0.0)
 POSE = dict(zip(TOOL_NAMES, (0.4, 0.1, 0.3, *DOWN, 0.085), strict=True))
-JOINTS = dict(zip(JOINT_ACTIONS, (*UR5Config().body().home,), strict=True))
+JOINTS = dict(zip(JOINT_ACTIONS, (*UR5Config().body().arm.home,), strict=True))
 TOOL_KEYS = ("w", "a", "r", "u", "i", "j"), ("s", "d", "f", "o", "k", "l")  # along and about x, y, z, and back
 JOINT_KEYS = "asdfhj", "zxcvnm"
 
@@ -179,8 +179,8 @@ def test_as_a_brain_it_starts_where_the_robot_is_at_an_episode_and_at_a_takeover
     names = (*JOINT_ACTIONS, *TOOL_NAMES[:-1])
     body = UR5Config().body()
     brain.bind(RobotFeatures(names, TOOL_NAMES, 25, body=body, robot_type="ur5"))
-    tool = pose_vectors(ArmKinematics(body.chain, body.limits).tool(np.array(body.home[:6])))
-    observation = Observation(names, np.array([[*body.home, *tool]]))
+    tool = pose_vectors(ArmKinematics(body.arm.chain, body.limits).tool(np.array(body.arm.home[:6])))
+    observation = Observation(names, np.array([[*body.arm.home, *tool]]))
     for _ in range(2):
         brain.reset(np.zeros(1, np.intp), [0], 1)
         person.press("w", teleop)

@@ -15,7 +15,7 @@ from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 CONFIG = UR5Config()
 ARM, RATES = CONFIG.body(), CONFIG.rates
-HOME = np.array(ARM.home)
+HOME = np.array(ARM.arm.home)
 
 
 def drive(tmp_path, brain, frames=125, **options):

@@ -79,7 +79,7 @@ def test_an_arm_is_rigid_its_fingers_are_as_far_apart_as_its_opening(arm) -> Non
     header, arrays = unpack(ViewedDataset(arm).packed(0))
     physics = read_episode(arm, 0)["simulation.state"]
     capsules = arrays["view.capsules"].reshape(header["frames"], -1, 2, 3).astype(np.float64)
-    chain = ur5().chain
+    chain = ur5().arm.chain
     for number, one in enumerate(chain.capsules):
         wanted = np.linalg.norm(np.subtract(one.start, one.end))
         np.testing.assert_allclose(

@@ -9,7 +9,7 @@ ARM = ur5()
 
 
 def test_no_distance_changes_by_more_than_its_slopes() -> None:
-    model = CollisionModel(ARM.chain)
+    model = CollisionModel(ARM.arm.chain)
     slopes = np.concatenate(model.slopes())
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (2000, 6))

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 ARM = ur5(actuation="torque")
 HZ = 500
 DYNAMICS = ArmDynamics(ARM)
-HOME = np.array(ARM.home)
+HOME = np.array(ARM.arm.home)
 ALL = np.ones(1, np.bool_)
 
 

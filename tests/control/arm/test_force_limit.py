@@ -13,7 +13,7 @@ from bhd_lerobot.errors import ConfigError
 HZ = 500
 ARM = ur5()
 DYNAMICS = ArmDynamics(ARM)
-HOME = np.array(ARM.home[:6])
+HOME = np.array(ARM.arm.home[:6])
 
 
 def reading_of(forces: np.ndarray, postures: np.ndarray = HOME) -> PlantReading:
@@ -46,8 +46,8 @@ def test_forces_are_estimated_and_compared_with_the_largest() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_forces_in_random_postures_and_directions_are_found_as_the_page_says(seed: int) -> None:
-    rng, kinematics = np.random.default_rng(seed), ArmKinematics(ARM.chain, ARM.limits)
-    postures = np.array(ARM.home)[:6] + rng.uniform(-1.5, 1.5, (1000, 6))
+    rng, kinematics = np.random.default_rng(seed), ArmKinematics(ARM.arm.chain, ARM.limits)
+    postures = np.array(ARM.arm.home)[:6] + rng.uniform(-1.5, 1.5, (1000, 6))
     free = np.min(kinematics.collision.distances(postures), axis=0) > 0.02
     postures = np.repeat(postures[free][:160], 20, axis=0)
     forces = rng.normal(size=(len(postures), 3))

@@ -12,8 +12,8 @@ from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.plant import PlantReading
 
 ARM, HZ, STALL = ur5(), 500, 50
-KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
-LEAST = ARM.chain.min_distance
+KINEMATICS = ArmKinematics(ARM.arm.chain, ARM.limits)
+LEAST = ARM.arm.chain.min_distance
 
 
 def posture(height: float, tilt: float = 0.0) -> np.ndarray:
@@ -21,7 +21,7 @@ def posture(height: float, tilt: float = 0.0) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("yx", (tilt, np.pi)).as_matrix()
     pose[:3, 3] = 0.5, 0.1, height
-    return KINEMATICS.solve(pose, np.array(ARM.home[:6])).postures[0]
+    return KINEMATICS.solve(pose, np.array(ARM.arm.home[:6])).postures[0]
 
 
 class Hand:
@@ -29,7 +29,7 @@ class Hand:
 
     def __init__(self, *postures: np.ndarray) -> None:
         n = len(postures)
-        self.held, self.reading = HeldObjects(ARM, n, HZ), PlantReading(n, 7)
+        self.held, self.reading = HeldObjects(ARM.arm, n, HZ), PlantReading(n, 7)
         self.command = np.concatenate((postures, np.full((n, 1), 0.085)), axis=1)
         self.reading.position[:] = self.command
 
@@ -48,15 +48,15 @@ def test_what_a_stalled_gripper_holds_reaches_down_to_the_table() -> None:
     for arm, (height, tilt) in enumerate(cases):
         capsule = held[arm]
         assert isinstance(capsule, Capsule)
-        assert (capsule.name, capsule.start) == (HELD, ARM.chain.tool)
+        assert (capsule.name, capsule.start) == (HELD, ARM.arm.chain.tool)
         assert capsule.radius <= 0.025
-        model = CollisionModel(ARM.chain.holding(capsule))
+        model = CollisionModel(ARM.arm.chain.holding(capsule))
         rows = np.stack([posture(height + up, tilt) for up in (0.0, 0.01, -0.001)])
         heights = model.each(rows)[-1]
         assert LEAST < heights[0] < LEAST + 3e-4
         np.testing.assert_allclose(heights - heights[0], (0.0, 0.01, -0.001), atol=1e-9)
-        without = CollisionModel(ARM.chain).each(rows)
-        assert (model.each(rows)[: len(ARM.chain.disjoint)] == without[: len(ARM.chain.disjoint)]).all()
+        without = CollisionModel(ARM.arm.chain).each(rows)
+        assert (model.each(rows)[: len(ARM.arm.chain.disjoint)] == without[: len(ARM.arm.chain.disjoint)]).all()
 
 
 def test_a_gripper_that_moves_is_empty_or_that_nothing_stood_under_holds_nothing() -> None:

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 ARM = ur5(actuation="torque")
 HZ = 500
 EFFORT = np.array(ARM.limits.effort[:6])
-HOME = np.array(ARM.home)
+HOME = np.array(ARM.arm.home)
 ALL = np.ones(1, np.bool_)
 
 
@@ -262,4 +262,4 @@ def test_a_position_servo_is_refused() -> None:
     with pytest.raises(ConfigError, match="actuation"):
         ImpedanceController(ur5(), 1, HZ, 20)
     with pytest.raises(ConfigError, match="actuation"):
-        ImpedanceController(replace(ARM, actuation="position"), 1, HZ, 20)
+        ImpedanceController(replace(ARM, arm=replace(ARM.arm, actuation="position")), 1, HZ, 20)

@@ -12,7 +12,7 @@ from bhd_lerobot.control.messages import Limit
 LIMITS = ur5().limits
 LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
 SPEED, ACCELERATION = np.array(LIMITS.velocity), np.array(LIMITS.acceleration)
-HOME = np.array(ur5().home)
+HOME = np.array(ur5().arm.home)
 HZ, FRAME = 500, 20
 SLACK = 1e-9
 

@@ -86,8 +86,8 @@ def test_in_free_space_it_changes_nothing() -> None:
 def watched(n: int = 1) -> support.Rig:
     """Return bases that drive by what a test writes into the scans."""
     rig = base_rig(n)
-    monitor = CollisionMonitor(support.BODY, LIDAR, n, support.HZ, BEAMS)
-    controller = BaseController(support.BODY, n, support.HZ, monitor=monitor)
+    monitor = CollisionMonitor(support.BODY.drive, LIDAR, n, support.HZ, BEAMS)
+    controller = BaseController(support.BODY.drive, n, support.HZ, monitor=monitor)
     cerebellum = support.Cerebellum(support.BODY, rig.plant, support.HZ, controller, sensors=BEAMS)
     rig.cerebellum = cerebellum
     for request in (support.Request.CONFIGURE, support.Request.ACTIVATE):
@@ -150,7 +150,7 @@ def test_scans_that_come_too_late_or_from_the_future_are_none_of_the_present() -
 
 
 def test_a_scan_from_the_future_does_not_take_the_place_of_one_that_grows_old() -> None:
-    monitor = CollisionMonitor(support.BODY, LIDAR, 1, support.HZ, BEAMS)
+    monitor = CollisionMonitor(support.BODY.drive, LIDAR, 1, support.HZ, BEAMS)
     pose, far = np.zeros((1, 3)), np.full((1, monitor.beams), 3.0)
     for tick in range(4 * SCAN_TICKS):
         stamp = np.array([tick])
@@ -184,7 +184,7 @@ def test_a_base_stands_when_a_slow_wall_comes_that_it_is_commanded_to_drive_into
     """Between two scans a wall of 0.1 m/s comes as near as the margin is wide: faster ones are met on the way."""
     rig = watched()
     angle = 2 * np.pi * np.arange(BEAMS) / BEAMS
-    front = max(front for _, front, _ in support.BODY.outline)
+    front = max(front for _, front, _ in support.BODY.drive.outline)
     for tick in range(12 * support.HZ):
         x = float(rig.plant.position.mean()) * WHEEL_RADIUS
         ahead = 1.0 - wall_speed * tick / support.HZ - x

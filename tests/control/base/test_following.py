@@ -34,7 +34,7 @@ def stop_at(
         silent: of each so many seconds, how many nothing is read at the end.
     """
     rng = np.random.default_rng(seed)
-    controller = BaseController(turtlebot3_burger(), 1, HZ, latency_s=allowed)
+    controller = BaseController(turtlebot3_burger().drive, 1, HZ, latency_s=allowed)
     out = PlantReading(1, 2, 0)
     out.stamp_ns = np.ones(1, np.int64) if stamped else None
     controller.configure(np.array([0]), out)

@@ -15,8 +15,8 @@ from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
 
 ARM = ur5()
-CHAIN = ARM.chain
-HOME = np.array(ARM.home[:6])
+CHAIN = ARM.arm.chain
+HOME = np.array(ARM.arm.home[:6])
 POINTS = arrays(np.float64, (4, 3), elements=st.integers(-8, 8).map(lambda eighths: eighths / 8))
 ZERO = np.zeros(6)
 

@@ -10,7 +10,7 @@ import pinocchio
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -33,8 +33,8 @@ def engine_at(q: NDArray[np.float64], v: NDArray[np.float64], opening: float) ->
     return data
 
 
-def at_home_open(opening: float) -> Arm:
-    return replace(ARM, home=(*ARM.home[:-1], opening))
+def at_home_open(opening: float) -> Body:
+    return replace(ARM, arm=replace(ARM.arm, home=(*ARM.arm.home[:-1], opening)))
 
 
 @pytest.mark.law
@@ -52,7 +52,7 @@ def test_it_agrees_with_the_engine(opening: float) -> None:
             terms.gravity[k], engine_at(POSTURES[k], 0 * SPEEDS[k], opening).qfrc_bias[:6], atol=1e-10
         )
     np.testing.assert_array_equal(still.coriolis @ np.ones(6), np.zeros((40, 6)))
-    kinematics = ArmKinematics(ARM.chain, ARM.limits)
+    kinematics = ArmKinematics(ARM.arm.chain, ARM.limits)
     np.testing.assert_allclose(terms.tool, kinematics.tool(POSTURES), atol=1e-12)
     np.testing.assert_allclose(terms.jacobian, kinematics.jacobian(POSTURES), atol=1e-12)
 
@@ -92,7 +92,7 @@ def test_the_damped_mobility_has_an_inverse_in_a_singular_posture() -> None:
         (replace(ARM, mjcf=ARM.mjcf.replace('<site name="tool"', '<site name="tip"')), "has no site 'tool'"),
     ],
 )
-def test_a_body_that_cannot_be_is_refused(body: Arm, message: str) -> None:
+def test_a_body_that_cannot_be_is_refused(body: Body, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         ArmDynamics(body)
 
@@ -112,11 +112,11 @@ def test_it_is_the_same_with_version_3_of_pinocchio(monkeypatch: pytest.MonkeyPa
         return model
 
     for load in (0.0, 1.5):
-        expected = ArmDynamics(replace(ARM, load=load)).terms(POSTURES, SPEEDS)
+        expected = ArmDynamics(replace(ARM, arm=replace(ARM.arm, load=load))).terms(POSTURES, SPEEDS)
         with monkeypatch.context() as patch:
             patch.setattr(pinocchio, "buildModelFromMJCF", without_sites)
             patch.setattr(pinocchio, "buildReducedModel", without_rotors)
             assert not _parse(ARM).existFrame("tool")
-            terms = ArmDynamics(replace(ARM, load=load)).terms(POSTURES, SPEEDS)
+            terms = ArmDynamics(replace(ARM, arm=replace(ARM.arm, load=load))).terms(POSTURES, SPEEDS)
         for name in ("mass", "coriolis", "gravity", "jacobian", "tool"):
             np.testing.assert_allclose(getattr(terms, name), getattr(expected, name), atol=1e-12)

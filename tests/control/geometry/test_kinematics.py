@@ -15,8 +15,8 @@ from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
 
 ARM = ur5()
-CHAIN = ARM.chain
-HOME = np.array(ARM.home[:6])
+CHAIN = ARM.arm.chain
+HOME = np.array(ARM.arm.home[:6])
 KINEMATICS = ArmKinematics(CHAIN, ARM.limits)
 TILTED = ArmKinematics(dataclasses.replace(CHAIN, tool=(0.03, -0.02, 0.15)), ARM.limits)
 TURN = 2 * math.pi

@@ -12,7 +12,7 @@ from tests.control.goal_rig import ARM, HZ, KINEMATICS
 from tests.control.motion.test_trajectory import excess
 
 LIMITS = MotionLimits.of(ARM.limits)[slice(0, 6)]
-HOME = np.array(ARM.home[:6])
+HOME = np.array(ARM.arm.home[:6])
 BOX = np.array([[0.30, -0.35, 0.10], [0.65, 0.35, 0.50]])  # [m]
 
 

@@ -196,7 +196,7 @@ class Choosy(ArmKinematics):
 
 
 def test_the_first_posture_with_an_admissible_way_wins_and_at_most_eight_are_tried() -> None:
-    kinematics = Choosy(ARM.chain, ARM.limits)
+    kinematics = Choosy(ARM.arm.chain, ARM.limits)
     planner = GoalPlanner(ARM, HZ)
     planner.kinematics = kinematics
     command = BrainCommand("a", target_pose=moved())
@@ -212,8 +212,8 @@ def test_the_first_posture_with_an_admissible_way_wins_and_at_most_eight_are_tri
 
 
 def test_a_singular_posture_ends_neither_a_pose_nor_lies_on_a_line_but_joints_may_pass_it() -> None:
-    chain = dataclasses.replace(ARM.chain, min_manipulability=1.0)
-    strict = GoalPlanner(dataclasses.replace(ARM, chain=chain), HZ)
+    chain = dataclasses.replace(ARM.arm.chain, min_manipulability=1.0)
+    strict = GoalPlanner(dataclasses.replace(ARM, arm=dataclasses.replace(ARM.arm, chain=chain)), HZ)
     for motion in ("joint", "line"):
         answer = strict.plan(BrainCommand("a", target_pose=moved(0.05), motion=motion), HOME, ZEROS, ZEROS)
         assert isinstance(answer, PlanFailure)
@@ -222,7 +222,7 @@ def test_a_singular_posture_ends_neither_a_pose_nor_lies_on_a_line_but_joints_ma
     through = [
         KINEMATICS.manipulability(row) for row in made(joint_target=joints(0, 0, 0, 0, 2.5)).trajectory.position[:, :6]
     ]
-    assert min(through) < ARM.chain.min_manipulability
+    assert min(through) < ARM.arm.chain.min_manipulability
 
 
 def test_an_unbrakeable_state_stops_at_once() -> None:
@@ -233,8 +233,8 @@ def test_an_unbrakeable_state_stops_at_once() -> None:
 
 
 def test_what_the_motors_cannot_carry_is_refused_with_the_load() -> None:
-    arm = dataclasses.replace(ARM, load=5.0)
-    weak = dataclasses.replace(arm, limits=dataclasses.replace(arm.limits, effort=(10.0,) * 6 + (60.0,)))
+    limits = dataclasses.replace(ARM.limits, effort=(10.0,) * 6 + (60.0,))
+    weak = dataclasses.replace(ARM, arm=dataclasses.replace(ARM.arm, load=5.0, limits=limits))
     target = HOME[:6] + 0.3
     failure = GoalPlanner(weak, HZ).plan(BrainCommand("x", joint_target=tuple(target)), HOME, np.zeros(7), np.zeros(7))
     assert not isinstance(failure, Plan)
@@ -243,7 +243,7 @@ def test_what_the_motors_cannot_carry_is_refused_with_the_load() -> None:
 
 
 def test_a_goal_that_is_planned_anew_on_its_way_is_neither_refused_nor_later() -> None:
-    arm = dataclasses.replace(ARM, load=4.0)
+    arm = dataclasses.replace(ARM, arm=dataclasses.replace(ARM.arm, load=4.0))
     planner, random = GoalPlanner(arm, HZ), np.random.default_rng(0)
     checked = 0
     for _ in range(40):

@@ -34,7 +34,7 @@ BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
 TWIST = ("x.vel", "theta.vel")
 JOINTS = tuple(ur5().limits.names)
 ARM = (*JOINTS, *(name.replace(".pos", ".vel") for name in JOINTS))
-HOME = np.array(ur5().home)
+HOME = np.array(ur5().arm.home)
 BURGER = turtlebot3_burger()
 DRIVEN = RobotFeatures(BASE, TWIST, 10, (), BURGER)
 UR = RobotFeatures(ARM, JOINTS, 25, (), ur5())
@@ -201,7 +201,7 @@ def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or
 
 
 def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:
-    watch = ArmCollisionWatch(UR, ur5())
+    watch = ArmCollisionWatch(UR, ur5().arm)
     down = np.zeros(7)
     down[1] = 1.0  # the shoulder leans forward
     low = HOME + np.array([0, 0.40, 0, 0, 0, 0, 0])

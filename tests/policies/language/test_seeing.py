@@ -258,7 +258,7 @@ def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     assert table.steps[-1] == "back"
     home = table.end()
     assert home is not None
-    assert home.joint_target == ur5().home[:-1]
+    assert home.joint_target == ur5().arm.home[:-1]
     again = table.end()
     assert again is not None
     assert again.target_pose is not None

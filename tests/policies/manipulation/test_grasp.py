@@ -87,7 +87,7 @@ def test_of_two_ways_round_it_is_the_one_with_less_turn_of_the_wrist(
 
 def test_at_home_the_wrist_is_not_turned() -> None:
     arm = ur5()
-    tool = ForwardKinematics(arm.chain).tool(np.array(arm.home[:6]))
+    tool = ForwardKinematics(arm.arm.chain).tool(np.array(arm.arm.home[:6]))
     fingers = math.atan2(tool[1, 1], tool[0, 1])  # the tool's y axis: from the left to the right finger
     assert between_lines(fingers, neutral_yaw(*tool[:2, 3])) < 1e-6
 

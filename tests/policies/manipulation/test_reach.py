@@ -68,7 +68,7 @@ def test_where_no_way_leads_it_goes_by_way_of_home_and_gives_up_in_the_end(attem
     for _ in range(attempts - 1):
         home = desk.end(success=False)
         assert home is not None
-        assert home.joint_target == ur5().home[:6]
+        assert home.joint_target == ur5().arm.home[:6]
         again = desk.end()
         assert again is not None
         assert again.target_pose is not None

@@ -55,12 +55,12 @@ def test_an_object_is_rendered_where_the_projection_says() -> None:
         camera = Camera(table.world, WIDTH, HEIGHT)
     except RenderingError as error:
         pytest.skip(f"no image can be rendered on this machine: {error}")
-    table.place([TableScene("test", (), ur5().home)])
+    table.place([TableScene("test", (), ur5().arm.home)])
     table.world.forward()
     empty = camera.render(0, "scene").astype(int)
     for x, y in ((0.38, -0.25), (0.5, 0.0), (0.62, 0.27)):
         thing = TableObject("box", "blue", 0.02, 0.02, 0.04, x, y, style="plain")
-        table.place([TableScene("test", (thing,), ur5().home)])
+        table.place([TableScene("test", (thing,), ur5().arm.home)])
         table.world.forward()
         row, column = np.nonzero(np.abs(camera.render(0, "scene").astype(int) - empty).sum(axis=-1) > 60)
         middle = np.array([column.mean() + 0.5, row.mean() + 0.5])

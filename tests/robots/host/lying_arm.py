@@ -26,7 +26,7 @@ class LyingArm(Plant):
 
     def __init__(self, config: Any, body: Any) -> None:
         self._shared = shared(os.environ[LOG])
-        self._true, self._velocity = np.array(body.home), np.zeros(7)
+        self._true, self._velocity = np.array(body.arm.home), np.zeros(7)
         self._frozen = self._true.copy()
         self._period = 1 / config.rates.control_hz
         self._mode = 0

@@ -183,7 +183,7 @@ def test_missed_ticks_are_caught_up_within_a_bound(away: int, skipped: int, adva
 
 
 def test_servos_that_hold_the_arm_follow_a_reading_that_runs_away_no_farther_than_a_brake() -> None:
-    stop, reading = ServoStop(ur5()), PlantReading(1, 7)
+    stop, reading = ServoStop(ur5().arm), PlantReading(1, 7)
     stop.begin(reading.position)
     for _ in range(2000):
         reading.position[:] += 2.0 / 500
@@ -192,7 +192,7 @@ def test_servos_that_hold_the_arm_follow_a_reading_that_runs_away_no_farther_tha
 
 
 def test_a_servo_follows_a_fast_joint_and_holds_a_slow_one() -> None:
-    stop, reading = ServoStop(ur5()), PlantReading(1, 7)
+    stop, reading = ServoStop(ur5().arm), PlantReading(1, 7)
     last = np.full((1, 7), 0.03)
     stop.begin(last)
     reading.velocity[:] = [[1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.1]]
@@ -213,7 +213,7 @@ def test_an_arm_comes_to_rest_and_stays_there_by_itself(actuation: Any) -> None:
     world = World(body, 1)
     plant, stop, reading = SimulatedPlant(world), make_stop(body, 7), PlantReading(1, 7)
     world.qvel[:, :6] = [1.0, -1.0, 1.5, 2.0, 2.0, -2.0]
-    stop.begin(np.asarray(body.home)[None])
+    stop.begin(np.asarray(body.arm.home)[None])
     plant.set_mode(np.array([Mode.FAULT], np.int8))
     effort = np.asarray(body.limits.effort)
     speeds, positions = [], []

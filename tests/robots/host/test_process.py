@@ -20,7 +20,7 @@ from bhd_lerobot.control.plant import Plant
 
 class Standing(Plant):
     n = 1
-    def __init__(self, config, body): self.position, self.sensors = body.home if hasattr(body, "home") else 0.0, 1.0
+    def __init__(self, config, body): self.position, self.sensors = body.arm.home if body.arm else 0.0, 1.0
     def read(self, out): out.position[0], out.sensors[0] = self.position, self.sensors
     def write(self, ctrl): pass
 """

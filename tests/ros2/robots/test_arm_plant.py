@@ -77,7 +77,7 @@ def test_the_safety_mode_is_read_of_drivers_that_keep_it_and_of_those_that_do_no
     plant: ArmPlant, domain: int, latched: bool
 ) -> None:
     """`ur_robot_driver` publishes it volatile before 2024; a node that receives no gripper's commands is no problem."""
-    joints = [f"{joint}_joint" for joint in ur5().chain.joints]
+    joints = [f"{joint}_joint" for joint in ur5().arm.chain.joints]
     out = reading()
 
     def make(at: float) -> list[Sent]:

@@ -16,7 +16,7 @@ from bhd_lerobot.ros2.serve.server import State
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, joints, moved
 
-NAMES = [f"{joint}_joint" for joint in ARM.chain.joints]
+NAMES = [f"{joint}_joint" for joint in ARM.arm.chain.joints]
 
 
 class Node:

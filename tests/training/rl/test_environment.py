@@ -198,7 +198,7 @@ def test_the_critic_sees_more_than_the_actor_and_the_actor_what_it_saw_before() 
     assert size == parts.actor.feature_size
     # The scan was taken where the robots stand: of 36 beams each is one of the directions.
     simulation: Any = env.stage.simulation
-    near = simulation.body.radius / simulation.lidar.ranges
+    near = simulation.body.drive.radius / simulation.lidar.ranges
     np.testing.assert_allclose(seen[:, size : size + 36], np.minimum(near, 1.0), atol=0.02)
     learner = make_learner(config, parts, adapter)
     other = seen.copy()
