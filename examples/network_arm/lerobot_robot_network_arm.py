@@ -23,9 +23,10 @@ class NetworkArmConfig(bhd.UR5Config):
     address: str = "127.0.0.1:47654"
     realtime: bhd.RealtimeConfig = field(default_factory=lambda: bhd.RealtimeConfig(plant_timeout_s=0.1))
 
-    def body(self) -> bhd.Arm:
+    def body(self) -> bhd.Body:
         """Return a UR5's geometry and limits, with the latency that was measured of this arm."""
-        return replace(super().body(), latency_s=0.010)
+        body = super().body()
+        return replace(body, arm=replace(body.need(bhd.Arm), latency_s=0.010))
 
 
 @bhd.register_robot

@@ -44,7 +44,7 @@ class NetworkPlant(bhd.Plant):
 
     n = 1
 
-    def __init__(self, config: Any, body: bhd.Arm) -> None:
+    def __init__(self, config: Any, body: bhd.Body) -> None:
         host, _, port = config.address.partition(":")
         if not port.isdecimal():
             raise ValueError(f"robot.address is {config.address!r}; write host:port, such as 127.0.0.1:47654")

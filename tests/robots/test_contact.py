@@ -84,7 +84,7 @@ def test_setpoints_slow_an_arm_down_and_stop_it_before_it_touches_anything(where
         assert (pusher.mode, pusher.watchdog) == (Mode.TRACKING, 0)
         assert np.abs(pusher.arm.cerebellum.reading.velocity[0, :6]).max() < 0.02
         # Away it may go at once.
-        home = np.array(pusher.arm.body.home)[None]  # type: ignore[union-attr]
+        home = np.array(pusher.arm.body.arm.home)[None]  # type: ignore[union-attr]
         for _ in range(60):
             pusher.step(home)
         np.testing.assert_allclose(pusher.arm.cerebellum.reading.position, home, atol=2e-3)
@@ -161,7 +161,7 @@ def test_a_stopped_arm_lets_go_of_the_table_and_stays_so_after_reset_and_activat
 
 def test_a_goal_into_something_unknown_ends_and_lets_go() -> None:
     pusher = Pusher(measures=True, fixtures=(Shape("box", 0.25, 0.45, 0.0, 0.2, 0.1, 0.8),))
-    home = pusher.arm.body.home  # type: ignore[union-attr]
+    home = pusher.arm.body.arm.home  # type: ignore[union-attr]
     assert pusher.controller.submit(0, BrainCommand("into", joint_target=(home[0] + 2.0, *home[1:6]))) is None
     for _ in range(100):
         report = pusher.arm.step(None)
@@ -223,7 +223,7 @@ def test_setpoints_and_goals_keep_away_from_obstacles_that_are_declared() -> Non
         assert (pusher.mode, pusher.watchdog) == (Mode.TRACKING, 0)
         assert pusher.limits & Limit.CLEARANCE
     pusher = Pusher(fixtures=(post,), obstacles=[declared])
-    home = pusher.arm.body.home  # type: ignore[union-attr]
+    home = pusher.arm.body.arm.home  # type: ignore[union-attr]
     assert pusher.controller.submit(0, BrainCommand("by", joint_target=(home[0] + 2.5, *home[1:6]))) is None
     while not (results := pusher.arm.step(None).results):
         pass

@@ -23,7 +23,7 @@ class Base:
     def __init__(self) -> None:
         self.config = TurtleBot3Config(odometry=True, fps=FPS)
         self.simulation = BaseSimulation(self.config)
-        arena = make_arena("turtlebot3_world", 0, robot_radius=self.config.body().radius)
+        arena = make_arena("turtlebot3_world", 0, robot_radius=self.config.body().drive.radius)
         self.simulation.reset(np.zeros(1, np.intp), [arena], [0])
         self.rates, self.body = self.simulation.rates, self.simulation.body
         self.observation_names, self.action_names = self.simulation.observation_names, self.simulation.action_names
