@@ -9,6 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.registry import body_of
+from bhd_lerobot.datasets.format import columns
 from bhd_lerobot.datasets.format import features as keys
 
 MAX_LINES = 8  # in one plot; more cannot be distinguished
@@ -26,18 +27,9 @@ _PLACED = (  # what has a place of its own on the page
 
 def numbers(column: pa.ChunkedArray, frames: int) -> NDArray | None:
     """Return a column of numbers, of shape (frames, numbers); None if it holds something else."""
-    array: Any = column.combine_chunks()
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):  # LeRobot's matrices
-            array = array.storage
-        elif pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
-            array = array.flatten()
-        else:
-            break
-    kind = array.type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+    values = columns.numbers(column)
+    if values is None:
         return None
-    values = np.asarray(array.to_numpy(zero_copy_only=False))
     if values.dtype == object:  # a column with gaps
         values = values.astype(np.float64)
     if frames == 0 or values.size % frames:

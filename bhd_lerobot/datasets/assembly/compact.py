@@ -13,10 +13,10 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
 from bhd_lerobot.datasets.format import statistics
-from bhd_lerobot.datasets.format.columns import frames_of
+from bhd_lerobot.datasets.format.columns import frames_of, to_numpy
 from bhd_lerobot.datasets.format.episode_table import stored_stats
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, write_meta
-from bhd_lerobot.datasets.format.schema import Schema, as_numpy
+from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import Workspace, link_others
@@ -119,7 +119,7 @@ def _stats_from_data(schema: Schema, frames: pa.Table, path: Path) -> EpisodeSta
         table = frames.select(schema.float_keys).cast(wanted)
     except (pa.ArrowException, ValueError) as error:
         raise corrupt(path, error) from error
-    return statistics.column_stats({key: as_numpy(table[key]) for key in schema.float_keys})
+    return statistics.column_stats({key: to_numpy(table[key]) for key in schema.float_keys})
 
 
 def _store(result: dict[str, statistics.Stats], episode: int, stats: EpisodeStats) -> None:

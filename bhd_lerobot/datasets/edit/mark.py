@@ -12,8 +12,7 @@ from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.edit.edits import Change, EditReport, OnDone, check_episodes, rewrite
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.columns import frames_of
-from bhd_lerobot.datasets.format.schema import as_numpy
+from bhd_lerobot.datasets.format.columns import frames_of, to_numpy
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.layout import Slot
@@ -173,7 +172,7 @@ class _Changes:
         path = self._state.root / layout.data_file(slot)
         if (slot, key) not in self._frames:
             self._frames = {(slot, key): frames_of(path, self._slots[slot], [key])}  # of one file: its episodes follow
-        return as_numpy(self._frames[slot, key][row["episode_index"]][key]).copy()
+        return to_numpy(self._frames[slot, key][row["episode_index"]][key]).copy()
 
 
 def _interventions(row: Row) -> list[tuple[int, int, str]]:

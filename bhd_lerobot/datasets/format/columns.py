@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from bhd_lerobot.datasets.format.expected import is_listed
 from bhd_lerobot.datasets.format.state import (
     DatasetState,
     Row,
@@ -161,16 +162,32 @@ def _row(state: DatasetState, index: int) -> Row:
     return state.rows[index]
 
 
-def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
+def flat(column: pa.ChunkedArray) -> pa.Array:
+    """Return the values of a column; those of lists one after the other."""
+    array = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):  # of no rows
+        array = pa.concat_arrays(array.chunks)
+    while isinstance(array, pa.ExtensionArray) or is_listed(array.type):
+        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+    return array
+
+
+def numbers(column: pa.ChunkedArray) -> NDArray | None:
+    """Return the numbers of a column, flat; None if it holds something else."""
+    array = flat(column)
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    return array.to_numpy(zero_copy_only=False) if any(is_one(array.type) for is_one in kinds) else None
+
+
+def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...] = (-1,)) -> NDArray:
     """Return a column of a data file as an array of shape (T, *shape), or (T,) of scalars."""
-    array = column.combine_chunks()
-    if pa.types.is_list(array.type) and pa.types.is_struct(array.type.value_type):
-        rows = np.empty(len(array), dtype=object)  # language: a list of rows for every frame
-        rows[:] = array.to_pylist()
+    array = flat(column)
+    if pa.types.is_struct(array.type):  # language: a list of rows for every frame
+        rows = np.empty(len(column), dtype=object)
+        rows[:] = column.to_pylist()
         return rows
-    if pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
-        return array.flatten().to_numpy(zero_copy_only=False).reshape(len(array), *shape)
-    return np.asarray(array.to_numpy(zero_copy_only=False))
+    values = np.asarray(array.to_numpy(zero_copy_only=False))
+    return values.reshape(len(column), *shape) if is_listed(column.type) else values
 
 
 def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:

@@ -105,14 +105,6 @@ def _language_array(values: np.ndarray, kind: pa.ListType) -> pa.ListArray:
     return pa.ListArray.from_arrays(offsets, structs, type=kind)
 
 
-def as_numpy(column: pa.ChunkedArray) -> np.ndarray:
-    """Return a column of a data file as an array of shape (T,) or (T, d); the inverse of `Schema.table`."""
-    array = column.combine_chunks()
-    if pa.types.is_fixed_size_list(array.type):
-        return array.flatten().to_numpy(zero_copy_only=False).reshape(len(array), array.type.list_size)
-    return array.to_numpy(zero_copy_only=False)
-
-
 def _row_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     """LeRobot stores a value of shape (1,) as a scalar."""
     return () if shape == (1,) else shape

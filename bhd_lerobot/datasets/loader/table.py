@@ -10,6 +10,8 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from bhd_lerobot.datasets.format.columns import flat
+from bhd_lerobot.datasets.format.expected import wrong_array
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import corrupt, load_info
 from bhd_lerobot.datasets.storage import layout
@@ -211,19 +213,9 @@ def _read(
 
 def _tensor(key: str, column: pa.ChunkedArray, shape: tuple[int, ...]) -> Tensor:
     """Return a column as LeRobot's samples have it: through Python's numbers, so float32, int64 or bool."""
-    array = column.combine_chunks()
-    rows = len(array)
-    if isinstance(array, pa.ChunkedArray):  # an empty column stays chunked
-        array = pa.concat_arrays(array.chunks)
-    while True:
-        if array.null_count:
-            raise DatasetError(f"Column {key!r} has {array.null_count} missing values; a policy cannot learn from it.")
-        if isinstance(array, pa.ExtensionArray):
-            array = array.storage
-        elif pa.types.is_nested(array.type):
-            array = array.flatten()
-        else:
-            break
+    if wrong := next(filter(None, map(wrong_array, column.chunks)), ""):
+        raise DatasetError(f"Column {key!r} cannot be learned from: {wrong}.")
+    rows, array = len(column), flat(column)
     values = array.to_numpy(zero_copy_only=False)
     kinds: Mapping[str, Any] = {"f": np.float32, "i": np.int64, "u": np.int64, "b": np.bool_}
     if values.dtype.kind not in kinds:

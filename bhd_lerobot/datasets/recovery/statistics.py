@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format.columns import flat
 from bhd_lerobot.datasets.format.state import Row, slot_of
 from bhd_lerobot.datasets.storage import layout
 
@@ -58,9 +59,7 @@ def stats_of(
 
 
 def _array(table: pa.Table, key: str, shape: tuple[int, ...]) -> np.ndarray:
-    column = table[key].combine_chunks()
-    values = np.array(column.to_pylist()) if pa.types.is_nested(column.type) else column.to_numpy(zero_copy_only=False)
-    return values.reshape(len(column), *shape) if shape != (1,) else values.reshape(len(column))
+    return flat(table[key]).to_numpy(zero_copy_only=False).reshape(len(table), *(() if shape == (1,) else shape))
 
 
 def _images(table: pa.Table, key: str) -> Iterator[np.ndarray]:

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import numbers
 from bhd_lerobot.datasets.format.expected import wrong_columns
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import Row, ordered_slots
@@ -139,7 +140,7 @@ class ValueCheck:
             if missing:
                 self._findings.error("finite", key, f"{missing} frames hold nothing", _LEAVE)
                 continue
-            values = _numbers(table[key])
+            values = numbers(table[key])
             if values is None:
                 continue
             size = math.prod(self._files.features[key]["shape"])
@@ -247,17 +248,3 @@ class ValueCheck:
         )
         report = self._findings.error if is_zero else self._findings.warning
         report("stats", f"{layout.STATS}: {key}", what, remedy)
-
-
-def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:
-    """Return the numbers of a column, flat; None if it holds something else."""
-    arrays = []
-    for chunk in column.chunks:
-        array = chunk
-        while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):
-            array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
-        kind = array.type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-            return None
-        arrays.append(array.to_numpy(zero_copy_only=False))
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays) if arrays else None

@@ -5,12 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.edit.edits import check_reported, opened
-from bhd_lerobot.datasets.format.columns import frames_of, instructions_of
+from bhd_lerobot.datasets.format.columns import frames_of, instructions_of, to_numpy
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots
 from bhd_lerobot.datasets.storage import layout
@@ -99,15 +97,4 @@ def _episodes(state: DatasetState, chosen: Sequence[Row]) -> Iterator[tuple[Row,
         for row in rows:
             part = frames[row["episode_index"]]
             tasks = instructions_of(row, part["task_index"].to_numpy(), state.tasks, path)
-            yield {**row, "tasks": tasks}, {key: _column(part[key], tuple(features[key]["shape"])) for key in stored}
-
-
-def _column(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray[Any]:
-    array = column.combine_chunks()
-    if pa.types.is_list(array.type) and pa.types.is_struct(array.type.value_type):
-        rows = np.empty(len(array), dtype=object)
-        rows[:] = array.to_pylist()
-        return rows
-    if pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
-        return array.flatten().to_numpy(zero_copy_only=False).reshape(len(array), *shape)
-    return np.asarray(array.to_numpy(zero_copy_only=False))
+            yield {**row, "tasks": tasks}, {key: to_numpy(part[key], tuple(features[key]["shape"])) for key in stored}
