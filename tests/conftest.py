@@ -21,8 +21,8 @@ from tests import shortcuts
 if "PYTEST_XDIST_WORKER" in os.environ:
     gc.disable()  # until everything is imported, or it is looked through again and again for what can go
 pytest_plugins = [
-    "tests.datasets.remote.store_fixtures",
     "tests.fake_hub.fixtures",
+    "tests.datasets.remote.store_fixtures",
     "tests.recorded_datasets",
     "tests.selection",
 ]

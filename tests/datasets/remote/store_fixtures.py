@@ -1,13 +1,17 @@
 """Fixtures around places below a URL."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import fsspec
 import pytest
 
+from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from tests.datasets import support
+from tests.fake_hub.fixtures import stored as stored_on
+from tests.fake_hub.hub import FakeHub
 
 EPISODES = 3
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
@@ -40,12 +44,6 @@ def s3_url() -> Iterator[str]:
         server.stop()
 
 
-@pytest.fixture(params=["memory", "file", "s3"])
-def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A place of each kind."""
-    return _place(request, tmp_path, monkeypatch)
-
-
 @pytest.fixture(params=["memory", "file"])
 def near_url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A place that needs no server: for what happens on our side of the store."""
@@ -64,6 +62,28 @@ def _place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
         s3.rm("bucket", recursive=True)
     s3.mkdir("bucket")
     return "s3://bucket/there/d"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place of any kind: a URL, or `me/d` on a Hub."""
+
+    url: str
+    hub: FakeHub | None = None
+
+    def remote(self) -> HubDataset | StoreDataset:
+        return StoreDataset(self.url) if self.hub is None else HubDataset(self.url, create=True)
+
+    def stored(self) -> dict[str, bytes]:
+        return stored(self.url) if self.hub is None else stored_on(self.hub)
+
+
+@pytest.fixture(params=["hub", "memory", "file", "s3"])
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+    """A place of each kind."""
+    if request.param == "hub":
+        return Place("me/d", request.getfixturevalue("hub"))
+    return Place(_place(request, tmp_path, monkeypatch))
 
 
 def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,43 +23,6 @@ from tests.fake_hub.fixtures import EPISODES, send, stored
 from tests.fake_hub.hub import FakeHub, Fault, real_client
 
 
-@pytest.mark.law
-def test_what_comes_back_is_what_was_recorded(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    report = send(root)
-    assert stored(hub) == content(root)
-    assert (report.episodes, len(report.sent), report.kept) == (EPISODES, len(content(root)), 0)
-    fetched = pull(HubDataset("me/d"), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
-    assert (fetched.episodes, fetched.kept) == (None, 0)
-    repository = hub.dataset("me/d")
-    assert len(repository.commits) == 2  # the Hub's own first one, and the dataset
-    assert repository.tags == {"v3.0": repository.branches["main"]}  # which LeRobot looks for
-    assert support.verify(tmp_path / "e", EPISODES, video=True, stats=True) == EPISODES
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["d", "e"]  # nothing is left beside it
-
-
-def test_a_second_push_and_a_second_pull_move_nothing(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    send(root)
-    pull(HubDataset("me/d"), tmp_path / "e")
-    hub.reset()
-    assert (send(root).sent, pull(HubDataset("me/d"), tmp_path / "e").fetched) == ([], [])
-    assert not hub.asked("^PUT|/commit/|/tag/|/resolve/")
-    assert hub.received == 0
-
-
-def test_a_longer_dataset_sends_only_what_differs_and_removes_what_is_old(hub: FakeHub, root: Path) -> None:
-    send(root)
-    with support.resume(root, video=True) as recorder:
-        support.record(recorder, video=True)
-    hub.reset()
-    report = send(root)
-    assert stored(hub) == content(root)
-    assert report.kept > 0
-    assert layout.INFO in report.sent
-    repository = hub.dataset("me/d")
-    assert repository.tags["v3.0"] == repository.branches["main"]
-
-
 def test_an_interrupted_upload_goes_on_where_it_was(hub: FakeHub, root: Path) -> None:
     hub.faults = [Fault("^PUT", times=-1, after=2, after_bytes=100)]
     with pytest.raises(TransferError, match="connection was lost"):

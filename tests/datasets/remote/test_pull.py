@@ -57,22 +57,6 @@ def test_episodes_that_do_not_exist(hub: FakeHub, root: Path, tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_a_changed_dataset_is_not_overwritten_without_replace(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / "notes.txt").write_text("mine")
-    (target / layout.STATS).write_text("{}")
-    before = content(target)
-    with pytest.raises(DatasetExistsError, match=r"meta/stats\.json.*--replace"):
-        pull(HubDataset("me/d"), target)
-    assert content(target) == before
-    hub.reset()
-    report = pull(HubDataset("me/d"), target, replace=True)
-    assert report.fetched == [layout.STATS]
-    assert content(target) == content(root) | {"notes.txt": b"mine"}
-
-
 def test_folders_that_hold_something_else_are_never_replaced(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     (tmp_path / "like/data/chunk-000").mkdir(parents=True)

@@ -8,7 +8,6 @@ import pytest
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import Card, MakeCard, is_generated, sign
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import (
     DatasetCorruptError,
@@ -18,20 +17,7 @@ from bhd_lerobot.errors import (
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import send, stored
-from tests.fake_hub.hub import FakeHub, Fault
-
-
-def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: FakeHub, root: Path) -> None:
-    def change() -> None:
-        path = root / layout.STATS
-        path.write_bytes(path.read_bytes() + b" ")
-
-    hub.faults = [Fault("^PUT", meanwhile=change)]
-    with pytest.raises(DatasetError, match=r"changed by another program.*meta/stats\.json"):
-        send(root)
-    assert stored(hub) == {}
-    send(root)
-    assert stored(hub) == content(root)
+from tests.fake_hub.hub import FakeHub
 
 
 def test_a_dataset_in_use_is_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
