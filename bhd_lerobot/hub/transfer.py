@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.remote.place import is_url
 from bhd_lerobot.errors import ConfigError
 
 if TYPE_CHECKING:
-    from bhd_lerobot.datasets.remote.place import Remote
+    from bhd_lerobot.datasets.remote.store import Remote
 
 PATIENCE_S = 3.0
 """How long the threads of a transfer may take to end after Ctrl-C [s]; a stalled connection holds them for minutes."""

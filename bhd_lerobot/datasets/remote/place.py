@@ -2,20 +2,9 @@
 
 import os
 import re
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bhd_lerobot.errors import ConfigError, TransferError
-
-if TYPE_CHECKING:
-    from bhd_lerobot.datasets.remote.hub import HubDataset
-    from bhd_lerobot.datasets.remote.store import StoreDataset
-
-type Remote = HubDataset | StoreDataset
-"""A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
-
-Where `has_checksums` is on, files are listed with theirs, and an interrupted download can be resumed.
-"""
 
 LOCAL = {"file", "local"}
 """Protocols of this machine's own folders."""
@@ -85,13 +74,3 @@ def open_url(url: str, storage_options: dict[str, Any] | None = None) -> tuple[A
     raise ConfigError(
         f"{text} cannot hold a dataset: {reason}. Give the URL of a folder, such as s3://bucket/folder or file:///folder."
     )
-
-
-def refuse_overlap(root: Path, remote: "Remote") -> None:
-    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced."""
-    if remote.folder is None:
-        return
-    here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
-    is_one = here.exists() and there.exists() and os.path.samefile(here, there)
-    if is_one or here.is_relative_to(there) or there.is_relative_to(here):
-        raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")

@@ -25,7 +25,7 @@ from bhd_lerobot.datasets.remote.listing import (
     megabytes,
     parse_info,
 )
-from bhd_lerobot.datasets.remote.place import Remote, refuse_overlap
+from bhd_lerobot.datasets.remote.store import Remote, refuse_overlap
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
     PULL,

@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.remote.listing import CARD, PREVIEW, RemoteFile, is_recorded, matching, parse_info
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
-from bhd_lerobot.datasets.remote.place import Remote, refuse_overlap
+from bhd_lerobot.datasets.remote.store import Remote, refuse_overlap
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, DatasetExistsError
 

@@ -5,15 +5,17 @@ dataset or none.
 """
 
 import contextlib
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.remote.errors import transfer_errors
+from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.listing import RemoteFile, listed
 from bhd_lerobot.datasets.remote.place import LOCAL, open_url, shown
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import TransferError
+from bhd_lerobot.errors import ConfigError, TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
@@ -99,3 +101,20 @@ class StoreDataset:
 
     def _at(self, path: str) -> str:
         return f"{self._root.rstrip('/')}/{path}"
+
+
+type Remote = HubDataset | StoreDataset
+"""A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
+
+Where `has_checksums` is on, files are listed with theirs, and an interrupted download can be resumed.
+"""
+
+
+def refuse_overlap(root: Path, remote: Remote) -> None:
+    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced."""
+    if remote.folder is None:
+        return
+    here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
+    is_one = here.exists() and there.exists() and os.path.samefile(here, there)
+    if is_one or here.is_relative_to(there) or there.is_relative_to(here):
+        raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")
