@@ -3,7 +3,7 @@
 import multiprocessing
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 from gymnasium import spaces
@@ -15,7 +15,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from bhd_lerobot.envs.course import Course
 from bhd_lerobot.envs.register import NAMESPACE
 from bhd_lerobot.envs.settings import Settings, make_settings
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, OneOf, check_options
 
 if TYPE_CHECKING:  # LeRobot's commands import this module, whatever they are used for
     from bhd_lerobot.envs.gym_env import BhdEnv
@@ -54,16 +55,13 @@ class BhdEnvConfig(EnvConfig):
     split: str = "held_out"
     cameras: bool | None = None
     obs_type: str | None = None
-    vector: str = "bhd"
-    threads: int | None = None
+    vector: Annotated[str, OneOf(VECTORS)] = "bhd"
+    threads: Count | None = None
     render_mode: str = "rgb_array"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be honoured, and work out the features."""
-        if self.vector not in VECTORS:
-            raise ConfigError(unknown_name("env.vector", self.vector, VECTORS))
-        if self.threads is not None and self.threads < 1:
-            raise ConfigError(f"env.threads is {self.threads}; it must be at least 1.")
+        check_options(self, "env.")
         from bhd_lerobot.envs.gym_env import BhdEnv
 
         Course(self.seed, self.split)  # type: ignore[arg-type]

@@ -10,11 +10,11 @@ from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Whole
+from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Range, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.policies.topic.config import TopicConfig
-from bhd_lerobot.recording.live_view import check_options
+from bhd_lerobot.recording.live_view import PACKAGES, check_display
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
 from bhd_lerobot.robots.viewer.viewer import check_view
@@ -113,7 +113,7 @@ class RecordConfig(Options):
             the lockstep clock it moves as fast as it is simulated. Closing the window does not end the recording.
         display_data: show the recording live in Rerun or Foxglove; of parallel simulations, the first. The names of
             these options are those of `lerobot-record`.
-        display_mode: viewer: `rerun` or `foxglove`.
+        display_mode: the viewer.
         display_ip: for `rerun`, the address of a viewer on another machine; for `foxglove`, the interface that it can
             connect to, by default 127.0.0.1.
         display_port: for `rerun`, the port of a viewer on another machine; for `foxglove`, the port that it can connect
@@ -150,9 +150,9 @@ class RecordConfig(Options):
     bell: bool = True
     view: bool = False
     display_data: bool = False
-    display_mode: str = "rerun"
+    display_mode: Annotated[str, OneOf(PACKAGES)] = "rerun"
     display_ip: str | None = None
-    display_port: int | None = None
+    display_port: Annotated[int, Range("[1, 65535]")] | None = None
     display_compressed_images: bool = False
 
     def __post_init__(self) -> None:
@@ -163,7 +163,7 @@ class RecordConfig(Options):
             self.dataset.repo_id = local_name(self.dataset.root)
         check_robot_and_task(self.robot, self.task, "bhd-record")
         self._settle_brain()
-        check_options(self)
+        check_display(self)
         check_view(self.view, self.robot)
         check_engine(self)
         estop_signal(self.estop_signal)
