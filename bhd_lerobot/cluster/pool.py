@@ -21,7 +21,8 @@ from bhd_lerobot.errors import ClusterError
 CONTINUE = "What was recorded is saved; the same command runs the rest, bhd-record with --resume=true."
 _QUEUED = 2  # tasks that a worker has at a time: it continues with the next while a result travels
 _WINDOW = 4  # tasks for each worker, finished or not, by which the run may be ahead of the oldest that is missing
-_DEATHS = 3  # of workers, with the same task in hand; and of workers that were not there yet, in a row
+_DEATHS = 3  # of workers, with the same task in hand
+_STARTS = 5  # of workers that are lost before they are there, in a row
 _POLL_S = 0.2
 _LOGS = "Ray's logs are on that machine, in /tmp/ray/session_latest/logs."
 
@@ -182,8 +183,8 @@ class WorkerPool:
         cause = " ".join(line.strip() for line in str(error).splitlines() if "class_name" not in line).strip()[:300]
         self._dismiss(lambda one: one is worker)
         self._lost_early += not worker.host
-        if self._lost_early >= _DEATHS:
-            raise ClusterError(f"{_DEATHS} workers in a row were lost at their start: {cause} {_LOGS}") from error
+        if self._lost_early >= _STARTS:
+            raise ClusterError(f"{_STARTS} workers in a row were lost at their start: {cause} {_LOGS}") from error
         for task in worker.tasks:
             task.deaths += 1
             if task.deaths >= _DEATHS:
