@@ -5,10 +5,8 @@ it from a `Body`, so that a simulated and a real robot are limited by the same f
 """
 
 import math
-from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, reduce
-from operator import add
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -135,15 +133,6 @@ class Limits:
         lower = (low if one else -most for one, low, most in zip(positions, self.lower, self.velocity, strict=True))
         upper = (high if one else most for one, high, most in zip(positions, self.upper, self.velocity, strict=True))
         return tuple(lower), tuple(upper)
-
-    def __add__(self, other: "Limits") -> "Limits":
-        """Return the limits of both, one after the other, with the shorter time-out."""
-        joined: dict[str, Any] = {
-            one.name: getattr(self, one.name) + getattr(other, one.name)
-            for one in fields(self)
-            if one.name != "command_timeout_s"
-        }
-        return Limits(**joined, command_timeout_s=min(self.command_timeout_s, other.command_timeout_s))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,7 +405,7 @@ class Body:
         mjcf: MJCF document of the robot alone, without floor or scene; empty for a robot that is not simulated, whose
             forces and torques are then not known from its motion either.
         root: name of the root body, which carries a free joint if the robot moves.
-        drive: the wheels and the base that they move.
+        drive: the wheels and the base that they move; it has these or an arm.
         arm: the arm with its gripper.
         lidar: the range finder.
         cameras: the cameras, by name.
@@ -438,17 +427,17 @@ class Body:
     least_physics_hz: int = 1
     least_control_hz: int = 1
 
-    @cached_property
-    def limits(self) -> Limits:
-        """Limits of the commands that it takes: those of the drive, and then those of the arm.
+    def __post_init__(self) -> None:
+        if (self.drive is None) == (self.arm is None):
+            has = "neither a drive nor an arm" if self.arm is None else "both a drive and an arm"
+            raise ConfigError(f"The body {self.name!r} has {has}; it needs one of them.")
 
-        Raises:
-            ConfigError: it has neither.
-        """
-        limits = [part.limits for part in (self.drive, self.arm) if part is not None]
-        if not limits:
-            raise ConfigError(f"The body {self.name!r} takes no commands: it has neither a drive nor an arm.")
-        return reduce(add, limits)
+    @property
+    def limits(self) -> Limits:
+        """Limits of the commands that it takes."""
+        part = self.drive or self.arm
+        assert part is not None
+        return part.limits
 
     @property
     def joints(self) -> tuple[str, ...]:

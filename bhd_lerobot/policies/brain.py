@@ -8,7 +8,8 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Options
@@ -100,6 +101,11 @@ class RobotFeatures:
     cameras: Mapping[str, tuple[int, int, int]] | None = None
     robot_type: str = ""
     robot: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def arm(self) -> Arm:
+        """The robot's arm; a UR5 where the body is not known."""
+        return (self.body or ur5()).need(Arm)
 
 
 class Brain(Protocol):

@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Drive
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
 
@@ -45,16 +45,15 @@ class SimulatedPlant:
         self.n = world.n
         body, efforts = world.body, world.efforts
         self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        arm, drive = body.arm, body.drive
+        arm = body.arm
         if arm is not None:
             joints, names = arm.chain.joints, arm.actuators
             positions, velocities = world.joint_slice(arm.gripper.joints)
             self._fingers = world.qpos[:, positions], world.qvel[:, velocities]
             self._grip = efforts[:, velocities.start]  # the force of their one actuator acts on each of them
-        elif drive is not None:
-            joints, names = drive.joints, drive.actuators
         else:
-            raise SimulationError(f"Body {body.name!r} has neither a drive nor an arm: there is nothing to command.")
+            drive = body.need(Drive)
+            joints, names = drive.joints, drive.actuators
         positions, velocities = world.joint_slice(joints)
         self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
         self._effort = efforts[:, velocities]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from bhd_lerobot.bodies.body import Body, Shape
+from bhd_lerobot.bodies.body import Body, Drive, Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
@@ -35,10 +35,8 @@ def build_model(
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if body.arm is not None:
         add_table_stage(spec, body.root, body.arm, fixtures)
-    elif body.drive is not None:
-        _add_arena_stage(spec, body, body.drive.touch_sensor, pool_size)
     else:
-        raise ConfigError(f"The body {body.name!r} has neither a drive nor an arm: there is no scene for it.")
+        _add_arena_stage(spec, body, body.need(Drive).touch_sensor, pool_size)
     try:
         model = spec.compile()
     except ValueError as error:

@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.body import CameraSpec, LidarSpec, Limits, Rates, Shape
+from bhd_lerobot.bodies.body import Arm, CameraSpec, Drive, LidarSpec, Limits, Rates, Shape
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import BhdError, ConfigError
 from tests.cases import each_case
 
@@ -61,6 +63,32 @@ def limits(**changes: object) -> Limits:
 def test_limits_are_positive_finite_and_as_many_as_the_names(name: str, bad: tuple[float, ...]) -> None:
     with pytest.raises(ConfigError, match=name):
         limits(**{name: bad})
+
+
+def test_a_position_has_finite_limits_and_a_velocity_may_go_without() -> None:
+    positions = dict.fromkeys(("upper", "stop_jerk", "effort"), (1.0, 2.0)) | {"lower": (-1.0, 0.0)}
+    assert limits(**positions).bounds == ((-1.0, 0.0), (1.0, 2.0))
+    assert limits().bounds == ((-0.2, -2.0), (0.2, 2.0))
+    for name in ("upper", "stop_jerk", "effort"):
+        with pytest.raises(ConfigError):
+            limits(**{**positions, name: (1.0, math.inf)})
+    with pytest.raises(ConfigError, match="each range must be finite"):
+        limits(**{**positions, "lower": (-1.0, 3.0)})
+
+
+def test_a_robot_has_a_drive_or_an_arm_and_names_the_part_that_it_lacks() -> None:
+    base, arm = turtlebot3_burger(), ur5()
+    assert base.limits == base.need(Drive).limits
+    assert arm.joints == (*arm.need(Arm).chain.joints, "gripper")
+    for body, part, words in ((base, Arm, "no arm"), (arm, Drive, "no drive"), (arm, LidarSpec, "no lidar")):
+        with pytest.raises(ConfigError, match=f"{body.name}.* has {words}"):
+            body.need(part)
+    for change, words in (
+        ({"arm": arm.arm}, "both a drive and an arm"),
+        ({"drive": None}, "neither a drive nor an arm"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            replace(base, **change)
 
 
 @each_case("timeout", [0, 0.0, -0.5, math.inf, math.nan])

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError, NothingFitsError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
@@ -102,7 +100,7 @@ class LanguageBrain(PickBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the gripper, and the objects or the camera that shows them."""
         super().bind(robot)
-        self._home = (robot.body or ur5()).need(Arm).home
+        self._home = robot.arm.home
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
 
@@ -216,18 +214,20 @@ class LanguageBrain(PickBrain):
             return super()._choose_grasp(target, others)
         grasp = super()._choose_grasp(target, others)
         # A side that leaves room for errors, unless other objects are in the way there.
-        careful = plan_grasp(target, others, MAX_OPENING - 2 * _WIDER)
+        careful = plan_grasp(target, others, self._max_opening - 2 * _WIDER)
         if careful is not None and grasp is not None and careful.room >= min(grasp.room, _ROOM):
             grasp = careful
         if grasp is None:  # what seems a little too wide may fit after all
             length, width, height = target.size
             least = min(length, width)
-            if least < MAX_OPENING + _WIDER:
-                factor = (MAX_OPENING - _FIT) / least
+            if least < self._max_opening + _WIDER:
+                factor = (self._max_opening - _FIT) / least
                 grasp = super()._choose_grasp(replace(target, size=(factor * length, factor * width, height)), others)
         # The fingers need more room beside what is not known exactly.
         return (
-            None if grasp is None else replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
+            None
+            if grasp is None
+            else replace(grasp, opening=min(self._max_opening, grasp.opening + 2 * target.error_90_m))
         )
 
     def _is_held(self, opening: float, grasp: Grasp) -> bool:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError, PerceptionError
 from bhd_lerobot.options.declared import Count, Positive
@@ -71,11 +70,12 @@ class PickBrain(GoalBrain):
         super().__init__(config or PickBrainConfig())
         self._work: dict[int, Work] = {}
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._opening = 0
+        self._opening, self._max_opening = 0, 0.0
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
         self._find_objects(robot)
+        self._max_opening = robot.arm.gripper.max_opening
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
 
     def _find_objects(self, robot: RobotFeatures) -> None:
@@ -163,7 +163,7 @@ class PickBrain(GoalBrain):
 
     def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
         """Return how to grasp the object; None if it does not fit between the fingers."""
-        return plan_grasp(target, others, MAX_OPENING)
+        return plan_grasp(target, others, self._max_opening)
 
     def _carry_out(self, sim: int, skill: Skill, grasp: Grasp) -> BrainCommand | None:
         """Return the next goal of a skill that needs the grasp."""
@@ -205,7 +205,7 @@ class PickBrain(GoalBrain):
         work.stage = "back"
         self.doing[sim] = "let go and try again"
         # Up first, with the fingers open, from wherever the tool is.
-        return self._free(sim, "back", work.grasp, opening=MAX_OPENING)
+        return self._free(sim, "back", work.grasp, opening=self._max_opening)
 
     def _missed(self, sim: int, seen: Observation, target: SeenObject) -> str:
         """Return what is wrong with the grasp, if anything."""

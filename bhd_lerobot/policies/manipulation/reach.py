@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
@@ -35,7 +33,7 @@ class ReachBrain(GoalBrain):
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the target, and home."""
-        self._home = (robot.body or ur5()).need(Arm).home
+        self._home = robot.arm.home
         self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:

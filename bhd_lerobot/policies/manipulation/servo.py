@@ -15,10 +15,9 @@ import scipy
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.declared import Positive, Range
+from bhd_lerobot.options.declared import NotNegative, Positive, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
 from bhd_lerobot.policies.manipulation.pick import SQUEEZE, TRAVEL
@@ -83,7 +82,7 @@ class PickServoConfig(ServoConfig):
 
     lift_m: Positive = 0.15
     down_m: Positive = 0.01
-    wider_m: Annotated[float, Range(f"[0, {MAX_OPENING}]")] = 0.0
+    wider_m: NotNegative = 0.0
 
 
 class _ServoBrain(ConfiguredBrain):
@@ -94,7 +93,7 @@ class _ServoBrain(ConfiguredBrain):
     def __init__(self, config: ServoConfig) -> None:
         super().__init__(config)
         self._tool: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._gripper = 0
+        self._gripper, self._max_opening = 0, 0.0
         self._error = np.asarray(config.camera_error_m, np.float64)
 
     def bind(self, robot: RobotFeatures) -> None:
@@ -105,6 +104,7 @@ class _ServoBrain(ConfiguredBrain):
                 f"The brain {self.name!r} sees and gives tool poses; this robot has the actions "
                 f"{', '.join(robot.action_names[:3])}, …. Set --robot.action_space=tool --robot.tool_pose=true."
             )
+        self._max_opening = robot.arm.gripper.max_opening
         self._tool = find_columns(robot.observation_names, _TOOL, self.name, "observation")
         self._gripper = int(find_columns(robot.observation_names, [_GRIPPER], self.name, "observation")[0])
 
@@ -226,7 +226,7 @@ class PickServoBrain(_ServoBrain):
         """
         wider, grasp = self.config.wider_m, None
         for extra, least in ((wider, wider), (wider, 0.0), (0.0, 0.0)) if wider else ((0.0, 0.0),):
-            grasp = plan_grasp(target, others, MAX_OPENING, near=yaw, enough=_ROOM, wider=extra, least=least)
+            grasp = plan_grasp(target, others, self._max_opening, near=yaw, enough=_ROOM, wider=extra, least=least)
             if grasp is not None and grasp.room >= _ROOM:
                 break
         return grasp
