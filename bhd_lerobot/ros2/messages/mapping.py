@@ -212,18 +212,20 @@ class TopicFields:
         Raises:
             DatasetError: it has no such element.
         """
-        values = [_number(one, one.read(message)) for one in self.fields]
-        return np.array(values, np.float64) * self.scales + self.offsets
+        values, lacking = self.read_present(message)
+        if lacking:
+            raise DatasetError(next(iter(lacking.values())))
+        return values
 
-    def read_present(self, message: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the features in a message, and which of them it has no element for, shape (len(columns),) each."""
-        values, missing = np.zeros(len(self.fields)), np.zeros(len(self.fields), np.bool_)
-        for column, one in enumerate(self.fields):
+    def read_present(self, message: Any) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Return the features in a message, shape (len(columns),), and why it does not have some, by their places."""
+        values, lacking = np.zeros(len(self.fields)), {}
+        for place, one in enumerate(self.fields):
             try:
-                values[column] = _number(one, one.read(message))
-            except DatasetError:
-                missing[column] = True
-        return values * self.scales + self.offsets, missing
+                values[place] = _number(one, one.read(message))
+            except DatasetError as error:
+                lacking[place] = str(error)
+        return values * self.scales + self.offsets, lacking
 
     def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
         """Return a serialised message with the features, shape (len(columns),), and the stamp [ns] if it has one."""

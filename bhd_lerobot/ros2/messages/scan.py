@@ -38,7 +38,7 @@ def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: floa
     nearest or farthest range.
 
     Args:
-        range_max: of the same; one that is not positive is none.
+        range_max: of the scanner [m]; one that is not positive is none.
     """
     values = np.asarray(ranges, np.float64)
     beyond = values > (range_max if range_max > 0 else np.inf)

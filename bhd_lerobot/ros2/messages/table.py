@@ -25,6 +25,8 @@ TWIST = tuple(FIELDS[TWIST_TYPE])
 ODOMETRY = tuple(FIELDS[ODOMETRY_TYPE])[2:]
 GYRO = tuple(FIELDS[IMU_TYPE])
 TOOL = tuple(FIELDS[POSE_TYPE])
+WHEELS = ("wheel_left.pos", "wheel_right.pos", "wheel_left.vel", "wheel_right.vel")
+"""Of a TurtleBot3's JointState; turtlebot3_node has the speeds in m/s."""
 
 ODOM_FRAME, FOOTPRINT_FRAME, SCAN_FRAME, IMU_FRAME = "odom", "base_footprint", "base_scan", "imu_link"
 ARM_FRAME, TOOL_FRAME = "base", "tool"

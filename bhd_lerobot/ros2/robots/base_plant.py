@@ -10,10 +10,9 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages.presets import columns
-from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, SCAN, STAMPED_TWIST, TWIST, TWIST_TYPE
+from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, SCAN, STAMPED_TWIST, TWIST, TWIST_TYPE, WHEELS
 from bhd_lerobot.ros2.robots.plant import Ros2Plant, scan_reader
 
-_WHEELS = ("wheel_left.pos", "wheel_right.pos", "wheel_left.vel", "wheel_right.vel")
 _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
@@ -38,7 +37,7 @@ class BasePlant(Ros2Plant):
         node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         twist_type = TWIST_TYPE if config.ros2.distro == "humble" else STAMPED_TWIST
         inputs = [
-            InputSpec.of(columns("/joint_states", JOINTS, _WHEELS), SENSOR_DATA, node_silence),
+            InputSpec.of(columns("/joint_states", JOINTS, WHEELS), SENSOR_DATA, node_silence),
             InputSpec(
                 "/scan",
                 SCAN,
@@ -66,7 +65,7 @@ class BasePlant(Ros2Plant):
         """Write the wheels, the scan and the gyroscope into `out`."""
         wheels = self.numbers(state, 0)
         out.position[0] = wheels[:2]
-        out.velocity[0] = wheels[2:] / self._wheel_radius  # turtlebot3_node has them in m/s
+        out.velocity[0] = wheels[2:] / self._wheel_radius
         out.sensors[0, : self._beams] = self.numbers(state, 1)
         if self._has_gyro:
             out.sensors[0, self._beams :] = self.numbers(state, 2)

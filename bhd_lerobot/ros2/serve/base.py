@@ -19,7 +19,7 @@ from bhd_lerobot.ros2.messages.base import OdometryPart, ScanPart
 from bhd_lerobot.ros2.messages.parts import FieldsPart, Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.split import gyro_message
-from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, ODOMETRY, TWIST
+from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, ODOMETRY, TWIST, WHEELS
 from bhd_lerobot.ros2.serve.server import Output, State, Topics
 
 NODE_HZ = 20  # of turtlebot3_node's timer
@@ -48,6 +48,7 @@ class BaseTopics(Topics):
         self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=lidar)
         self._odometry_part = OdometryPart("/odom", (*TWIST, *ODOMETRY))
         self._gyro_part = FieldsPart("/imu", GYRO, **gyro_message())
+        self._wheel_part = FieldsPart("/joint_states", WHEELS, JOINTS, frame="base_link")
         self._scan_period_ns = NANOSECONDS // lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
@@ -70,16 +71,10 @@ class BaseTopics(Topics):
         frames = Frames(0, np.zeros(1, np.int64), stamps)
         twist = record["observation"][:, :2]
         moved = np.concatenate([twist, record["odometry"]], axis=1)
-        angles, speeds = record["joint_positions"], record["joint_velocities"]
-        joints = {
-            "header": header(stamps, "base_link"),
-            "name": list(_JOINTS),
-            "position": angles,
-            "velocity": speeds * self._drive.wheel_radius,  # turtlebot3_node has them in m/s
-        }
+        angles, speeds = record["joint_positions"], record["joint_velocities"] * self._drive.wheel_radius
         self._odometry.send(self._odometry_part.encode(frames, moved)[0])
         self._imu.send(self._gyro_part.encode(frames, record["observation"][:, self._gyro])[0])
-        self._joints.send(encode(JOINTS, joints, 1)[0])
+        self._joints.send(self._wheel_part.encode(frames, np.concatenate([angles, speeds], axis=1))[0])
         battery = {
             "header": header(stamps),
             **{"voltage": _VOLTAGE, "temperature": math.nan, "current": math.nan, "charge": math.nan},

@@ -29,7 +29,7 @@ class Reading:
 
     Attributes:
         decoded: what is in the messages; nothing of images.
-        static_lost: whether some of them cannot be read.
+        static_lost: whether messages of ``/tf_static`` cannot be read.
     """
 
     topic: str
@@ -142,11 +142,9 @@ def _fields(fields: TopicFields, names: Sequence[str], angles: Mapping[str, floa
     missing = np.zeros_like(values, np.bool_)
     reasons: dict[str, None] = {}
     for row, message in enumerate(reading.decoded):
-        try:
-            values[row] = fields.read(message)
-        except DatasetError as error:
-            reasons[str(error)] = None
-            values[row], missing[row] = fields.read_present(message)
+        values[row], absent = fields.read_present(message)
+        missing[row, list(absent)] = True
+        reasons |= dict.fromkeys(absent.values())
     lacking = [name for name, column in zip(names, missing.T, strict=True) if column.all()]
     if lacking and len(values):
         raise DatasetError(
