@@ -120,7 +120,7 @@ class Field:
         store, inside, steps = type_store(), self.msgtype, []
         if inside not in store.fielddefs:
             raise ConfigError(unknown_type(inside, store.fielddefs))
-        parts = self.path.split(".") if self.path else []
+        parts = re.split(r"\.(?![^\[]*\])", self.path) if self.path else []  # a name in brackets may have dots
         for place, text in enumerate(parts):
             match = _STEP.fullmatch(text)
             if match is None:

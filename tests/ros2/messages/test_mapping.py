@@ -17,6 +17,7 @@ FEATURES = {
     "theta.vel": FieldConfig("/odom", ODOMETRY, "twist.twist.angular.z", scale=-1),
     "elbow.pos": FieldConfig("/joint_states", JOINTS, "position[name=elbow]"),
     "second.pos": FieldConfig("/path", "trajectory_msgs/msg/JointTrajectory", "points[1].positions[2]"),
+    "lift.pos": FieldConfig("/numbers", "bhd_msgs/msg/Numbers", "values[names=lift.pos]"),
     "wheel.pos": FieldConfig("/tf", "tf2_msgs/msg/TFMessage", "transforms[child_frame_id=wheel].transform.rotation.z"),
 }
 
@@ -25,7 +26,7 @@ def test_features_are_grouped_by_topic_and_come_back_from_what_is_sent() -> None
     values = np.linspace(-1, 1, len(FEATURES))
     found = np.full(len(FEATURES), np.nan)
     topics = topics_of(FEATURES, {})
-    assert [topic.topic for topic in topics] == ["/odom", "/joint_states", "/path", "/tf"]
+    assert [topic.topic for topic in topics] == ["/odom", "/joint_states", "/path", "/numbers", "/tf"]
     for topic in topics:
         columns = list(topic.columns)
         message = decode(topic.msgtype, topic.encode(values[columns], 1_500_000_000))

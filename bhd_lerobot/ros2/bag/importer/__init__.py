@@ -4,7 +4,6 @@ __all__ = [
     "columns",
     "convert",
     "diagnostics",
-    "frames",
     "options",
     "resample",
     "segments",

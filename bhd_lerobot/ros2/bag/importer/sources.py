@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.ros2.bag.importer import frames
 from bhd_lerobot.ros2.bag.importer.diagnostics import speed_warnings
 from bhd_lerobot.ros2.bag.storage.read import Messages
 from bhd_lerobot.ros2.messages.base import odometry, unwrapped
 from bhd_lerobot.ros2.messages.images import COMPRESSED, IMAGE
 from bhd_lerobot.ros2.messages.mapping import MappingConfig, TopicFields, topics_of
 from bhd_lerobot.ros2.messages.parts import header_stamps
-from bhd_lerobot.ros2.messages.scan import ScanReader, Static
+from bhd_lerobot.ros2.messages.scan import BASE_FRAMES, ScanReader, Static, last_name
 from bhd_lerobot.ros2.messages.table import IMU_TYPE, ODOMETRY_TYPE, SCAN
 
 Array = NDArray[np.float64]
@@ -161,7 +160,7 @@ def _odometry(read: Reader, frame: str | None, reading: Reading) -> Array:
     """Return the fields of a base's odometry; note speeds that are not those of its pose."""
     topic, decoded = reading.topic, reading.decoded
     children = [message.child_frame_id for message in decoded]
-    frames.check_base_frame(topic, frames.the_frame(topic, children), frame)
+    _check_base_frame(topic, _the_frame(topic, children), frame)
     stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
     measured = stamps if (np.diff(stamps) > 0).all() else reading.messages.received
     reading.notes.extend(speed_warnings(topic, measured, *odometry(decoded)))
@@ -170,7 +169,7 @@ def _odometry(read: Reader, frame: str | None, reading: Reading) -> Array:
 
 def _scans(reader: ScanReader, reading: Reading) -> Array:
     topic, scans, notes, lidar = reading.topic, reading.decoded, reading.notes, reader.lidar
-    frame = frames.the_frame(topic, [scan.header.frame_id for scan in scans])
+    frame = _the_frame(topic, [scan.header.frame_id for scan in scans])
     reader = replace(reader, topic=topic, static=dict(reading.static))
     rotation, source = reader.rotation(frame)
     if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
@@ -193,3 +192,24 @@ def _scans(reader: ScanReader, reading: Reading) -> Array:
             f"has {lidar.range_max:g} m all the same"
         )
     return reader.resampled(scans, rotation)
+
+
+def _the_frame(topic: str, frames: Sequence[str]) -> str:
+    """Return the one frame that all messages of a topic are in."""
+    names, counts = np.unique(np.array(frames, dtype=str), return_counts=True)
+    if len(names) > 1:
+        found = ", ".join(f"{str(name)!r} in {count} messages" for name, count in zip(names, counts, strict=True))
+        raise DatasetError(
+            f"{topic} has messages in several frames: {found}. They come from several sensors or robots; make a bag "
+            "of one of them."
+        )
+    return str(names[0]).lstrip("/")
+
+
+def _check_base_frame(topic: str, frame: str, given: str | None) -> None:
+    """Check that odometry is of the robot's base."""
+    if frame and last_name(frame) not in BASE_FRAMES and frame != given:
+        raise DatasetError(
+            f"The speeds of {topic} are of the frame {frame!r} (child_frame_id), not of {' or '.join(BASE_FRAMES)}. If "
+            f"that is the robot's base, with x ahead, say so with --odom_frame={frame}."
+        )
