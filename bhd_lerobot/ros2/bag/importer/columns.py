@@ -43,7 +43,7 @@ def frame_columns(
         keys.APPLIED_ACTION: applied,
     }
     return {
-        **{key: values.astype(np.float32) for key, values in vectors.items() if values.shape[1]},
+        **{key: values.astype(np.float32) for key, values in vectors.items()},
         keys.TIME: (times - times[0]) / NANO,
         keys.AGE: (ages / NANO).astype(np.float32),
         keys.COMMAND_AGE: (np.where(in_force, command_age, 0) / NANO).astype(np.float32),
@@ -138,8 +138,7 @@ def _commands(options: ImportOptions, tracks: Sequence[Track], times: Times) -> 
         rows = track.values[place] if len(track.times) else np.zeros((len(ends), len(track.names)))
         columns |= dict(zip(track.names, np.where(since[:, None] >= 0, rows, 0.0).T, strict=True))
         age = np.where((age < 0) | (since < 0), -1, np.maximum(age, since))
-    values = [columns[name] for name in options.action_names]
-    return np.stack(values, axis=1) if values else np.zeros((len(ends), 0)), age
+    return np.stack([columns[name] for name in options.action_names], axis=1), age
 
 
 def _state(options: ImportOptions, tracks: Sequence[Track], times: Times) -> Array:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError, DatasetWriteError
 from bhd_lerobot.ros2.bag.importer.columns import (
@@ -47,13 +46,13 @@ class ImportReport:
     notes: list[str] = field(default_factory=list)
 
 
-def import_bags(bags: Sequence[Bag], root: Path | str | None, repo_id: str, options: ImportOptions) -> ImportReport:
+def import_bags(bags: Sequence[Bag], root: Path, repo_id: str, options: ImportOptions) -> ImportReport:
     """Make a dataset of bags of a robot; the whole of it, or nothing, also after a kill.
 
     Raises:
         DatasetError: a bag does not have what is needed.
     """
-    report = ImportReport(Path(root) if root is not None else default_root(repo_id))
+    report = ImportReport(root)
     names = options.observation_names
     if {*TWIST} <= {*options.action_names} and not {*TWIST} & {*names}:
         report.notes.append(
@@ -134,7 +133,7 @@ class _Recording:
             self._recorder = DatasetRecorder.create(
                 self._repo_id,
                 options.fps,
-                {key: feature for key, feature in features.items() if feature["shape"] != (0,)},
+                features,
                 robot_type=options.robot_type,
                 root=self._folder,
                 recording=options.identity(),
@@ -143,8 +142,7 @@ class _Recording:
 
     def refuse_again(self, bag: Path, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage."""
-        vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
-        numbers = (start, *(crc32(values.tobytes()) for values in vectors))
+        numbers = (start, *(crc32(columns[key].tobytes()) for key in (keys.OBSERVATION_STATE, keys.ACTION)))
         if numbers in self._seen:
             raise DatasetError(
                 f"{self._seen[numbers]} and {bag} hold the same drive: the same numbers at {start / NANO:.3f} s. It "
