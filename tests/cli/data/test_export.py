@@ -303,10 +303,10 @@ def write_arm(root, names, values):
 def test_the_links_of_an_arm_add_up_to_its_forward_kinematics(tmp_path):
     joints = np.random.default_rng(0).uniform(-2 * np.pi, 2 * np.pi, (40, 6)).astype(np.float32)
     joints[0] = 0
-    names = [f"{joint}.pos" for joint in ur5_body().chain.joints]
+    names = [f"{joint}.pos" for joint in ur5_body().arm.chain.joints]
     bags = export(write_arm(tmp_path / "d", names, joints), tmp_path / "bags")
     topics = decoded(bags / "episode_000000/episode_000000.mcap")
-    kinematics = ForwardKinematics(ur5_body().chain)
+    kinematics = ForwardKinematics(ur5_body().arm.chain)
     frames, tool = kinematics.frames(joints.astype(np.float64)), kinematics.tool(joints.astype(np.float64))
     for frame in range(len(joints)):
         links = tree(topics, frame)
