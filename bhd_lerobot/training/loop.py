@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.training.data import TrainingData
 from bhd_lerobot.training.log import Row
 from bhd_lerobot.training.step import Learner, NonFiniteLossError, StepResult
 
@@ -22,30 +24,9 @@ class DivergedError(BhdError):
 
 
 @dataclass
-class LoopOptions:
-    """When the loop does what; a frequency of 0 is never.
-
-    `batch_size` is of all processes. The first rows of metrics come earlier, after 10, 20, 50 and 100 steps; the last
-    step has a row, a held-out loss and a checkpoint.
-    """
-
-    steps: int
-    batch_size: int
-    frames: int
-    log_freq: int
-    eval_freq: int = 0
-    save_freq: int = 0
-    env_eval_freq: int = 0
-    seed: int = 0
-    held_out: Sequence[int] = ()
-    fingerprint: str = ""
-
-
-@dataclass
 class Hooks:
     """What the loop calls, in every process; `mean` is over all of them. What is not wanted is None."""
 
-    held_out: Callable[[], Iterator[Batch]] | None = None
     log: Callable[[Row], None] = lambda row: None
     save: Callable[[int, dict[str, Any]], None] | None = None
     evaluate: Callable[[int], Row] | None = None
@@ -80,11 +61,18 @@ class Window:
 
 
 class TrainingLoop:
-    """Steps from where it is to the end."""
+    """Steps from where it is to the end.
 
-    def __init__(self, learner: Learner, loader: Any, options: LoopOptions, hooks: Hooks) -> None:
+    The first rows of metrics come earlier than `log_freq`, after 10, 20, 50 and 100 steps; the last step has a row, a
+    held-out loss and a checkpoint.
+    """
+
+    def __init__(
+        self, learner: Learner, config: BhdTrainConfig, data: TrainingData, hooks: Hooks, processes: int = 1
+    ) -> None:
         """Prepare it at step 0."""
-        self.learner, self.loader, self.options, self.hooks = learner, loader, options, hooks
+        self.learner, self.config, self.data, self.loader, self.hooks = learner, config, data, data.train, hooks
+        self._batch_size = config.batch_size * processes
         self.step = 0
         self.interrupted = False
         self._window = Window()
@@ -93,30 +81,30 @@ class TrainingLoop:
     def state_dict(self) -> dict[str, Any]:
         """Return where it is, as JSON values: floats keep all their bits."""
         return {
-            "frames": self.options.frames,
-            "held_out": list(self.options.held_out),
-            "fingerprint": self.options.fingerprint,
+            "frames": self.data.frames,
+            "held_out": list(self.data.held_out_episodes),
+            "fingerprint": self.data.fingerprint,
             "loader": self.loader.state_dict(),
             "window": self._window.numbers(),
         }
 
     def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
         """Continue after `step` steps."""
-        if state.get("frames", self.options.frames) != self.options.frames:
+        if state.get("frames", self.data.frames) != self.data.frames:
             raise BhdError(
-                f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "
+                f"The run was started on {state['frames']} frames, and now there are {self.data.frames}: the "
                 "dataset or the selection has changed since. To learn from it, start a new run with "
                 "--fine_tune=CHECKPOINT."
             )
-        before, now = state.get("held_out", list(self.options.held_out)), list(self.options.held_out)
+        before, now = state.get("held_out", list(self.data.held_out_episodes)), list(self.data.held_out_episodes)
         if before != now:
             raise BhdError(
                 f"The run was started with {_listed(before)} held out, and now it would be {_listed(now)}. Leave "
                 "dataset.eval_split and selection.hold_out as they were, or start a new run."
             )
-        if state.get("fingerprint", self.options.fingerprint) != self.options.fingerprint:
+        if state.get("fingerprint", self.data.fingerprint) != self.data.fingerprint:
             raise BhdError(
-                f"The run was started on other data: as many frames ({self.options.frames}) with other numbers, "
+                f"The run was started on other data: as many frames ({self.data.frames}) with other numbers, "
                 "episodes, instructions or images. Restore that dataset, or learn from this one in a new run with "
                 "--fine_tune=CHECKPOINT."
             )
@@ -129,7 +117,7 @@ class TrainingLoop:
         """Train to the end, or until asked to stop; then a checkpoint of the last step exists."""
         batches = self._batches()
         self._window.started = time.perf_counter()
-        while self.step < self.options.steps and not self.interrupted:
+        while self.step < self.config.steps and not self.interrupted:
             started = time.perf_counter()
             raw = next(batches)
             where = (raw.get("episode_index"), raw.get("frame_index"))
@@ -147,20 +135,20 @@ class TrainingLoop:
             self._between()
 
     def _between(self) -> None:
-        step, options, hooks = self.step, self.options, self.hooks
+        step, options, hooks, held_out = self.step, self.config, self.hooks, self.data.held_out
         is_last = step == options.steps
         self.interrupted = hooks.should_stop(step)
         is_extra = (options.log_freq > 0 and is_last) or (step in _EARLY and step < options.log_freq)
         is_log = _is_due(step, options.log_freq) or is_extra
         is_saving = _is_due(step, options.save_freq) or is_last
-        is_eval = hooks.held_out is not None and options.eval_freq > 0 and (_is_due(step, options.eval_freq) or is_last)
-        row: Row = {"step": step, "epoch": step * options.batch_size / options.frames}
+        is_eval = options.eval_steps > 0 and (_is_due(step, options.eval_steps) or is_last)
+        row: Row = {"step": step, "epoch": step * self._batch_size / self.data.frames}
         if is_log:
             row |= self._measured()
         began = time.perf_counter()
-        if is_eval and hooks.held_out is not None:
+        if is_eval and held_out is not None:
             self._check()
-            row["held_out_loss"] = self.learner.held_out_loss(hooks.held_out(), options.seed)
+            row["held_out_loss"] = self.learner.held_out_loss(iter(held_out), options.seed or 0)
         if hooks.evaluate is not None and _is_due(step, options.env_eval_freq):
             row |= hooks.evaluate(step)
         if len(row) > 2:
@@ -188,7 +176,7 @@ class TrainingLoop:
             "data_s": window.data_s / count,
             "update_s": window.update_s / count,
             "steps_per_s": count / elapsed,
-            "samples_per_s": count * self.options.batch_size / elapsed,
+            "samples_per_s": count * self._batch_size / elapsed,
         }
         self._window = Window()
         return row
@@ -205,7 +193,7 @@ class TrainingLoop:
             raise self._diverged(first, float(losses[place]), self._window.batches[place])
 
     def _diverged(self, step: int, loss: float, where: tuple[Any, Any]) -> DivergedError:
-        name = f"step {step} (epoch {(step - 1) * self.options.batch_size // self.options.frames})"
+        name = f"step {step} (epoch {(step - 1) * self._batch_size // self.data.frames})"
         if all(isinstance(rows, Tensor) for rows in where):
             pairs = [f"{int(e)}:{int(f)}" for e, f in zip(*where, strict=True)]
             shown = ", ".join(pairs[:8]) + (f", … ({len(pairs)} samples)" if len(pairs) > 8 else "")

@@ -21,7 +21,7 @@ from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData, open_data, open_metadata, select_episodes
 from bhd_lerobot.training.env import EnvEvaluation
 from bhd_lerobot.training.log import SHOWN, Row, RunProgress, format_numbers
-from bhd_lerobot.training.loop import Hooks, LoopOptions, TrainingLoop
+from bhd_lerobot.training.loop import Hooks, TrainingLoop
 from bhd_lerobot.training.output import RunOutput
 from bhd_lerobot.training.setup import (
     build_optimizer,
@@ -135,13 +135,10 @@ def _run(
         found = fit_camera(parts.policy, data.train, learner.prepare, processes=accelerator.num_processes)
         console.print(escape(found), soft_wrap=True, highlight=False)
     environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None
-    hooks = Hooks(
-        held_out=None if data.held_out is None else data.held_out.__iter__,
-        evaluate=None if environment is None else environment.run,
-    )
+    hooks = Hooks(evaluate=None if environment is None else environment.run)
     if accelerator.num_processes > 1:
         hooks.mean = lambda values: accelerator.reduce(values.float().to(accelerator.device), reduction="mean").cpu()
-    loop = TrainingLoop(learner, data.train, _loop_options(config, data, accelerator.num_processes), hooks)
+    loop = TrainingLoop(learner, config, data, hooks, accelerator.num_processes)
     if config.checkpoint_path:
         loop.load_state_dict(step, state)
     if step >= config.steps:
@@ -157,21 +154,6 @@ def _run(
     accelerator.wait_for_everyone()
     accelerator.end_training()
     return result
-
-
-def _loop_options(config: BhdTrainConfig, data: TrainingData, processes: int) -> LoopOptions:
-    return LoopOptions(
-        steps=config.steps,
-        batch_size=config.batch_size * processes,
-        frames=data.frames,
-        log_freq=config.log_freq,
-        eval_freq=config.eval_steps,
-        save_freq=config.save_freq,
-        env_eval_freq=config.env_eval_freq,
-        seed=config.seed or 0,
-        held_out=data.held_out_episodes,
-        fingerprint=data.fingerprint,
-    )
 
 
 def _follow(
