@@ -1,5 +1,6 @@
 """A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot expects."""
 
+import glob
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ class HubDataset:
         self.name, self.revision = check_repo_id(repo_id), revision
         self.commit: str | None = None
         self._private, self._tag, self._create = private, tag, create
-        self._branch = revision or MAIN
+        self._branch, self._listed = revision or MAIN, set[str]()
 
     def files(self) -> dict[str, RemoteFile]:
         """Return all files of the revision by path; makes the repository first if it was opened with `create`."""
@@ -61,7 +62,9 @@ class HubDataset:
                 )
             self.commit = info.sha
             tree = self._api.list_repo_tree(self.name, repo_type="dataset", revision=info.sha, recursive=True)
-            return {one.path: _file(one) for one in tree if hasattr(one, "blob_id")}
+            files = {one.path: _file(one) for one in tree if hasattr(one, "blob_id")}
+            self._listed = set(files)
+            return files
 
     def read(self, path: str) -> bytes:
         """Return a file of the listed commit."""
@@ -71,15 +74,13 @@ class HubDataset:
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Download files of the listed commit."""
-        import glob
-
         from huggingface_hub import snapshot_download
 
-        patterns = [glob.escape(path) for path in paths]
+        others = self._listed - set(paths)  # the client compares each file with each pattern
+        wanted = ("allow_patterns", paths) if len(paths) < len(others) else ("ignore_patterns", others)
+        options: dict[str, Any] = {wanted[0]: [glob.escape(path) for path in wanted[1]], "local_dir": folder}
         with transfer_errors(self.name, "download", revision=self.revision):
-            snapshot_download(
-                self.name, repo_type="dataset", revision=self.commit, allow_patterns=patterns, local_dir=folder
-            )
+            snapshot_download(self.name, repo_type="dataset", revision=self.commit, **options)
 
     def send(self, files: Mapping[str, Path], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Upload files and remove others in one commit, and set the tags.

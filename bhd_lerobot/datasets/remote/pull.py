@@ -166,7 +166,8 @@ class _Pull:
             _link(self._root / path, folder / path)
         if not missing:
             return
-        need, free = sum(there[path].size for path in missing), shutil.disk_usage(folder).free
+        left = [path for path in missing if not RemoteFile(there[path].size).matches(folder / path)]
+        need, free = sum(there[path].size for path in left), shutil.disk_usage(folder).free
         if need + _SPARE_BYTES > free:
             raise TransferError(
                 f"Could not download {self._remote.name}: {megabytes(need)} are missing, and the disk of {folder} "
@@ -232,13 +233,13 @@ def _download_folder(root: Path, *, is_kept: bool) -> Iterator[Path]:
                 f"{folder} is in the way: bhd-data pull needs this name temporarily and did not create it. Move it, or "
                 "choose another --root."
             )
-        if not is_kept:
-            _remove(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _MARKER).touch()
     is_useful = False  # for the next attempt
     with contextlib.closing(RootLock(folder, root)):
         try:
+            if not is_kept:
+                _clear(folder)
             yield folder
         except BaseException as error:
             is_refusal = isinstance(error, BhdError) and not isinstance(error, TransferError)
@@ -247,19 +248,18 @@ def _download_folder(root: Path, *, is_kept: bool) -> Iterator[Path]:
         finally:
             if not is_useful:
                 with contextlib.suppress(OSError):
-                    _remove(folder)
+                    _clear(folder)
+                    shutil.rmtree(folder)  # the marker last: after a kill it is still known as ours
                     if folder == root / PULL:
                         folder.parent.rmdir()
 
 
-def _remove(folder: Path) -> None:
-    """Remove a download, the marker last: after a kill it is still known as ours."""
+def _clear(folder: Path) -> None:
     for path in folder.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
         elif path.name != _MARKER:
             path.unlink()
-    shutil.rmtree(folder)
 
 
 def _files(remote: Remote) -> dict[str, RemoteFile]:
