@@ -44,8 +44,7 @@ class ValueCheck:
         self.frames = 0
         self._files, self._findings, self._limits = files, findings, limits or {}
         self._columns: dict[str, Moments] = {}
-        self._episodes: list[int] = []
-        self._lengths: list[int] = []
+        self._longest = 0  # frames of an episode
         # By feature: how many frames are not finite, and where the first is, for each file.
         self._broken: dict[str, list[tuple[int, str]]] = {}
         self._frozen, self._steps = FrozenCheck(files.features), StepCheck(files.features)
@@ -66,7 +65,8 @@ class ValueCheck:
                 if following is not None:
                     tables.append(reader.submit(self._read, following[0]))
                 if table is not None and (table := self._in_order(name, table, rows)) is not None:
-                    self._check_table(table.select([key for key in table.column_names if key in self._files.features]))
+                    columns = [key for key in table.column_names if key in self._files.features]
+                    self._check_table(table.select(columns), rows)
         self._judge_columns()
         self._frozen.judge(self._findings)
         self._steps.judge(self._findings)
@@ -112,8 +112,6 @@ class ValueCheck:
         if (np.diff(order) < 0).any():
             table = table.take(order)
         self._check_times(name, table)
-        self._episodes += [row["episode_index"] for row in rows]
-        self._lengths += [row["length"] for row in rows]
         return table
 
     def _check_times(self, name: str, table: pa.Table) -> None:
@@ -131,9 +129,8 @@ class ValueCheck:
 
     # --- numbers -----------------------------------------------------------------------------------------------------
 
-    def _check_table(self, table: pa.Table) -> None:
-        lengths = np.array(self._lengths[len(self._lengths) - self._count_new(table) :])
-        starts = np.cumsum(lengths) - lengths
+    def _check_table(self, table: pa.Table, rows: Sequence[Row]) -> None:
+        self._longest = max(self._longest, *(row["length"] for row in rows))
         self.frames += len(table)
         for key in table.column_names:
             missing = table[key].null_count
@@ -148,43 +145,33 @@ class ValueCheck:
                 what = f"it holds {values.size} numbers in {len(table)} frames; its shape is {size}"
                 self._findings.error("schema", key, what, "Repair the shape in meta/info.json, or record again.")
                 continue
-            self._check_column(key, values.reshape(len(table), size), starts, lengths)
+            self._check_column(key, values.reshape(len(table), size), rows)
         for key in (keys.LATE, keys.SKIPPED):
             if key in table.column_names and not table[key].null_count:
                 self._counted[key] += int(table[key].to_numpy().sum())
 
-    def _count_new(self, table: pa.Table) -> int:
-        """Return how many of the episodes known last are in this table."""
-        rows = count = 0
-        while rows < len(table):
-            count += 1
-            rows += self._lengths[-count]
-        return count
-
-    def _check_column(
-        self, key: str, values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]
-    ) -> None:
+    def _check_column(self, key: str, values: NDArray[Any], rows: Sequence[Row]) -> None:
+        lengths, episodes = np.array([row["length"] for row in rows]), [row["episode_index"] for row in rows]
+        starts = np.cumsum(lengths) - lengths
         with np.errstate(invalid="ignore"):  # the sum of both infinities
             found = Moments.of(values)
         if not (np.isfinite(found.low).all() and np.isfinite(found.high).all()):  # both of a column with a NaN are NaN
-            self._note_broken(key, values, starts)
+            self._note_broken(key, values, starts, episodes)
             values = np.where(np.isfinite(values), values, 0)
             found = Moments.of(values)
         known = self._columns.setdefault(key, found)
         if known is not found:
             known.add(found)
         if key in _MOVING:
-            episodes = self._episodes[len(self._episodes) - len(starts) :]
             self._frozen.add(key, values, starts, lengths, episodes)
             self._steps.add(key, values, starts, episodes)
 
-    def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64]) -> None:
+    def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64], episodes: Sequence[int]) -> None:
         rows, elements = np.nonzero(~np.isfinite(values))
         row, element = int(rows[0]), int(elements[0])
         episode = int(np.searchsorted(starts, row, side="right")) - 1
-        number = self._episodes[len(self._episodes) - len(starts) + episode]
         frame, name = row - int(starts[episode]), name_of(self._files.features[key], element)
-        where = f"episode {number}, frame {frame}: {name} is {values[row, element]}"
+        where = f"episode {episodes[episode]}, frame {frame}: {name} is {values[row, element]}"
         self._broken.setdefault(key, []).append((len(np.unique(rows)), where))
 
     # --- over all files ----------------------------------------------------------------------------------------------
@@ -222,7 +209,7 @@ class ValueCheck:
                 continue
             if len(self._files.features[key]["shape"]) > 1:
                 continue  # LeRobot's are over other axes
-            wrong = wrong_statistic(known, column, max(self._lengths))
+            wrong = wrong_statistic(known, column, self._longest)
             if wrong is not None:
                 where, what = f"{layout.STATS}: {key}", f"{wrong} is not that of the data"
                 if key in UNREAD:
