@@ -59,13 +59,13 @@ def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_p
 
 def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
     for name, kind in robot_configs().items():
-        limits = kind().body().limits
+        body = kind().body()
+        limits = body.limits
         ranges = limits_of(name)["control.applied_action"]
         assert list(ranges) == list(limits.names)
         for index, (low, high) in enumerate(ranges.values()):
-            arm = hasattr(limits, "upper")
-            assert high == (limits.upper if arm else limits.velocity)[index]
-            assert low == (limits.lower[index] if arm else -high)
+            assert high == (limits.upper if body.arm else limits.velocity)[index]
+            assert low == (limits.lower[index] if body.arm else -high)
     assert limits_of("turtlebot3")["control.applied_action"]["x.vel"] == (-0.22, 0.22)
     assert limits_of("ur5")["observation.state"]["gripper.pos"] == (0.0, 0.085)
     assert limits_of("so101_follower") == limits_of(None) == {}
