@@ -91,9 +91,9 @@ class BlankedBrain(ConfiguredBrain):
             self._instructions[sim] = instruction
         return [self._instructions[(sim + 1) % n] for sim in ids]
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return where the brain looks; with exchanged images, in all simulations if it looks at those of any."""
-        looks = self._brain.looks(results)
+        looks = self._brain.needs_images(results)
         return np.array(looks.any()) if self.config.images and self.config.exchange else looks
 
     def subtasks(self) -> Sequence[str]:

@@ -159,7 +159,7 @@ class Brain(Protocol):
     def act(self, observation: Observation) -> Command:
         """Return the command of n robots for this frame; a brain returns goals always or never."""
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations the next `act` uses images; in the others it may get black ones.
 
         Args:
@@ -228,7 +228,7 @@ class ConfiguredBrain:
         """Return nothing: there is no plan."""
         return {}
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return whether it uses images, in every frame and simulation."""
         return np.array(self.uses_images)
 

@@ -210,7 +210,7 @@ def _run(
                 _print_dropped(episode, len(loop.robots.camera_shapes), console)
             takes.add(episode)
             if loop.before_start is None:
-                takes.settle()
+                takes.wait()
             show(now=True)
     result.episodes = recorder.num_episodes
     recorder.finalize()

@@ -67,7 +67,7 @@ class ResetPhase:
         if takes is not None:
             if takes.is_saving and self._status is not None:
                 self._status.change("saving", spec.index - 1)
-            (takes.discard if is_discarded else takes.settle)()
+            (takes.discard if is_discarded else takes.wait)()
         return is_discarded
 
     def _wait(self, spec: EpisodeSpec) -> bool:

@@ -36,10 +36,10 @@ class Takes:
 
     def add(self, take: Episode) -> None:
         """Begin to save a take."""
-        self.settle()
+        self.wait()
         self._last = take, self._thread.submit(self._save, take)
 
-    def settle(self) -> None:
+    def wait(self) -> None:
         """Wait until the last take is saved; it stays.
 
         Raises:
@@ -65,4 +65,4 @@ class Takes:
     ) -> None:
         self._thread.shutdown()
         if error is None:
-            self.settle()
+            self.wait()

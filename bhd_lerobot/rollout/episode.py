@@ -220,7 +220,7 @@ class EpisodeLoop:
         robots, task, brain = self.robots, self.task, self.brain
         frame = robots.observe()
         state = frame.state.astype(np.float32)
-        images = self._images.order_all(self.observer, np.broadcast_to(brain.looks(self._results), robots.n))
+        images = self._images.order_all(self.observer, np.broadcast_to(brain.needs_images(self._results), robots.n))
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:

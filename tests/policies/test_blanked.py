@@ -20,8 +20,8 @@ class Spy(ConfiguredBrain):
         super().__init__(None)
         self.where = looks
 
-    def looks(self, results: Any) -> np.ndarray:
-        return super().looks(results) if self.where is None else np.array(self.where)
+    def needs_images(self, results: Any) -> np.ndarray:
+        return super().needs_images(results) if self.where is None else np.array(self.where)
 
     def parameters(self) -> dict[str, Any]:
         return {}
@@ -51,9 +51,9 @@ def test_what_is_blanked_does_not_arrive_and_all_else_does(deaf: bool, blind: bo
     assert spy.seen.state is state
     assert (brain.has_plan, brain.uses_images, brain.uses_privileged_state) == (True, True, False)
     assert images["scene"].min() == 200, "nobody else's images are changed"
-    assert brain.looks({}).tolist() is True
+    assert brain.needs_images({}).tolist() is True
     spy.where = [True, False]
-    assert brain.looks({}).tolist() == [True, False]
+    assert brain.needs_images({}).tolist() == [True, False]
 
 
 def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> None:
@@ -64,9 +64,9 @@ def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> N
     brain.reset(np.array([0, 2]), [4, 5], 3, ["d", "e"])
     assert spy.instructions == ["b", "d"]
     # Where it looks in one simulation, the images of the others are needed.
-    assert brain.looks({}).all()
+    assert brain.needs_images({}).all()
     spy.where = [False, False, False]
-    assert not brain.looks({}).any()
+    assert not brain.needs_images({}).any()
     images = np.arange(1, 4, dtype=np.uint8)[:, None, None, None] * np.ones((3, 4, 6, 3), np.uint8)
     state = np.zeros((3, 1))
     # Of those that run each gets another's; one that is alone gets none.

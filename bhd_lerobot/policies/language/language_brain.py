@@ -104,7 +104,7 @@ class LanguageBrain(PickBrain):
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations it is about to look at something, shape (n,)."""
         return np.array([self._is_looking(sim, results.get(sim, ())) for sim in range(len(self._pending))], np.bool_)
 

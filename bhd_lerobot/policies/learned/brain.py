@@ -157,7 +157,7 @@ class LearnedBrain(ConfiguredBrain):
         n = len(self._next)
         running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
         ids = running[self._next[running] >= self.inference.steps]
-        rows = self._remember(self._rows(observation, bool(self.looks({})[running].any())), running)
+        rows = self._remember(self._rows(observation, bool(self.needs_images({})[running].any())), running)
         if len(ids):
             self._store(ids, self.inference.infer(ids, {key: values[ids] for key, values in rows.items()}), rows)
         if self.config.stream:
@@ -190,7 +190,7 @@ class LearnedBrain(ConfiguredBrain):
     def _weights(self) -> str:
         return weights_digest(self.loaded.folder)
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations the policy is about to use images, shape (n,)."""
         if self._history_length > 1:
             return np.full(len(self._next), self.uses_images)

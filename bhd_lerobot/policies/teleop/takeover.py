@@ -62,10 +62,10 @@ class TakeoverBrain(ConfiguredBrain):
         self._was_taken = is_taken
         return is_taken
 
-    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return where the one who drives looks."""
         driver = self._person if self._settle() else self._brain
-        return driver.looks(results)
+        return driver.needs_images(results)
 
     def act(self, observation: Observation) -> Command:
         """Return the action of the one who drives."""

@@ -18,7 +18,7 @@ from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.robots import Acted, Clock, Deliver, Frame, FrameReport, Receipt
+from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Clock, Deliver, Frame, FrameReport
 from bhd_lerobot.robots.host.sender import CommandSender
 
 
@@ -172,7 +172,7 @@ class Host(ABC):
         """Send a command to the running robots and let one frame go by."""
         return self._frame(self.send(command), command)
 
-    def act(self, command: Command) -> Acted:
+    def act(self, command: Command) -> ActionReport:
         """Do what LeRobot's `send_action` does: here, let a frame go by."""
         return self.step(command)
 
@@ -184,11 +184,11 @@ class Host(ABC):
         """Return the newest observation, whatever frame it is in."""
         return self.observe()
 
-    def send(self, command: Command) -> Receipt:
+    def send(self, command: Command) -> Acceptance:
         """Send a command to the running robots; no time goes by. Return what was accepted of it."""
         return self._sender.send(command, self.running)
 
-    def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
+    def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
         """Let one frame go by, and report what happened in it and to the command that it began with."""
         for flags in self.touches:
             flags[:] = False

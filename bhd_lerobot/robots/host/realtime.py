@@ -28,7 +28,7 @@ from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.link import LiveLink
-from bhd_lerobot.robots.host.robots import Acted, Deliver, Frame, FrameReport, Receipt
+from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Deliver, Frame, FrameReport
 from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of
@@ -222,7 +222,7 @@ class LiveHost:
         """Send a command, let the present frame go by, and report it."""
         return self._frame(self.send(command), command)
 
-    def send(self, command: Command) -> Receipt:
+    def send(self, command: Command) -> Acceptance:
         """Send a command and return at once.
 
         Raises:
@@ -232,7 +232,7 @@ class LiveHost:
         start = int(self._boundary["frame"]) * self._frame_ns if isinstance(command, Chunk) else None
         return self._sender.send(command, self.running, start)
 
-    def act(self, command: Command) -> Acted:
+    def act(self, command: Command) -> ActionReport:
         """Send a command and return at once, with the newest command of the cerebellum as what is applied.
 
         Raises:
@@ -240,9 +240,9 @@ class LiveHost:
         """
         receipt = self.send(command)
         applied = self.to_action(self.bridge.latest["command"])
-        return Acted(sent=receipt.sent, refusals=receipt.refusals, mode=self.modes, applied=applied)
+        return ActionReport(sent=receipt.sent, refusals=receipt.refusals, mode=self.modes, applied=applied)
 
-    def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
+    def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
         """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report."""
         # Boundary k is the end of tick k F - 1, one period before k frames.
         now = time.monotonic_ns() - self._origin

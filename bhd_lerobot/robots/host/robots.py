@@ -35,7 +35,7 @@ class Frame:
 
 
 @dataclass(kw_only=True)
-class Acted:
+class ActionReport:
     """What became of a command, of n robots.
 
     Attributes:
@@ -54,7 +54,7 @@ class Acted:
 
 
 @dataclass(kw_only=True)
-class FrameReport(Acted):
+class FrameReport(ActionReport):
     """Report of a frame, at its end, of n robots.
 
     Attributes:
@@ -79,7 +79,7 @@ class FrameReport(Acted):
 
 
 @dataclass
-class Receipt:
+class Acceptance:
     """What was accepted of a command, of n robots.
 
     Attributes:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.bridge import Bridge
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.messages import Reason, SendResult
-from bhd_lerobot.robots.host.robots import Receipt
+from bhd_lerobot.robots.host.robots import Acceptance
 
 Mask = NDArray[np.bool_]
 Refusals = dict[int, tuple[Reason, str]]
@@ -27,7 +27,7 @@ class CommandSender:
     def __init__(self, bridge: Bridge, to_setpoints: ToSetpoints) -> None:
         self._bridge, self._to_setpoints = bridge, to_setpoints
 
-    def send(self, command: Command, running: Mask, start_ns: int | None = None) -> Receipt:
+    def send(self, command: Command, running: Mask, start_ns: int | None = None) -> Acceptance:
         """Send a command.
 
         Args:
@@ -35,7 +35,7 @@ class CommandSender:
             running: the robots that are in an episode, shape (n,).
             start_ns: when a chunk begins [ns]; now if None.
         """
-        receipt = Receipt(SendResult(np.zeros(len(running), np.int8)))
+        receipt = Acceptance(SendResult(np.zeros(len(running), np.int8)))
         match command:
             case None:
                 pass
@@ -47,7 +47,7 @@ class CommandSender:
                 self._send_setpoint(command, running, receipt)
         return receipt
 
-    def _send_setpoint(self, action: NDArray[np.float64], mask: Mask, receipt: Receipt) -> None:
+    def _send_setpoint(self, action: NDArray[np.float64], mask: Mask, receipt: Acceptance) -> None:
         if not mask.any():
             return
         setpoints, refused = self._to_setpoints(action, mask, None)
@@ -57,7 +57,9 @@ class CommandSender:
         receipt.sent = self._bridge.send(setpoints, mask)
         receipt.refuse(refused)
 
-    def _send_chunk(self, actions: NDArray[np.float64], running: Mask, start_ns: int | None, receipt: Receipt) -> None:
+    def _send_chunk(
+        self, actions: NDArray[np.float64], running: Mask, start_ns: int | None, receipt: Acceptance
+    ) -> None:
         rows: list[NDArray[np.float64]] = []
         for action in actions:
             setpoints, refused = self._to_setpoints(action, running, rows[-1] if rows else None)
@@ -73,7 +75,7 @@ class CommandSender:
             sent = receipt.sent.reasons
             sent[sent == Reason.ACCEPTED] = first[sent == Reason.ACCEPTED]
 
-    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]], receipt: Receipt) -> None:
+    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]], receipt: Acceptance) -> None:
         for sim, goals in commands.items():
             refusals = [refusal for goal in goals if (refusal := self._bridge.submit(goal, sim)) is not None]
             if refusals:

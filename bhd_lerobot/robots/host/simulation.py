@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.robots.host.host import Host
-from bhd_lerobot.robots.host.robots import Deliver, FrameReport, Receipt
+from bhd_lerobot.robots.host.robots import Acceptance, Deliver, FrameReport
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.render_thread import RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
@@ -101,7 +101,7 @@ class Simulation(Host):
         super().stop(ids)
         self._active = np.flatnonzero(self.running)
 
-    def _frame(self, receipt: Receipt, command: Command) -> FrameReport:
+    def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
         report = super()._frame(receipt, command)
         self.world.check()
         if self.on_change is not None:

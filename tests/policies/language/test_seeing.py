@@ -85,7 +85,7 @@ class Table:
     def frame(self, result: CommandResult | None = None) -> BrainCommand | None:
         """Let the brain act; images are there if it asked for them."""
         results = {0: [result]} if result else {}
-        wanted = bool(self.brain.looks(results)[0])
+        wanted = bool(self.brain.needs_images(results)[0])
         if wanted and (self.freezes_after is None or sum(self.images_wanted) < self.freezes_after):
             self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
         self.images_wanted.append(wanted)
@@ -200,9 +200,9 @@ def test_what_it_does_not_see_or_not_surely_enough_it_does_not_touch(
     looks: list[Any], options: dict[str, Any], problem: str
 ) -> None:
     table = Table(*looks, **options)
-    assert table.brain.looks({}).tolist() == [True]
+    assert table.brain.needs_images({}).tolist() == [True]
     assert table.frame() is None
-    assert table.brain.looks({}).tolist() == [False]  # it gave up
+    assert table.brain.needs_images({}).tolist() == [False]  # it gave up
     assert problem in table.problem
     assert table.brain.subtasks()[0].startswith("cannot: ")
     assert table.brain.plan(0)["chosen"] is None

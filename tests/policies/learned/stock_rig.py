@@ -72,7 +72,7 @@ def trace_bhd_eval(folder: Path, options: list[str]) -> Trace:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LearnedBrain, "act", spy)
         # Images are made only where they are looked at; here every one is compared.
-        patch.setattr(LearnedBrain, "looks", lambda self, results: np.full(1, self.uses_images))
+        patch.setattr(LearnedBrain, "needs_images", lambda self, results: np.full(1, self.uses_images))
         assert evaluate.main([*options, *arguments(n_episodes=1, n_envs=1, videos=0, output_dir=folder)]) == 0
     return _trace(seen, done)
 

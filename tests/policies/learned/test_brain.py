@@ -209,7 +209,7 @@ def test_images_that_it_does_not_look_at_need_not_be_there(
     brain.reset(np.arange(3), [0, 1, 2], 3, [INSTRUCTION] * 3)
     running = np.array([True, True, False])  # the third begins later
     for frame, one in enumerate(seen):
-        looks = brain.looks({})
+        looks = brain.needs_images({})
         assert looks.tolist() == [frame in frames, frame in frames, True]
         images = one.images if frame in frames else {}
         action = brain.act(Observation(one.names, one.state, images, one.environment_state, running=running))

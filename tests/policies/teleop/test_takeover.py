@@ -43,7 +43,7 @@ class Counting(ConfiguredBrain):
     def reset(self, ids: Any, seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         self.resets, self._count = self.resets + 1, 0
 
-    def looks(self, results: Any) -> Any:
+    def needs_images(self, results: Any) -> Any:
         return np.array([self._count == 0])
 
     def act(self, observation: Observation) -> Any:
@@ -68,7 +68,7 @@ def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afres
     looked, actions, interventions = [], [], []
     for _ in taken:
         # Who drives is settled once a frame: a key between the two calls takes effect in the next.
-        looked.append(bool(both.looks({})[0]))
+        looked.append(bool(both.needs_images({})[0]))
         actions.append(float(both.act(SEEN)[0, 0]))
         interventions.append(bool(both.interventions()[0]))
     assert actions == [1.0, 2.0, 101.0, 102.0, 1.0, 2.0]
