@@ -33,7 +33,7 @@ TASK = "TurtleBot3Avoid-v0"
 # What a process of `AsyncVectorEnv` needs, imported once, before the processes part.
 PRELOADED = (
     "bhd_lerobot.envs.config_env",
-    "bhd_lerobot.envs.stage",
+    "bhd_lerobot.envs.episodes",
     "bhd_lerobot.robots.turtlebot3",
     "benchmarks.envs",
 )

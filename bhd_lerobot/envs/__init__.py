@@ -2,13 +2,13 @@
 
 __all__ = [
     "config_env",
-    "course",
+    "episodes",
     "gym_env",
     "register",
+    "sequence",
     "settings",
     "spaces",
     "stable_baselines",
-    "stage",
     "vector",
     "vector_member",
 ]

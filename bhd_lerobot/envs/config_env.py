@@ -12,8 +12,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from bhd_lerobot.envs.course import Course
 from bhd_lerobot.envs.register import NAMESPACE
+from bhd_lerobot.envs.sequence import EpisodeSequence
 from bhd_lerobot.envs.settings import Settings, make_settings
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, OneOf, check_options
@@ -64,7 +64,7 @@ class BhdEnvConfig(EnvConfig):
         check_options(self, "env.")
         from bhd_lerobot.envs.gym_env import BhdEnv
 
-        Course(self.seed, self.split)  # type: ignore[arg-type]
+        EpisodeSequence(self.seed, self.split)  # type: ignore[arg-type]
         self.fps = self._settings().robot.fps
         with closing(BhdEnv(self.gym_id, **self.gym_kwargs)) as env:
             self._add_features(env)

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs import register  # noqa: F401  registers the environments
-from bhd_lerobot.envs.course import STREAM, Course
+from bhd_lerobot.envs.sequence import STREAM, EpisodeSequence
 from bhd_lerobot.envs.vector import RENDER_MODES, BhdVectorEnv, info_of
 from bhd_lerobot.tasks.task import Split
 
@@ -27,7 +27,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     `event`, `episode_index` and `seed` (the episode's), and at the end `score` and the task's `details`.
 
     Attributes:
-        stage: simulation and task.
+        episodes: simulation and task.
         task: name of the environment.
 
     Args:
@@ -79,25 +79,25 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             first_episode=first_episode,
             episode_stride=episode_stride,
         )
-        self.render_mode, self.task, self.stage = render_mode, self._one.task, self._one.stage
+        self.render_mode, self.task, self.episodes = render_mode, self._one.task, self._one.episodes
         self.metadata = {**self.metadata, "render_fps": self._one.metadata["render_fps"]}
         self.action_space = self._one.single_action_space
         self.observation_space = self._one.single_observation_space
 
     @property
-    def course(self) -> Course:
+    def sequence(self) -> EpisodeSequence:
         """Which episode comes next."""
-        return self._one.members[0].course
+        return self._one.members[0].sequence
 
     @property
     def task_description(self) -> str:
         """The instruction of this episode."""
-        return self.stage.instruction(0)
+        return self.episodes.instruction(0)
 
     @property
     def _max_episode_steps(self) -> int:
         """Longest duration of an episode [frames]; LeRobot asks for it by this name."""
-        return self.stage.frames
+        return self.episodes.frames
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Start an episode.

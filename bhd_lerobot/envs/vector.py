@@ -8,10 +8,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bhd_lerobot.envs.course import STREAM, Course
+from bhd_lerobot.envs.episodes import EVENT_NAMES, ClosedError, ResetNeededError, SteppedEpisodes
+from bhd_lerobot.envs.sequence import STREAM, EpisodeSequence
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.spaces import ActionScale, observation_space
-from bhd_lerobot.envs.stage import EVENT_NAMES, ClosedError, ResetNeededError, Stage
 from bhd_lerobot.envs.vector_member import Images, Member
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.task import Event, Split
@@ -31,7 +31,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
     a `BhdEnv` does: no two run the same episode.
 
     Attributes:
-        stage: simulations and task.
+        episodes: simulations and task.
         members: what `call`, `get_attr` and `set_attr` talk to, one for each environment.
 
     Args:
@@ -81,19 +81,19 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         self.render_mode = render_mode
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.num_envs = n = num_envs
-        self.stage = Stage(settings.robot, settings.task, n, threads)
+        self.episodes = SteppedEpisodes(settings.robot, settings.task, n, threads)
         self.task = settings.name
         firsts = [None if first_episode is None else first_episode + i for i in range(n)]
-        courses = [Course(seed, split, first, episode_stride) for first in firsts]
-        self.members = [Member(self.stage, i, course, self) for i, course in enumerate(courses)]
+        sequences = [EpisodeSequence(seed, split, first, episode_stride) for first in firsts]
+        self.members = [Member(self.episodes, i, sequence, self) for i, sequence in enumerate(sequences)]
         self.metadata = {
             "render_modes": list(RENDER_MODES),
             "render_fps": settings.robot.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._scale = ActionScale(self.stage.simulation, normalise=normalise_actions)
+        self._scale = ActionScale(self.episodes.simulation, normalise=normalise_actions)
         self.single_action_space = self._scale.space
-        self.single_observation_space = observation_space(self.stage.simulation, self.stage.task, settings.parts)
+        self.single_observation_space = observation_space(self.episodes.simulation, self.episodes.task, settings.parts)
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
         self._all = np.arange(n)
@@ -166,11 +166,11 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
                 "DISABLED; call reset() first, of some of several with options={'reset_mask': …}."
             )
         over = np.flatnonzero(self._over)
-        values = self._scale.to_robot(actions, self.stage.running)
+        values = self._scale.to_robot(actions, self.episodes.running)
         reward: NDArray[np.float64] = np.zeros(self.num_envs)
         ended = over[:0]
         if len(over) < self.num_envs:
-            stepped = self.stage.step(values)
+            stepped = self.episodes.step(values)
             reward = stepped.reward
             if self._one_episode:
                 for kept, new in (
@@ -178,7 +178,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
                     (self._truncated, stepped.truncated),
                     (self._event, stepped.event),
                 ):
-                    np.copyto(kept, new, where=self.stage.running)
+                    np.copyto(kept, new, where=self.episodes.running)
             else:
                 self._terminated, self._truncated, self._event = stepped.terminated, stepped.truncated, stepped.event
             ended = np.flatnonzero(stepped.event)
@@ -190,7 +190,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
             if len(over):
                 # Those whose episodes ended a step ago take no action: they begin anew.
                 self._start(over, [None] * len(over))
-        self._see(np.flatnonzero(self.stage.running))
+        self._see(np.flatnonzero(self.episodes.running))
         return self._end(ended, reward)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -200,13 +200,13 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
             RenderingError: no image can be rendered here.
         """
         self._check_open()
-        return None if self.render_mode is None else tuple(map(self.stage.render, range(self.num_envs)))
+        return None if self.render_mode is None else tuple(map(self.episodes.render, range(self.num_envs)))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
         """Call a method of each environment, or get an attribute; see `Member`."""
         self._check_open()
         if name == "render" and not args and not kwargs and self.render_mode is not None:
-            return Images(self.stage)  # LeRobot takes the first few of them only
+            return Images(self.episodes)  # LeRobot takes the first few of them only
         values = [getattr(member, name) for member in self.members]
         return tuple(value(*args, **kwargs) if callable(value) else value for value in values)
 
@@ -215,7 +215,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of the environments, `seed` or `split` of their courses for example.
+        """Set an attribute of the environments, `seed` or `split` of their sequences for example.
 
         Args:
             name: the attribute.
@@ -233,15 +233,17 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulations."""
-        self.stage.close()
+        self.episodes.close()
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
     def _start(self, ids: NDArray[np.intp], numbers: Sequence[int | None]) -> None:
         """Start episodes in some environments; of these numbers, or the next ones."""
-        courses = [self.members[sim].course for sim in ids]
-        self.stage.reset(ids, [course.advance(number) for course, number in zip(courses, numbers, strict=True)])
-        self._episodes[ids] = [course.episode for course in courses]
+        sequences = [self.members[sim].sequence for sim in ids]
+        self.episodes.reset(
+            ids, [sequence.advance(number) for sequence, number in zip(sequences, numbers, strict=True)]
+        )
+        self._episodes[ids] = [sequence.episode for sequence in sequences]
         for flags in (self._over, self._terminated, self._truncated, self._success):
             flags[ids] = False
         self._event[ids] = Event.NOTHING
@@ -250,13 +252,13 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         """Finish a step in which some episodes ended; return what `step` returns."""
         if not len(ended):
             return self._observations(), reward, self._terminated.copy(), self._truncated.copy(), self._infos()
-        outcomes = [self.stage.outcome(sim, Event(int(self._event[sim]))) for sim in ended.tolist()]
+        outcomes = [self.episodes.outcome(sim, Event(int(self._event[sim]))) for sim in ended.tolist()]
         self._success[ended] = [outcome.success for outcome in outcomes]
         finals = [
             {
                 "event": EVENT_NAMES[self._event[sim]],
                 "episode_index": int(self._episodes[sim]),
-                "seed": int(self.stage.seeds[sim]),
+                "seed": int(self.episodes.seeds[sim]),
                 "is_success": outcome.success,
                 "score": float(outcome.score),
                 "details": dict(outcome.details),
@@ -265,7 +267,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         ]
         terminated, truncated = self._terminated.copy(), self._truncated.copy()
         infos: dict[str, Any] = {}
-        self.stage.rest(ended)
+        self.episodes.rest(ended)
         self._over[ended] = True
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             for sim, final in zip(ended.tolist(), finals, strict=True):
@@ -285,8 +287,8 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         if not len(ids):
             return
         everything = len(ids) == self.num_envs
-        running = np.count_nonzero(self.stage.running)
-        seen = self.stage.observe(None if len(ids) == running else ids)
+        running = np.count_nonzero(self.episodes.running)
+        seen = self.episodes.observe(None if len(ids) == running else ids)
         parts: Any = self.single_observation_space
         new = {key: seen[key] for key in parts}
         if everything or self._observation is None:
@@ -314,7 +316,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
             "is_success": self._success.copy(),
             "event": EVENT_NAMES[self._event],
             "episode_index": self._episodes.copy(),
-            "seed": self.stage.seeds.copy(),
+            "seed": self.episodes.seeds.copy(),
         }
         mask = np.ones(n, np.bool_)
         if only is not None:

@@ -10,9 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from bhd_lerobot.envs.episodes import ClosedError, ResetNeededError
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.register import ENVIRONMENTS, register
-from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.tasks.task import episode_seed
 from tests.cases import each_case

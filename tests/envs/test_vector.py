@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from bhd_lerobot.envs.course import STREAM
+from bhd_lerobot.envs.episodes import ClosedError, ResetNeededError
 from bhd_lerobot.envs.gym_env import BhdEnv
-from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
+from bhd_lerobot.envs.sequence import STREAM
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ActionError, ConfigError
 from tests.cases import each_case
@@ -131,11 +131,11 @@ def test_in_a_rollout_of_lerobot_what_is_over_is_left_alone(mode: AutoresetMode)
             assert (mine[1][over] == 0).all()
             assert (mine[2] | mine[3])[over].all()
         over |= mine[2] | mine[3]
-        np.testing.assert_array_equal(ours.stage.running, ~over)
+        np.testing.assert_array_equal(ours.episodes.running, ~over)
         last = mine
     assert over.all()
     assert ours.reset(seed=7)[1]["episode_index"].tolist() == [7, 8, 9]
-    assert ours.stage.running.all()
+    assert ours.episodes.running.all()
 
 
 def test_attributes_are_found_and_set() -> None:

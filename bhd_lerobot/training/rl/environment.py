@@ -13,8 +13,8 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import Limit
+from bhd_lerobot.envs.episodes import SteppedEpisodes
 from bhd_lerobot.envs.stable_baselines import BhdSb3VecEnv
-from bhd_lerobot.envs.stage import Stage
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.config import RewardConfig
@@ -84,10 +84,10 @@ class Shaping:
         self._potential: Array = np.zeros(n)
         self.uses_potential = config.potential != "none"
 
-    def potential(self, stage: Any) -> Array:
+    def potential(self, episodes: Any) -> Array:
         """Return the potential of every simulation's state now, shape (n,)."""
-        truth = stage.simulation.truth()
-        target = stage.task.environment_state(truth)
+        truth = episodes.simulation.truth()
+        target = episodes.task.environment_state(truth)
         return pose_potential(truth.tool_pose, target[:, :7], self._config.per_m, self._config.per_rad)
 
     def restart(self, ids: NDArray[np.intp], potential: Array) -> None:
@@ -119,13 +119,13 @@ def pose_potential(tool: Array, target: Array, per_m: float, per_rad: float) -> 
     return -per_m * distance - per_rad * angle
 
 
-def privileged_state(stage: Stage) -> NDArray[np.float32]:
+def privileged_state(episodes: SteppedEpisodes) -> NDArray[np.float32]:
     """Return what the simulator, the task and the cerebellum know beyond the observation, shape (n, k).
 
     The last number is whether the cerebellum kept the robot from an obstacle in the last frame: the flag CLEARANCE.
     """
-    kept = (stage.limits & Limit.CLEARANCE) != 0
-    parts = stage.simulation.privileged_state(), stage.task.privileged_state(), kept[:, None]
+    kept = (episodes.limits & Limit.CLEARANCE) != 0
+    parts = episodes.simulation.privileged_state(), episodes.task.privileged_state(), kept[:, None]
     return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
@@ -142,7 +142,7 @@ class RlVecEnv(BhdSb3VecEnv):
         self.stack = FeatureStack(parts.front, parts.before, env.num_envs)
         self.shaping = Shaping(reward, gamma, env.num_envs)
         self._after, self._privileged = parts.after, privileged
-        width = self.stack.size + (privileged_state(env.stage).shape[1] if privileged else 0)
+        width = self.stack.size + (privileged_state(env.episodes).shape[1] if privileged else 0)
         super().__init__(
             env,
             spaces.Box(-np.inf, np.inf, (width,), np.float32),
@@ -159,14 +159,14 @@ class RlVecEnv(BhdSb3VecEnv):
         super()._begin(ids, observation)
         self.stack.restart(ids, rows_of(observation))
         if self.shaping.uses_potential:
-            self.shaping.restart(ids, self.shaping.potential(self.env.stage))
+            self.shaping.restart(ids, self.shaping.potential(self.env.episodes))
 
     def _observations(self) -> NDArray[np.float32]:
         features = self.stack.features()
-        return np.hstack([features, privileged_state(self.env.stage)]) if self._privileged else features
+        return np.hstack([features, privileged_state(self.env.episodes)]) if self._privileged else features
 
     def _rewards(self, reward: Array, event: NDArray[np.int64], terminated: NDArray[np.bool_]) -> Array:
-        potential = self.shaping.potential(self.env.stage) if self.shaping.uses_potential else None
+        potential = self.shaping.potential(self.env.episodes) if self.shaping.uses_potential else None
         return self.shaping(reward, event, terminated, potential)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

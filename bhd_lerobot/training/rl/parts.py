@@ -51,7 +51,7 @@ def rows_of(observation: dict[str, Any]) -> Rows:
 
 def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] = ()) -> RlParts:
     """Return the actor and what belongs to it."""
-    simulation, task = env.stage.simulation, env.stage.task
+    simulation, task = env.episodes.simulation, env.episodes.task
     contract = PolicyContract(
         robot_type=config.robot.type,
         fps=simulation.rates.fps,
@@ -200,7 +200,7 @@ def _random_run(env: BhdVectorEnv, seed: int) -> Stats:
     """Return the scale of what is seen under random actions, each of which lasts a while."""
     rng = np.random.default_rng(seed)
     observation, _ = env.reset()
-    low, high = action_bounds(env.stage.simulation.body, env.stage.simulation.action_names)
+    low, high = action_bounds(env.episodes.simulation.body, env.episodes.simulation.action_names)
     seen: dict[str, list[NDArray[Any]]] = defaultdict(list)
     actions = rng.uniform(low, high, (env.num_envs, len(low))).astype(np.float32)
     for frame in range(_RANDOM_FRAMES):

@@ -193,7 +193,7 @@ class Run(BaseCallback):
     def _judge(self, row: Row) -> None:
         """Save, and, unless the run is to stop, find out how good the policy is."""
         result = self._result
-        following = max(member.course.following for member in self._env.members)
+        following = max(member.sequence.following for member in self._env.members)
         result.checkpoint = save(result.output_dir, self._parts, self.model, following)
         self._saved = result.step
         policy = LearnedBrainConfig(path=str(result.checkpoint / PRETRAINED_MODEL_DIR))

@@ -7,7 +7,7 @@ import torch
 
 pytest.importorskip("stable_baselines3")
 
-from bhd_lerobot.envs.course import STREAM
+from bhd_lerobot.envs.sequence import STREAM
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import Event
@@ -95,7 +95,7 @@ def test_at_an_episodes_start_nothing_was_before_its_first_frame(rig: Rig) -> No
 
 def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_same_step(rig: Rig) -> None:
     rig.adapter.reset()
-    episodes = [member.course.episode for member in rig.env.members]
+    episodes = [member.sequence.episode for member in rig.env.members]
     for _ in range(9):
         features, _, done, infos = rig.step()
         assert not done.any()
@@ -109,13 +109,13 @@ def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_s
         # It stood still: what it saw last is what it saw before, but for the noise of a scan; the new arena is another.
         assert np.abs(info["terminal_observation"] - before[sim]).max() < np.abs(features[sim] - before[sim]).max()
         assert info["episode"]["l"] == 10
-    assert [member.course.episode for member in rig.env.members] == [episode + STREAM for episode in episodes]
+    assert [member.sequence.episode for member in rig.env.members] == [episode + STREAM for episode in episodes]
     assert len(rig.episodes) == N
 
 
 def collide(rig: Rig) -> tuple:
     rig.adapter.reset()
-    rig.env.stage.simulation._touched[0] = False
+    rig.env.episodes.simulation._touched[0] = False
     for _ in range(400):
         features, reward, done, infos = rig.step(forward=1.0)
         hits = [sim for sim, info in enumerate(infos) if info.get("event") == "collision"]
@@ -197,7 +197,7 @@ def test_the_critic_sees_more_than_the_actor_and_the_actor_what_it_saw_before() 
     np.testing.assert_array_equal(seen[:, :size], adapter.stack.features())
     assert size == parts.actor.feature_size
     # The scan was taken where the robots stand: of 36 beams each is one of the directions.
-    simulation: Any = env.stage.simulation
+    simulation: Any = env.episodes.simulation
     near = simulation.body.drive.radius / simulation.lidar.ranges
     np.testing.assert_allclose(seen[:, size : size + 36], np.minimum(near, 1.0), atol=0.02)
     learner = make_learner(config, parts, adapter)

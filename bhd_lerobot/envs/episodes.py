@@ -41,7 +41,7 @@ class Stepped:
     truncated: NDArray[np.bool_]
 
 
-class Stage:
+class SteppedEpisodes:
     """n simulations, each in an episode of its own, or idle; `frames`: longest duration of an episode."""
 
     def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:

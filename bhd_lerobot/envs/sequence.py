@@ -16,7 +16,7 @@ which Stable-Baselines3 and NumPy's own seeds are limited, never meet.
 _END = 2**63  # infos of vector environments hold the numbers as int64
 
 
-class Course:
+class EpisodeSequence:
     """The episodes of one environment: `episode` is the number of the present one, -1 before the first."""
 
     def __init__(self, seed: int = 0, split: Split = "train", first: int | None = None, stride: int = STREAM) -> None:

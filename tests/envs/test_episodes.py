@@ -7,9 +7,9 @@ import pytest
 
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.envs.episodes import SteppedEpisodes
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.settings import make_settings
-from bhd_lerobot.envs.stage import Stage
 from bhd_lerobot.policies.brain import ConfiguredBrain
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -65,7 +65,7 @@ def test_an_episode_is_that_of_the_loop_bit_for_bit(name: str) -> None:
             np.testing.assert_array_equal(observation["agent_pos"], columns[keys.OBSERVATION_STATE][frame])
             if keys.ENVIRONMENT_STATE in columns:
                 np.testing.assert_array_equal(observation["environment_state"], columns[keys.ENVIRONMENT_STATE][frame])
-            np.testing.assert_array_equal(env.stage.simulation.physics_state[0], columns[keys.PHYSICS_STATE][frame])
+            np.testing.assert_array_equal(env.episodes.simulation.physics_state[0], columns[keys.PHYSICS_STATE][frame])
             observation, reward, terminated, truncated, info = env.step(columns[keys.ACTION][frame])
             assert np.float32(reward) == columns[keys.REWARD][frame]
             assert (terminated or truncated) == bool(columns[keys.DONE][frame])
@@ -91,10 +91,10 @@ def test_time_truncates_and_what_happens_terminates() -> None:
 
 
 def test_a_success_that_is_an_achievement_terminates() -> None:
-    stage = Stage(make_settings("UR5Reach-v0").robot, make_settings("UR5Reach-v0").task)
-    stage.reset(ONE, [0])
-    stage.task.judge = lambda truth, running: (np.ones(1), np.full(1, int(Event.SUCCESS)))  # type: ignore[method-assign]
-    stepped = stage.step(np.array(stage.simulation.body.arm.home)[None])
+    episodes = SteppedEpisodes(make_settings("UR5Reach-v0").robot, make_settings("UR5Reach-v0").task)
+    episodes.reset(ONE, [0])
+    episodes.task.judge = lambda truth, running: (np.ones(1), np.full(1, int(Event.SUCCESS)))  # type: ignore[method-assign]
+    stepped = episodes.step(np.array(episodes.simulation.body.arm.home)[None])
     assert stepped.terminated.all()
     assert not stepped.truncated.any()
 
@@ -102,13 +102,13 @@ def test_a_success_that_is_an_achievement_terminates() -> None:
 @pytest.mark.parametrize(("mode", "event"), [(Mode.FAULT, Event.FAULT), (Mode.ESTOP, Event.ESTOP)])
 def test_a_robot_that_has_latched_a_stop_terminates(mode: Mode, event: Event) -> None:
     settings = make_settings("TurtleBot3Avoid-v0", {"beams": 36})
-    stage = Stage(settings.robot, settings.task, 2)
-    stage.reset(np.arange(2), [0, 2])
+    episodes = SteppedEpisodes(settings.robot, settings.task, 2)
+    episodes.reset(np.arange(2), [0, 2])
     if mode == Mode.ESTOP:
-        stage.simulation.bridge.estop(np.array([1]))
+        episodes.simulation.bridge.estop(np.array([1]))
     else:
-        stage.simulation.cerebellum.interrupt(Watchdog.PLANT, Mode.FAULT)
-    stepped = stage.step(np.zeros((2, 2)))
+        episodes.simulation.cerebellum.interrupt(Watchdog.PLANT, Mode.FAULT)
+    stepped = episodes.step(np.zeros((2, 2)))
     assert stepped.event[1] == event
     assert stepped.terminated[1]
     assert not stepped.truncated[1]
