@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
@@ -124,14 +125,8 @@ class BhdTrainConfig(TrainPipelineConfig):
         if self.dataset.streaming or self.job.is_remote:
             option = "dataset.streaming" if self.dataset.streaming else "job.target"
             raise ConfigError(f"{option} is not for bhd-train; use lerobot-train, which reads the same configuration.")
-        if self.output_dir is not None and not self.resume and _is_there(Path(self.output_dir)):
-            last = Path(self.output_dir) / "checkpoints/last/pretrained_model"
-            resume = f", or continue its run with --resume=true --config_path={quoted(last)}"
-            what = "exists" if last.is_dir() else "exists and holds no run to continue"
-            raise ConfigError(
-                f"The output folder {self.output_dir} {what}. Set another --output_dir"
-                f"{resume if last.is_dir() else ''}."
-            )
+        if self.output_dir is not None and not self.resume:
+            refuse_existing(Path(self.output_dir))
         if self.policy.push_to_hub and not self.policy.repo_id:
             raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")
         given = self.optimizer, self.scheduler
@@ -190,11 +185,19 @@ class BhdTrainConfig(TrainPipelineConfig):
         (save_directory / OWN_CONFIG_NAME).write_text(json.dumps(own, indent=4), encoding="utf-8")
 
 
-def _is_there(path: Path) -> bool:
+def refuse_existing(folder: Path) -> None:
+    """Refuse a run's folder that is there already, with how to continue a run in it."""
     try:
-        return path.exists()
+        if not folder.exists():
+            return
+        has_run = (folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).is_dir()
     except OSError as error:  # a name that is too long, a folder that may not be looked into
-        raise ConfigError(f"The output folder {path} cannot be used: {error.strerror}. Set --output_dir.") from error
+        raise ConfigError(f"The output folder {folder} cannot be used: {error.strerror}. Set --output_dir.") from error
+    resume = f", or continue its run with --resume=true --config_path={quoted(folder)}" if has_run else ""
+    raise ConfigError(
+        f"The output folder {folder} exists{'' if has_run else ' and holds no run to continue'}. Set another "
+        f"--output_dir{resume}."
+    )
 
 
 def own_fields() -> list[str]:

@@ -13,6 +13,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.options.command import Program
 from bhd_lerobot.policies.learned.inference import use_threads
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
+from bhd_lerobot.training.config import refuse_existing
 from bhd_lerobot.training.log import Row
 from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 
@@ -72,14 +73,9 @@ def _run_folder(config: RlConfig) -> Path:
     if config.output_dir is None:
         config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
     folder = Path(config.output_dir).expanduser()
+    if not config.resume:
+        refuse_existing(folder)
     try:
-        if folder.exists() and not config.resume:
-            resume = f", or continue its run with --resume=true --config_path={quoted(folder)}"
-            is_run = (folder / "checkpoints").is_dir()
-            raise ConfigError(
-                f"The output folder {folder} exists{'' if is_run else ' and holds no run to continue'}. Set another "
-                f"--output_dir{resume if is_run else ''}."
-            )
         if config.resume and not folder.is_dir():
             raise ConfigError(f"There is no run to resume in {folder}.")
         folder.mkdir(parents=True, exist_ok=True)
