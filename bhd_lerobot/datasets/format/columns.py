@@ -19,7 +19,6 @@ from bhd_lerobot.datasets.format.state import (
     Row,
     corrupt,
     load_state,
-    ordered_slots,
     read_frames,
     slot_of,
 )
@@ -113,21 +112,6 @@ def wrong_order(slots: Sequence[layout.Slot]) -> str:
                 f"{episode - 1}"
             )
     return ""
-
-
-def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = None) -> list[dict[str, NDArray]]:
-    """Return columns of scalars, by key, of one episode or of all, each of shape (frames,)."""
-    root = Path(root)
-    state = load_state(root)
-    present = [key for key in keys if key in state.info["features"]]
-    rows = state.rows if episode is None else [_row(state, episode)]
-    wanted = {slot_of(row, "data") for row in rows}
-    result: dict[int, dict[str, NDArray]] = {}
-    for slot, inside in ordered_slots(state.rows, "data").items():
-        if slot in wanted:
-            for index, table in frames_of(root / layout.data_file(slot), inside, present).items():
-                result[index] = {key: np.asarray(table[key]) for key in present}
-    return [result[row["episode_index"]] for row in rows]
 
 
 def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
