@@ -180,7 +180,13 @@ class WorkerPool:
     def _replace(self, worker: Worker, error: BaseException) -> None:
         """Give a worker up and its tasks to others."""
         host = worker.host or "a machine that had not answered yet"
-        cause = " ".join(line.strip() for line in str(error).splitlines() if "class_name" not in line).strip()[:300]
+        lines = [line.strip() for line in str(error).splitlines() if line.strip() and "class_name" not in line]
+        if lines and "creation task" in lines[0]:
+            raise ClusterError(
+                f"A worker could not be started: {lines[-1]}. Install this package, as it is here, on all machines, "
+                "and start Ray there again."
+            ) from error
+        cause = " ".join(lines)[:300]
         self._dismiss(lambda one: one is worker)
         self._lost_early += not worker.host
         if self._lost_early >= _STARTS:

@@ -1,6 +1,7 @@
 """Runs on a cluster of two machines: the same bytes as on one, whatever dies."""
 
 import contextlib
+import importlib
 import io
 import os
 import pickle
@@ -16,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.cli.record import main
-from bhd_lerobot.cluster import loop
+from bhd_lerobot.cluster import loop, pool
 from bhd_lerobot.cluster.cluster import describe_crowding
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job
@@ -432,3 +433,14 @@ def test_the_run_stops_when_it_is_told_to(cluster):
     assert len(got) < 1000
     raylets = {machine.all_processes["raylet"][0].process.pid for machine in cluster.spare}
     until(lambda: not workers_of(raylets))
+
+
+@pytest.mark.usefixtures("driver")
+def test_a_machine_without_this_package_is_reported(cluster, tmp_path, monkeypatch):
+    (tmp_path / "only_here.py").write_text("class RemoteWorker:\n    def host(self): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(pool, "RemoteWorker", importlib.import_module("only_here").RemoteWorker)
+    got, _, error = run_pool(cluster, [fakes.ECHO])
+    assert got == []
+    assert isinstance(error, ClusterError)
+    assert "could not be started: ModuleNotFoundError: No module named 'only_here'. Install this package" in str(error)
