@@ -137,11 +137,6 @@ class FrameTable:
         start = int(self.starts[self._position[episode]])
         return slice(start, start + int(self.lengths[self._position[episode]]))
 
-    def episode(self, episode: int) -> dict[str, Tensor]:
-        """Return the columns of one episode, each of shape (T, ...), over the memory of the table."""
-        rows = self.rows(episode)
-        return {key: column[rows] for key, column in self.columns.items()}
-
     def place(self, row: int) -> str:
         """Return as text which episode and frame a row is."""
         return f"episode {int(self.columns['episode_index'][row])}, frame {int(self.columns['frame_index'][row])}"

@@ -182,7 +182,7 @@ def test_the_table_by_episode(plain: Path) -> None:
     assert table.episodes == [1, 3]
     assert len(table) == support.length(1) + support.length(3)
     for episode in (1, 3):
-        assert np.array_equal(table.episode(episode)["action"].numpy(), support.columns(episode)["action"])
+        assert np.array_equal(table.columns["action"][table.rows(episode)].numpy(), support.columns(episode)["action"])
     assert "observation.state" not in table.columns
     assert table.place(table.rows(3).start + 2) == "episode 3, frame 2"
     with pytest.raises(DatasetError, match="episode 0 is not among 1, 3"):
