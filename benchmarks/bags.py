@@ -83,7 +83,7 @@ def bare_read(path: Path) -> tuple[dict[str, bytes], list[tuple[str, str, int, b
 
 def import_bag(bag: Path, root: Path) -> None:
     """Import a bag."""
-    arguments = ["import", str(bag), "--task=Drive.", "--repo_id=bench/bags", f"--root={root}"]
+    arguments = ["import", str(bag), "--task=Drive.", "--min_episode_s=0", "--repo_id=bench/bags", f"--root={root}"]
     if data.main(arguments):
         raise AssertionError("The import failed.")
 
