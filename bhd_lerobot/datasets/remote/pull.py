@@ -174,6 +174,7 @@ class _Pull:
                 f"has {megabytes(free)} free. Free some space, or name another --root."
             )
         self._remote.fetch(sorted(missing), folder)
+        # Not hashed again, which takes as long as a fast download: TLS and Xet check the content on its way.
         if wrong := [path for path in missing if (folder / path).stat().st_size != there[path].size]:
             raise TransferError(f"Could not download {self._remote.name}: {listed(wrong)} did not arrive whole.")
         self._fetched |= missing
