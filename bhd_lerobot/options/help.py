@@ -15,8 +15,6 @@ from bhd_lerobot.options.parse import choices_of, entries_of, options_of, valid_
 _INDENT = 26  # [characters] where meanings begin
 # What LeRobot's own classes say nowhere; where a class says it, that counts.
 _OF_LEROBOT = {
-    "id": "name of this robot or teleoperator; LeRobot's own field",
-    "calibration_dir": "where LeRobot keeps calibration files; nothing here is calibrated",
     "episodes": "numbers of the episodes to use; by default all",
     "tfs": "random changes of images, by name",
     "revision": "branch, tag or commit on the Hub; by default LeRobot's version tag",
