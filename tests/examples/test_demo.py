@@ -70,7 +70,7 @@ def test_the_command_lines_are_valid(lines: list[list[str]]) -> None:
         if program == "record":
             splits.add(parse(RecordConfig, options).split)
         elif program == "train":
-            config = parse_train(options).config
+            config = parse_train(options)
             assert not config.save_freq or config.steps % config.save_freq == 0
         elif program == "eval":
             rules = [text for text in options if not re.search(r"learned|early|\.path=", text)]
