@@ -6,7 +6,7 @@ from typing import Any
 
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.atomic import is_free, making
+from bhd_lerobot.datasets.storage.atomic import building, is_free
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
 
@@ -54,7 +54,7 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
     try:
         with (
             write_errors("create the dataset", root, "Nothing was written there."),
-            making(root, disk, refuse) as space,
+            building(root, disk, refuse) as space,
         ):
             lock = space.lock_new()
             fill(space.folder)

@@ -17,10 +17,10 @@ from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_datas
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
     Workspace,
+    building,
     clean,
     complete_interrupted,
     is_free,
-    making,
     real,
     refuse_inside,
     remove_abandoned,
@@ -120,7 +120,7 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
                 raise DatasetExistsError(f"{folder} is a file. Choose another folder.")
 
         disk = Disk()
-        with write_errors("split the dataset", folder, "No part was written."), making(folder, disk, refuse) as space:
+        with write_errors("split the dataset", folder, "No part was written."), building(folder, disk, refuse) as space:
             disk.make_folder(space.folder)
             for name, episodes in parts.items():
                 _fill(space.folder / name, disk, picks[name], *_kept(state, episodes, "split"))

@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.format import info as meta_info
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import UNREADABLE
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import few
+from bhd_lerobot.datasets.validate.findings import brief
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
 _IMAGES = ("video", "image")
@@ -90,8 +90,8 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     if not sizes:
         return ""
     lacks, more = sorted(sizes.keys() - features.keys()), sorted(wanted - sizes.keys())
-    texts = [f"it does not describe {few(lacks)}"] if lacks else []
-    texts += [f"it describes {few(more)}, which {'is' if len(more) == 1 else 'are'} not there"] if more else []
+    texts = [f"it does not describe {brief(lacks)}"] if lacks else []
+    texts += [f"it describes {brief(more)}, which {'is' if len(more) == 1 else 'are'} not there"] if more else []
     for key in sorted(sizes.keys() & wanted):
         shape, size = features[key]["shape"], sizes[key]
         if size is not None and len(shape) == 1 and shape[0] != size:

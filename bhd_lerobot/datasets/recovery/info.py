@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.validate.findings import one_line
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError
 
 
-def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
+def replace_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
     """Describe a dataset by the `meta/info.json` of another; the caller holds the lock.
 
     What was there before goes to a folder beside the dataset.
@@ -71,8 +71,8 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
     return f"{layout.INFO}: columns and frame rate as in {donor}, counts from the files", saved
 
 
-def give_back(root: Path, saved: Path | None, disk: Disk) -> None:
-    """Undo what `adopt_info` did."""
+def restore_info(root: Path, saved: Path | None, disk: Disk) -> None:
+    """Undo what `replace_info` did."""
     if saved is None:
         disk.remove(root / layout.INFO)
     else:

@@ -13,7 +13,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.videos import FoundEpisode
-from bhd_lerobot.datasets.validate.findings import Findings, few
+from bhd_lerobot.datasets.validate.findings import Findings, brief
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 RECOVERED = "recovered"
@@ -63,7 +63,7 @@ def restore_outcomes(
     others = sorted(set(numbers) - set(known))
     if is_ours or stored.torn:
         rest = sorted(f"bhd/{name}" for name in names - ({"outcome", "success"} if known else set()))
-        columns = few(rest, _SHOWN) if rest else "all columns bhd/… but outcome and success" if known else "all bhd/…"
+        columns = brief(rest, _SHOWN) if rest else "all columns bhd/… but outcome and success" if known else "all bhd/…"
         findings.error("outcome", "meta/episodes", f"{columns} of {_episodes(numbers)}")
         if known and others:
             findings.error("outcome", "meta/episodes", f"bhd/outcome, bhd/success of {_episodes(others)}")
@@ -115,4 +115,4 @@ def _episodes(numbers: Sequence[int]) -> str:
     """Return numbers in order as text: a range where there is no hole."""
     if len(numbers) > 2 and list(numbers) == list(range(numbers[0], numbers[-1] + 1)):
         return f"episodes {numbers[0]} to {numbers[-1]}"
-    return f"episode{'s' if len(numbers) > 1 else ''} {few([str(number) for number in numbers], 8)}"
+    return f"episode{'s' if len(numbers) > 1 else ''} {brief([str(number) for number in numbers], 8)}"

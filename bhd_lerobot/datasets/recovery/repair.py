@@ -26,7 +26,7 @@ from bhd_lerobot.datasets.format.state import (
 )
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.fix import is_fixable, rebuild
-from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
+from bhd_lerobot.datasets.recovery.info import replace_info, restore_info
 from bhd_lerobot.datasets.recovery.salvage import RepairReport, salvage
 from bhd_lerobot.datasets.recovery.videos import whole_frames
 from bhd_lerobot.datasets.storage import layout
@@ -63,7 +63,7 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
         if info is not None:
             return _repair_with(root, Path(info), disk, lock)
         is_ours = (root / layout.IDENTITY).exists()
-        if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
+        if (root / layout.INFO).is_file() and (not is_ours or continued_elsewhere(root)):
             return _repair_foreign(root, disk, lock)
         return _repair_own(root, disk, lock)
     except DatasetCorruptError as error:
@@ -78,7 +78,7 @@ def _repair_own(root: Path, disk: Disk, lock: RootLock) -> RepairReport:
     report = RepairReport(root, 0, 0)
     try:
         with write_errors("repair the dataset", root, "Its saved episodes are intact."):
-            state, report = settle(root, disk)
+            state, report = restore_committed(root, disk)
             _check_deeply(state)
             if state.identity is not None and compact(state, Schema(state.info["features"]), disk, lock):
                 what = f"compaction and statistics of {len(state.without_stats)} episodes"
@@ -118,12 +118,12 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
     with write_errors("repair the dataset", root, consequence):
         roll_forward(root, disk)
         clean(root)
-        adopted, saved = adopt_info(root, donor, disk)
+        adopted, saved = replace_info(root, donor, disk)
     try:
         report = _repair_foreign(root, disk, lock, adopted)
     except BaseException:
         with write_errors("repair the dataset", root, consequence):
-            give_back(root, saved, disk)
+            restore_info(root, saved, disk)
         raise
     return report if saved is None or report.aside is not None else replace(report, aside=saved.parents[1])
 
@@ -170,7 +170,7 @@ def unfinished_files(root: Path) -> list[Path]:
     return [path for path in paths if path.suffix == ".parquet" and is_cut_off(path)]
 
 
-def went_on(root: Path) -> list[Path]:
+def continued_elsewhere(root: Path) -> list[Path]:
     """Return what another program left unfinished when it went on with a dataset of ours.
 
     A file that our own rows need and that is cut off is damage of another kind. LeRobot always leaves a data file.
@@ -201,7 +201,7 @@ def _check_readable(state: DatasetState) -> None:
                 raise corrupt(path, f"it has {frames} of {needed} frames; {problem or 'it ends'}")
 
 
-def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
+def restore_committed(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
     """Bring the disk to what ``info.json`` says; the caller holds the lock.
 
     Returns:
@@ -213,7 +213,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     state = load_state(root)
     dropped: list[str] = []
     if state.identity is not None:
-        if unfinished := went_on(root):
+        if unfinished := continued_elsewhere(root):
             raise corrupt(unfinished[0], "another program continued this dataset and was killed")
         # Only in our own datasets: another program may know what its files are for.
         dropped = sorted(layout.recorded_files(root) - state.files())

@@ -34,7 +34,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity, few
+from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity, brief
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError, counted
 
 
@@ -154,7 +154,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
 
 def _nothing_left(root: Path, info: dict[str, Any], wrong: str, findings: Findings) -> DatasetCorruptError:
     if cameras := lost_cameras(root, info):
-        what = f"it describes {few(cameras)}, of which there is no video and no image. If it is another recording's: "
+        what = f"it describes {brief(cameras)}, of which there is no video and no image. If it is another recording's: "
         findings.error("video", layout.INFO, what + repair_with_info(root))
     reasons = "".join(f"\n  {finding}" for finding in findings)
     return DatasetCorruptError(

@@ -115,7 +115,7 @@ class Workspace:
 
 
 @contextlib.contextmanager
-def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Workspace]:
+def building(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Workspace]:
     """Give a workspace for something new, and publish it when the block ends well."""
     remove_abandoned(real(target))
     complete_interrupted(target)

@@ -30,7 +30,7 @@ from bhd_lerobot.datasets.format.state import (
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, is_decided
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import FIX, Findings, few, one_line
+from bhd_lerobot.datasets.validate.findings import FIX, Findings, brief, one_line
 from bhd_lerobot.datasets.validate.order import SORTS, check_order
 from bhd_lerobot.datasets.validate.statistics import UNREAD
 from bhd_lerobot.errors import DatasetError
@@ -129,12 +129,12 @@ def _read_tasks(files: Files, findings: Findings) -> None:
         return
     numbers = list(tasks)
     if sorted(numbers) != list(range(len(numbers))):
-        what = f"its numbers are {few(numbers)}; they have to be 0 to {len(numbers) - 1}, because LeRobot counts rows"
+        what = f"its numbers are {brief(numbers)}; they have to be 0 to {len(numbers) - 1}, because LeRobot counts rows"
         findings.error("counts", layout.TASKS, what, "bhd-data repair numbers the instructions again.")
         return
     files.tasks = [tasks[number] for number in range(len(tasks))]
     if numbers != sorted(numbers):
-        what = f"its rows have the numbers {few(numbers)}; LeRobot takes row i for that of number i"
+        what = f"its rows have the numbers {brief(numbers)}; LeRobot takes row i for that of number i"
         findings.error("order", layout.TASKS, what, SORTS)
     if len(tasks) < files.info["total_tasks"]:
         what = f"it holds {len(tasks)} instructions; meta/info.json counts {files.info['total_tasks']}"
@@ -161,9 +161,9 @@ def _check_names(files: Files, findings: Findings) -> None:
     torn = [name for name in leftovers if name.endswith(".parquet") and is_cut_off(files.root / name)]
     if torn:
         what = "its writer was killed; an episode may be in it, and LeRobot loads nothing while it is there"
-        findings.error("files", few(torn, 3), what, "bhd-data repair recovers what is whole.")
+        findings.error("files", brief(torn, 3), what, "bhd-data repair recovers what is whole.")
     elif leftovers:
-        findings.warning("files", few(leftovers, 3), "no described episode is in it", remedy)
+        findings.warning("files", brief(leftovers, 3), "no described episode is in it", remedy)
     if (files.root / layout.STAGING).exists():
         findings.warning("files", layout.STAGING, *_interrupted(files))
 
@@ -209,7 +209,7 @@ def _read_stats(files: Files, findings: Findings) -> None:
         lacking = [statistic for statistic in _STATISTICS if statistic not in known]
         report = findings.warning if key in UNREAD else findings.error
         if lacking:
-            report("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
+            report("stats", f"{name}: {key}", f"it has no {brief(lacking)}", remedy)
         elif feature["dtype"] not in ("video", "image"):
             count = known["count"][0]
             if count != files.info["total_frames"]:

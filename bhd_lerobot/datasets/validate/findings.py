@@ -70,7 +70,7 @@ class Findings:
         self.items.append(Finding(Severity.NOTE, check, where, what))
 
 
-def few(values: Iterable[Any], shown: int = 6) -> str:
+def brief(values: Iterable[Any], shown: int = 6) -> str:
     """Return the first few of some values, and how many more there are."""
     texts = [str(value) for value in values]
     more = len(texts) - shown

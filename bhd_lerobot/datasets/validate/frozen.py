@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.validate.findings import Findings, few, name_of
+from bhd_lerobot.datasets.validate.findings import Findings, brief, name_of
 
 _SHORTEST = 10  # frames; in fewer, a number may well stand still
 _SHOWN = 3  # episodes that are named one by one
@@ -71,7 +71,7 @@ class FrozenCheck:
             findings.warning("frozen", key, "its values never change", "Check that it was connected.")
             return
         if dead.any():
-            names = few(name_of(self._features[key], int(i)) for i in np.flatnonzero(dead))
+            names = brief(name_of(self._features[key], int(i)) for i in np.flatnonzero(dead))
             findings.note("frozen", key, f"these never change: {names}")
         if key == keys.ACTION:
             return  # a brain may well want the same all the time; a sensor that reads the same is broken
@@ -83,7 +83,7 @@ class FrozenCheck:
         odd = (frozen[usable].mean(axis=0) <= 0.5) & ~dead
         still = frozen & (usable & ~whole)[:, None] & odd & (level > column.low) & (level < column.high)
         for element in np.flatnonzero(still.any(axis=0)).tolist():
-            episodes = few(column.episodes[i] for i in np.flatnonzero(still[:, element]))
+            episodes = brief(column.episodes[i] for i in np.flatnonzero(still[:, element]))
             what = f"it does not change in episode {episodes}, and does in most others"
             where = f"{key}: {name_of(self._features[key], element)}"
             findings.warning("frozen", where, what, "Check the sensor.")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format.columns import instructions_of, numbers_of, order_of, wrong_number, wrong_order
 from bhd_lerobot.datasets.format.state import UNREADABLE, Row
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import FIX, Findings, few
+from bhd_lerobot.datasets.validate.findings import FIX, Findings, brief
 
 _MOVE = "Move it out of the dataset."
 SORTS = f"{FIX} puts them in order."
@@ -59,10 +59,10 @@ def _check_instructions(
         if (words := instructions_of(row, own, tasks, path)) != row["tasks"]
     ]
     for row, words in others[:1]:
-        episodes = few(row["episode_index"] for row, _ in others)
+        episodes = brief(row["episode_index"] for row, _ in others)
         what = (
-            f"the instructions of episode {row['episode_index']} are {few(map(repr, row['tasks'])) or 'missing'}, and "
-            f"its frames have {few(map(repr, words))}; so of {episodes}"
+            f"the instructions of episode {row['episode_index']} are {brief(map(repr, row['tasks'])) or 'missing'}, "
+            f"and its frames have {brief(map(repr, words))}; so of {episodes}"
         )
         findings.error("counts", "meta/episodes", what, f"{FIX} lists those of the frames.")
 

@@ -21,7 +21,7 @@ from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import Row, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
-from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
+from bhd_lerobot.datasets.validate.findings import Findings, brief, name_of, one_line
 from bhd_lerobot.datasets.validate.frozen import FrozenCheck
 from bhd_lerobot.datasets.validate.order import check_numbers
 from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_deviations, wrong_statistic
@@ -89,7 +89,7 @@ class ValueCheck:
             file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True)
             missing = [key for key in stored if key not in file.schema_arrow.names]
             if missing:
-                self._findings.error("schema", name, f"it has no column {few(missing)}", _LEAVE)
+                self._findings.error("schema", name, f"it has no column {brief(missing)}", _LEAVE)
                 return None
             if wrong := wrong_columns(file.schema_arrow, self._files.features):
                 self._findings.error("schema", name, wrong, _LEAVE)
@@ -97,7 +97,7 @@ class ValueCheck:
             extra = [key for key in file.schema_arrow.names if key not in self._files.features]
             if extra:
                 self._findings.warning(
-                    "schema", name, f"meta/info.json knows no {few(extra)}", "Programs leave it out."
+                    "schema", name, f"meta/info.json knows no {brief(extra)}", "Programs leave it out."
                 )
             return file.read(columns=list(dict.fromkeys((*stored, *DEFAULT_FEATURES))))
         except (OSError, pa.ArrowException, ValueError) as error:
@@ -229,9 +229,9 @@ class ValueCheck:
         number = wrong[np.argmax(stored[wrong] == 0)] if is_zero else wrong[0]
         name = name_of(self._files.features[key], int(number))
         what = (
-            f"the std of {few(name_of(self._files.features[key], int(n)) for n in wrong)} is not that of the data: of "
-            f"{name} it is {stored[number]:.3g}, and theirs is {deviation[number]:.3g}, as LeRobot rounds far from 0; "
-            "a policy that is normalised with it learns something else"
+            f"the std of {brief(name_of(self._files.features[key], int(n)) for n in wrong)} is not that of the data: "
+            f"of {name} it is {stored[number]:.3g}, and theirs is {deviation[number]:.3g}, as LeRobot rounds far from "
+            "0; a policy that is normalised with it learns something else"
         )
         report = self._findings.error if is_zero else self._findings.warning
         report("stats", f"{layout.STATS}: {key}", what, remedy)

@@ -16,7 +16,7 @@ from bhd_lerobot.datasets.format.identity import FORMAT, as_json, check_identity
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, slot_of
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
-from bhd_lerobot.datasets.recovery.repair import settle
+from bhd_lerobot.datasets.recovery.repair import restore_committed
 from bhd_lerobot.datasets.recovery.salvage import RepairReport
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
@@ -139,7 +139,7 @@ class DatasetRecorder:
         lock = RootLock(root, is_choice=True)
         try:
             with write_errors("resume the dataset", root, _INTACT):
-                state, report = settle(root, disk)
+                state, report = restore_committed(root, disk)
             _check_last(state)
             check_identity(
                 state,
@@ -266,7 +266,7 @@ class DatasetRecorder:
         with write_errors("take back the last episode", self.root, _INTACT):
             self._committer.take_back(self.root, *before)
             # What is not counted any more is dropped as after a kill in the middle of a save.
-            self._state, _ = settle(self.root, self._disk, keep_staging=True)
+            self._state, _ = restore_committed(self.root, self._disk, keep_staging=True)
         self._stats.pop(self.num_episodes, None)
 
     def finalize(self) -> None:
@@ -334,7 +334,7 @@ class DatasetRecorder:
         # A failed `finalize` gave the lock back, so that `repair` can be used; it may have been.
         self._is_uncertain |= self._lock.acquire()
         if self._is_uncertain:
-            self._state, _ = settle(self.root, self._disk, keep_staging=True)
+            self._state, _ = restore_committed(self.root, self._disk, keep_staging=True)
             self._is_uncertain = False
 
     def _check_not_finalized(self) -> None:

@@ -20,7 +20,7 @@ import pytest
 
 from bhd_lerobot.datasets.edit.edits import edits_of, keep
 from bhd_lerobot.datasets.edit.mark import mark
-from bhd_lerobot.datasets.recovery.repair import repair, settle
+from bhd_lerobot.datasets.recovery.repair import repair, restore_committed
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
@@ -453,6 +453,6 @@ def test_our_own_dataset_that_lerobot_went_on_with(recorded: Recorded, tmp_path:
         go_on(root, "none", count, die)
         if count == 1:  # our recorder does not throw away what it did not write
             with pytest.raises(DatasetCorruptError, match="bhd-data repair"):
-                settle(root, Disk())
+                restore_committed(root, Disk())
         assert repair(root).episodes == 3 + count
         assert json.loads((root / "meta/bhd.json").read_text())["recording"]["edited"] == {"edit": "recovered"}

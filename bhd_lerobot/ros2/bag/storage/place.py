@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from bhd_lerobot.datasets.storage.atomic import complete_interrupted, is_free, making, real, remove_abandoned
+from bhd_lerobot.datasets.storage.atomic import building, complete_interrupted, is_free, real, remove_abandoned
 from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.errors import DatasetExistsError
 
@@ -31,6 +31,6 @@ def complete_or_not(target: Path, option: str, action: str, consequence: str) ->
     """
     with (
         write_errors(action, target, consequence),
-        making(target, Disk(), lambda: refuse_existing(target, option)) as space,
+        building(target, Disk(), lambda: refuse_existing(target, option)) as space,
     ):
         yield space.folder  # its final name, which rosbag2 gives to the files in it
