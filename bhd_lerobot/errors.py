@@ -144,3 +144,10 @@ def quoted(value: object) -> str:
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: ``1 episode``, ``2 episodes``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def brief(values: Iterable[object], shown: int = 6) -> str:
+    """Return the first few of some values, and how many more there are."""
+    texts = [str(value) for value in values]
+    more = len(texts) - shown
+    return ", ".join(texts[:shown]) + (f" and {more} more" if more > 0 else "")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Command, CommandResult
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, brief
 from bhd_lerobot.options.declared import Options
 
 
@@ -264,10 +264,9 @@ def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: st
     index = {name: column for column, name in enumerate(names)}
     missing = [name for name in wanted if name not in index]
     if missing:
-        shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
         whose = "task or scene does not report" if what == "environment" else "robot does not have"
         raise ConfigError(
-            f"The brain {who!r} needs the {what} feature(s) {shown}, which this {whose}. "
+            f"The brain {who!r} needs the {what} feature(s) {brief(missing, 3)}, which this {whose}. "
             f"There is: {', '.join(names[:8]) or 'nothing'}{', …' if len(names) > 8 else ''}."
         )
     return np.array([index[name] for name in wanted], np.intp)

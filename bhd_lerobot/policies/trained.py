@@ -11,7 +11,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, brief
 from bhd_lerobot.options.declared import check_options
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
@@ -129,8 +129,7 @@ def _matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int
     """Return the columns of `observation.state` whose names match a pattern."""
     for pattern in patterns:
         if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
-            some = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {some}.")
+            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {brief(names, _SHOWN)}.")
     return [i for i, name in enumerate(names) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
 
 

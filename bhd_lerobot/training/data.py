@@ -15,7 +15,7 @@ from bhd_lerobot.datasets.loader.loader import Loader, check, expert_stats, imag
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import DatasetError, quoted
+from bhd_lerobot.errors import DatasetError, brief, quoted
 from bhd_lerobot.stock import ImageTransforms, LeRobotDatasetMetadata, resolve_delta_timestamps
 from bhd_lerobot.training.config import BhdTrainConfig
 
@@ -161,9 +161,8 @@ def _of_constants(dataset: Any, policy: PreTrainedConfig, key: str, name: str) -
         return ""  # ours give such an input no influence
     if policy.normalization_mapping.get(feature.type.value) in _OWN_SCALE or not (names := constant(dataset, key)):
         return ""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return (
-        f"warning: {', '.join(names[:_SHOWN])}{more} of {key} never changes in the data. A {policy.type!r} divides by "
+        f"warning: {brief(names, _SHOWN)} of {key} never changes in the data. A {policy.type!r} divides by "
         "how much it changes: where the robot is off by a little there, its actions mean nothing. Record data in which "
         "it changes, or without it."
     )

@@ -17,7 +17,7 @@ from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 
 from bhd_lerobot.datasets.loader.loader import Batch, Loader
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError, brief
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
 from bhd_lerobot.policies.learned.policy import check_statistics
@@ -192,10 +192,9 @@ def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
     unknown = [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in trained)]
     if unknown or not patterns:
         names = list(trained)
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         raise ConfigError(
             f"fine_tune_parameters is {list(patterns)}; {repr(unknown[0]) if unknown else 'it'} matches no "
-            f"parameter of the policy, which has {', '.join(names[:_NAMED])}{more}. Give names, or ['*'] for all."
+            f"parameter of the policy, which has {brief(names, _NAMED)}. Give names, or ['*'] for all."
         )
     for name, one in trained.items():
         one.requires_grad_(any(fnmatchcase(name, pattern) for pattern in patterns))

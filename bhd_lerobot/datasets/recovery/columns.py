@@ -12,8 +12,7 @@ from bhd_lerobot.datasets.format import info as meta_info
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import UNREADABLE
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import brief
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, brief
 
 _IMAGES = ("video", "image")
 _NO_STATISTICS = ("string", "language", *_IMAGES)  # of images there may be some

@@ -13,7 +13,8 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.videos import FoundEpisode
-from bhd_lerobot.datasets.validate.findings import Findings, brief
+from bhd_lerobot.datasets.validate.findings import Findings
+from bhd_lerobot.errors import brief
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 RECOVERED = "recovered"

@@ -34,8 +34,15 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity, brief
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError, counted
+from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
+from bhd_lerobot.errors import (
+    DatasetCorruptError,
+    DatasetError,
+    DatasetLockedError,
+    UnsupportedDatasetError,
+    brief,
+    counted,
+)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.datasets.remote.errors import require_token, transfer_errors
-from bhd_lerobot.datasets.remote.listing import RemoteFile, listed
+from bhd_lerobot.datasets.remote.listing import RemoteFile
 from bhd_lerobot.datasets.remote.place import check_repo_id
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import TransferError
+from bhd_lerobot.errors import TransferError, brief
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -127,8 +127,9 @@ class HubDataset:
         self._api.preupload_lfs_files(additions=additions, free_memory=False, **place)
         if ignored := [addition.path_in_repo for addition in additions if getattr(addition, "_should_ignore", False)]:
             raise TransferError(
-                f"Could not upload the dataset to {self.name}: the repository's .gitignore names {listed(ignored)}, "
-                "and the Hub would leave them out. Change that file there; nothing was changed."
+                f"Could not upload the dataset to {self.name}: the repository's .gitignore names "
+                f"{brief(sorted(ignored))}, and the Hub would leave them out. Change that file there; "
+                "nothing was changed."
             )
         check()
         removals = [CommitOperationDelete(path) for path in deleted]

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,13 +53,6 @@ def is_recorded(path: str) -> bool:
 def megabytes(size: int) -> str:
     """Return a number of bytes as text."""
     return f"{size / 1e6:.1f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
-
-
-def listed(names: Iterable[str], at_most: int = 3) -> str:
-    """Return some names as text, and how many more there are."""
-    names = sorted(names)
-    more = f" and {len(names) - at_most} more" if len(names) > at_most else ""
-    return f"{', '.join(names[:at_most])}{more}"
 
 
 def parse_info(content: bytes | None, place: str) -> dict[str, Any]:

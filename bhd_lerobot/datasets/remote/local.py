@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bhd_lerobot.datasets.format.state import DatasetState, load_state
-from bhd_lerobot.datasets.remote.listing import SUBSET, is_recorded, listed
+from bhd_lerobot.datasets.remote.listing import SUBSET, is_recorded
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.datasets.storage.pointers import check_fetched
-from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
+from bhd_lerobot.errors import DatasetError, DatasetLockedError, brief, quoted
 
 _SKIPPED = {SUBSET, layout.UNREPORTED}
 
@@ -34,8 +34,8 @@ class LocalDataset:
         now = _stamps(self.root)
         if changed := {name for name in now | self._stamps if now.get(name) != self._stamps.get(name)}:
             raise DatasetError(
-                f"{self.root} was changed by another program while it was being copied: {listed(changed)}. What was "
-                "sent is not shown to anybody. Wait until the other program ends."
+                f"{self.root} was changed by another program while it was being copied: {brief(sorted(changed))}. What "
+                "was sent is not shown to anybody. Wait until the other program ends."
             )
 
 
@@ -68,8 +68,8 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
             raise DatasetError(f"{root} is not finalised: {reason}. Run bhd-data repair {quoted(root)}.")
         if unseen := sorted(state.files() - stamps.keys()):
             raise DatasetError(
-                f"{root}: {listed(unseen)} lie behind a link to a folder, which is not followed. Copy the dataset "
-                "with `cp -rL`, and take the copy."
+                f"{root}: {brief(sorted(unseen))} lie behind a link to a folder, which is not followed. Copy the "
+                "dataset with `cp -rL`, and take the copy."
             )
         left_out = sorted(name for name in stamps if is_recorded(name) and name not in state.files())
         names = sorted(stamps.keys() - {*left_out, *_SKIPPED})

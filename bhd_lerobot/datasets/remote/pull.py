@@ -20,7 +20,6 @@ from bhd_lerobot.datasets.remote.listing import (
     SUBSET,
     RemoteFile,
     is_recorded,
-    listed,
     matching,
     megabytes,
     parse_info,
@@ -38,7 +37,7 @@ from bhd_lerobot.datasets.storage.atomic import (
 )
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.storage.places import wrong_path
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetExistsError, TransferError, quoted
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetExistsError, TransferError, brief, quoted
 
 type Select = Callable[[Path], Sequence[int]]
 """Chooses episodes, given a folder that holds the metadata of the dataset."""
@@ -153,8 +152,8 @@ class _Pull:
         changed = (present.keys() - self._same) | (layout.recorded_files(self._root) - self._there.keys())
         if changed and not replace:
             raise DatasetExistsError(
-                f"{self._root} holds another dataset, or was changed since it was pulled: {listed(changed)}. Choose "
-                "another folder with --root, or replace it with --replace."
+                f"{self._root} holds another dataset, or was changed since it was pulled: {brief(sorted(changed))}. "
+                "Choose another folder with --root, or replace it with --replace."
             )
         self._is_given_up = bool(changed)
 
@@ -176,7 +175,7 @@ class _Pull:
         self._remote.fetch(sorted(missing), folder)
         # Not hashed again, which takes as long as a fast download: TLS and Xet check the content on its way.
         if wrong := [path for path in missing if (folder / path).stat().st_size != there[path].size]:
-            raise TransferError(f"Could not download {self._remote.name}: {listed(wrong)} did not arrive whole.")
+            raise TransferError(f"Could not download {self._remote.name}: {brief(sorted(wrong))} did not arrive whole.")
         self._fetched |= missing
 
     def _wanted(self, select: Select) -> tuple[list[int], set[str]]:
@@ -196,7 +195,7 @@ class _Pull:
             chosen |= {episode for episode in _episodes_before(self._root) if 0 <= episode < state.num_episodes}
         files = state.files(sorted(chosen))
         if lost := files - self._there.keys():
-            raise DatasetError(f"{name} is incomplete: {listed(lost)} are missing there.")
+            raise DatasetError(f"{name} is incomplete: {brief(sorted(lost))} are missing there.")
         return sorted(chosen), files
 
     def _publish(self, wanted: set[str], note: bytes | None) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 from bhd_lerobot.datasets.remote.errors import transfer_errors
 from bhd_lerobot.datasets.remote.hub import HubDataset
-from bhd_lerobot.datasets.remote.listing import RemoteFile, listed
+from bhd_lerobot.datasets.remote.listing import RemoteFile
 from bhd_lerobot.datasets.remote.place import LOCAL, open_url, shown
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import ConfigError, TransferError
+from bhd_lerobot.errors import ConfigError, TransferError, brief
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
@@ -55,7 +55,7 @@ class StoreDataset:
             self._fs.get([self._at(path) for path in paths], [str(folder / path) for path in paths])
         now = self._list()
         if changed := [path for path in paths if now.get(path) != self._versions[path]]:
-            raise TransferError(f"{self.name} was changed while it was read: {listed(changed)}. Pull it again.")
+            raise TransferError(f"{self.name} was changed while it was read: {brief(sorted(changed))}. Pull it again.")
 
     def send(self, files: Mapping[str, Path], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Remove `meta/info.json`, write files and remove others, and write `meta/info.json` when all are there."""
@@ -67,7 +67,7 @@ class StoreDataset:
             check()
             there = self.files()
             if lost := [path for path, file in others.items() if path not in there or not there[path].matches(file)]:
-                raise TransferError(f"{self.name} lacks files that were sent: {listed(lost)}.")
+                raise TransferError(f"{self.name} lacks files that were sent: {brief(sorted(lost))}.")
             self._put({layout.INFO: files[layout.INFO]})
 
     def _list(self) -> dict[str, dict[str, Any]]:

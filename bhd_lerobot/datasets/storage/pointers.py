@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, brief
 
 _KINDS = {b"version https://git-lfs.github.com/spec/": "git lfs pull", b"/annex/objects/": "git annex get ."}
 _LONGEST = 1024  # bytes of a pointer
@@ -30,10 +30,9 @@ def not_fetched(root: Path, paths: Iterable[Path]) -> NotFetchedError | None:
     if not commands:
         return None
     names = [path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path) for path in commands]
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     what = "is a pointer" if len(names) == 1 else "are pointers"
     return NotFetchedError(
-        f"{', '.join(names[:3])}{more} in {root} {what} of Git, in the place of a file that was not fetched. Run "
+        f"{brief(names, 3)} in {root} {what} of Git, in the place of a file that was not fetched. Run "
         f"`{' and '.join(sorted(set(commands.values())))}` in that folder. Nothing was changed."
     )
 

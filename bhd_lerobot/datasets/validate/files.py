@@ -30,10 +30,10 @@ from bhd_lerobot.datasets.format.state import (
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, is_decided
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import FIX, Findings, brief, one_line
+from bhd_lerobot.datasets.validate.findings import FIX, Findings, one_line
 from bhd_lerobot.datasets.validate.order import SORTS, check_order
 from bhd_lerobot.datasets.validate.statistics import UNREAD
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, brief
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
 RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."

@@ -1,6 +1,6 @@
 """What a check or a repair of a dataset finds."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -68,13 +68,6 @@ class Findings:
     def note(self, check: str, where: str, what: str) -> None:
         """Add a note."""
         self.items.append(Finding(Severity.NOTE, check, where, what))
-
-
-def brief(values: Iterable[Any], shown: int = 6) -> str:
-    """Return the first few of some values, and how many more there are."""
-    texts = [str(value) for value in values]
-    more = len(texts) - shown
-    return ", ".join(texts[:shown]) + (f" and {more} more" if more > 0 else "")
 
 
 def name_of(feature: Mapping[str, Any], element: int) -> str:

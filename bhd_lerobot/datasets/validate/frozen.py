@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.validate.findings import Findings, brief, name_of
+from bhd_lerobot.datasets.validate.findings import Findings, name_of
+from bhd_lerobot.errors import brief
 
 _SHORTEST = 10  # frames; in fewer, a number may well stand still
 _SHOWN = 3  # episodes that are named one by one

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format.columns import instructions_of, numbers_of, order_of, wrong_number, wrong_order
 from bhd_lerobot.datasets.format.state import UNREADABLE, Row
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import FIX, Findings, brief
+from bhd_lerobot.datasets.validate.findings import FIX, Findings
+from bhd_lerobot.errors import brief
 
 _MOVE = "Move it out of the dataset."
 SORTS = f"{FIX} puts them in order."

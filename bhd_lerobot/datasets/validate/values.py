@@ -21,11 +21,12 @@ from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import Row, ordered_slots
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
-from bhd_lerobot.datasets.validate.findings import Findings, brief, name_of, one_line
+from bhd_lerobot.datasets.validate.findings import Findings, name_of, one_line
 from bhd_lerobot.datasets.validate.frozen import FrozenCheck
 from bhd_lerobot.datasets.validate.order import check_numbers
 from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_deviations, wrong_statistic
 from bhd_lerobot.datasets.validate.steps import StepCheck
+from bhd_lerobot.errors import brief
 
 Limits = Mapping[str, Mapping[str, tuple[float, float]]]
 """Feature -> name of one of its numbers -> least and largest value."""

@@ -19,7 +19,7 @@ from lerobot.utils.constants import (
 from bhd_lerobot import __version__
 from bhd_lerobot.datasets.format.features import names_of
 from bhd_lerobot.datasets.storage.disk import Disk
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, brief
 from bhd_lerobot.options.units import other_units
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE, WEIGHT_FILES, find_checkpoint
 
@@ -237,14 +237,10 @@ def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
     new = [name for name in here if name not in set(trained)]
     if missing or new:
         parts = [f"{len(trained)} there and {len(here)} here"]
-        parts += [f"only there {_few(missing)}"] * bool(missing) + [f"only here {_few(new)}"] * bool(new)
+        parts += [f"only there {brief(missing, 4)}"] * bool(missing) + [f"only here {brief(new, 4)}"] * bool(new)
         return "; ".join(parts)
     place = next(i for i, pair in enumerate(zip(trained, here, strict=False)) if pair[0] != pair[1])
     return f"the same names in another order; column {place} is {trained[place]!r} there and {here[place]!r} here"
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _size(shape: Sequence[int]) -> str:
