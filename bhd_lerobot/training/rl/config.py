@@ -79,7 +79,11 @@ class PpoConfig(Options, prefix="ppo."):
         gamma: discount of a frame.
         gae_lambda: of the generalised advantage estimate.
         clip_range: by how much an update may change an action's probability, as a share.
-        lr: learning rate of Adam; it goes to 0 over `steps`, whatever time they take.
+        ent_coef: weight of the entropy.
+        vf_coef: weight of the critic's loss.
+        max_grad_norm: largest norm of the gradient.
+        lr: learning rate of Adam.
+        lr_schedule: ``"linear"``: to 0 over `steps`, whatever time they take; ``"constant"``.
         target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
         log_std_init: logarithm of the exploration noise, in normalised actions, the same for all; the mean of the
             checkpoint's own, or 0, if not set.
@@ -91,7 +95,11 @@ class PpoConfig(Options, prefix="ppo."):
     gamma: Share = 0.99
     gae_lambda: Share = 0.95
     clip_range: Positive = 0.2
+    ent_coef: NotNegative = 0.0
+    vf_coef: NotNegative = 0.5
+    max_grad_norm: Positive = 0.5
     lr: Positive = 3e-4
+    lr_schedule: Annotated[str, OneOf(("linear", "constant"))] = "linear"
     target_kl: Positive | None = None
     log_std_init: Finite | None = None
 

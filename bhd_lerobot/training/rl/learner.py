@@ -92,7 +92,7 @@ class MlpActorCritic(ActorCriticPolicy):
 def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> PPO:
     """Return PPO on an actor."""
     options = asdict(config.ppo)
-    lr, log_std = options.pop("lr"), options.pop("log_std_init")
+    lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
     options["batch_size"] = min(options["batch_size"], options["n_steps"] * env.num_envs)
     if log_std is None:
         own = parts.actor.log_std
@@ -100,7 +100,7 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> PPO:
     learner = PPO(
         MlpActorCritic,
         env,
-        learning_rate=lambda remaining: lr * max(0.0, remaining),
+        learning_rate=lr if schedule == "constant" else lambda remaining: lr * max(0.0, remaining),
         **options,
         seed=config.seed,
         device="cpu",
