@@ -107,7 +107,7 @@ def check_option(key: str, value: Any, kind: Any) -> None:
     """Refuse the value of an option that its type does not allow; the entries of lists and mappings, too."""
     if value is None:
         return
-    for one in getattr(kind, "__metadata__", ()):
+    for one in _declared(kind):
         one.check(key, value, kind.__origin__)
     origin, inner = typing.get_origin(kind), [one for one in typing.get_args(kind) if one is not ...]
     if origin in (list, tuple) and isinstance(value, list | tuple):
@@ -126,7 +126,12 @@ def declaration_of(config_class: type, name: str) -> str:
     kinds = [declared_types(config_class)[name]]
     while kinds:
         kind = kinds.pop()
-        if given := getattr(kind, "__metadata__", ()):
+        if given := _declared(kind):
             return str(given[0])
-        kinds += typing.get_args(kind)
+        kinds += [one for one in typing.get_args(kind) if not isinstance(one, str)]
     return ""
+
+
+def _declared(kind: Any) -> list[Range | OneOf]:
+    """Return what a type declares; what a plug-in annotates it with for others is not ours."""
+    return [one for one in getattr(kind, "__metadata__", ()) if isinstance(one, Range | OneOf)]

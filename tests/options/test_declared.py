@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.environment import EnvironmentEvalConfig
-from bhd_lerobot.options.declared import OneOf, Options, Range, check_option, declared_types
+from bhd_lerobot.options.declared import OneOf, Options, Range, check_option, declaration_of, declared_types
 from bhd_lerobot.options.parse import choices_of, decode, entries_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.replay import ReplayConfig
@@ -69,6 +69,18 @@ def test_what_is_not_declared_is_refused_by_name_of_a_file_and_of_python(kind: A
             if issubclass(kind, Options) and dataclasses.MISSING not in [one[2] for one in options_of(kind)]:
                 with pytest.raises(ConfigError, match=rf"\b{kind.option_prefix}{name}\b"):
                     kind(**{name: value})
+
+
+def test_what_a_plug_in_annotates_for_others_declares_nothing() -> None:
+    @dataclasses.dataclass
+    class Own(Options, prefix="brain."):
+        speed: Annotated[float, "rad/s"] = 0.5
+        share: Annotated[float, "of all", Range("[0, 1]")] = 0.5
+
+    assert Own(speed=7.0).speed == 7.0
+    assert (declaration_of(Own, "speed"), declaration_of(Own, "share")) == ("", "from 0 to 1")
+    with pytest.raises(ConfigError, match=r"brain.share is 2"):
+        Own(share=2)
 
 
 def test_defaults_are_what_is_declared() -> None:

@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.storage.places import check_links
 from bhd_lerobot.datasets.storage.pointers import not_fetched
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, counted, quoted
 
 UNREADABLE = (OSError, pa.ArrowException, ValueError)
 """What reading a damaged Parquet file raises; texts in it that are no UTF-8 are a `ValueError`."""
@@ -238,6 +238,7 @@ def read_rows(state: DatasetState, report: Report = refuse, *, is_full: bool = F
     """
     total = state.info["total_episodes"]
     by_index: dict[int, Row] = {}
+    refused: set[Any] = set()
     described: list[int] = []
     for path in sorted((state.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
         try:
@@ -257,12 +258,15 @@ def read_rows(state: DatasetState, report: Report = refuse, *, is_full: bool = F
         for row in rows:
             index = row.get("episode_index")
             described.append(index)
+            if index is None and is_full:
+                report("schema", path, "the episode_index of a row is null")
             if index is None or (isinstance(index, int) and index >= total):
                 continue  # a save that was interrupted before it counted
             if wrong := wrong_row(row, state.video_keys):
                 if not is_reported:
                     report("schema", path, f"episode {index!r} {wrong}")
                 is_reported = True
+                refused.add(index)
             elif index in by_index:
                 report("counts", path, f"episode {index} is described twice")
             else:
@@ -272,8 +276,9 @@ def read_rows(state: DatasetState, report: Report = refuse, *, is_full: bool = F
         own, extra = column_types(file.schema_arrow)
         state.metadata_types = {**own, **state.metadata_types}
         state.extra_types = {**extra, **state.extra_types}
-    if missing := [index for index in range(total) if index not in by_index]:
-        what = f"{len(missing)} episodes are not described, {missing[0]} first; meta/info.json counts {total}"
+    if missing := [index for index in range(total) if index not in by_index and index not in refused]:
+        many = f"{counted(len(missing), 'episode')} {'is' if len(missing) == 1 else 'are'} not described"
+        what = f"{many}, {missing[0]} first; meta/info.json counts {total}"
         report("counts", state.root / "meta/episodes", what)
     state.rows = [by_index[index] for index in sorted(by_index)]
     return described
@@ -281,11 +286,14 @@ def read_rows(state: DatasetState, report: Report = refuse, *, is_full: bool = F
 
 def check_places(state: DatasetState, report: Report = refuse) -> int:
     """Check that the frames of each episode follow those of the one before; return how many frames there are."""
-    start, wrong = 0, []
+    start, following, wrong = 0, 0, []
     for row in state.rows:
         first, last = row["dataset_from_index"], row["dataset_to_index"]
+        if row["episode_index"] != following:
+            start = first  # nothing is known of the one before
+        following = row["episode_index"] + 1
         if first != start or last != first + row["length"]:
-            wrong.append((row, f"has {row['length']} frames, from {first} to {last}, and begins at {start}"))
+            wrong.append((row, f"has {row['length']} frames, from {first} to {last}; it should begin at {start}"))
         start = last
     for row, what in wrong[:3]:
         path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))

@@ -59,6 +59,8 @@ def _meaning(error: BaseException, name: str, revision: str | None) -> str:
     from huggingface_hub import constants, errors
 
     short, kind = _short(error), type(error).__name__
+    is_store = "://" in name
+    where, own = ("the store", ", and AWS_ENDPOINT_URL of your own store") if is_store else ("the Hub", "")
     meanings: list[tuple[type | bool, str]] = [  # the more special ones first
         (errors.OfflineModeIsEnabled, "HF_HUB_OFFLINE is set, so nothing may be sent or fetched. Unset it."),
         (errors.LocalTokenNotFoundError, f"no token of the Hub was found. {_LOGIN}."),
@@ -73,31 +75,35 @@ def _meaning(error: BaseException, name: str, revision: str | None) -> str:
         ),
         (httpx.TimeoutException, f"the Hub did not answer in time ({kind}). Check the connection."),
         (httpx.TransportError, f"the connection was lost ({short or kind}). Check the connection."),
+        (errors.LocalEntryNotFoundError, ""),  # of its cause: the Hub cannot be reached, or nothing may be fetched
         (
             "Credentials" in kind or "Unable to locate credentials" in short,
             f"no credentials were found ({short}). Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
         ),
         (
             "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in short,
-            f"the store cannot be reached ({short}). Check the connection, and AWS_ENDPOINT_URL of your own store.",
+            f"{where} cannot be reached ({short}). Check the connection{own}.",
         ),
         (
             isinstance(error, TimeoutError) or "Timeout" in kind,
-            f"the store did not answer in time ({short or kind}). Check the connection.",
+            f"{where} did not answer in time ({short or kind}). Check the connection.",
         ),
-        (FileNotFoundError, f"it does not exist ({short}). Check the name; a bucket must be made first."),
-        (OSError, _system(error) if isinstance(error, OSError) else ""),
+        (
+            is_store and isinstance(error, FileNotFoundError),
+            f"it does not exist ({short}). Check the name; a bucket must be made first.",
+        ),
+        (OSError, _system(error, is_store=is_store) if isinstance(error, OSError) else ""),
     ]
     return next((text for one, text in meanings if (one if isinstance(one, bool) else isinstance(error, one))), "")
 
 
-def _system(error: OSError) -> str:
+def _system(error: OSError, *, is_store: bool) -> str:
     where = error.filename2 or error.filename
     place = f" ({where})" if where else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return f"{os.strerror(error.errno)}{place}. Free some space on this disk."
     if isinstance(error, PermissionError):
-        return f"no permission ({_short(error)}). Check the key, or the permissions of this path."
+        return f"no permission ({_short(error)}). Check {'the key, or ' * is_store}the permissions of this path."
     if "Consistency check failed" in str(error):
         return "the connection was lost in the middle of a file. Check the connection."
     return ""

@@ -51,6 +51,7 @@ def open_url(url: str, storage_options: dict[str, Any] | None = None) -> tuple[A
         (protocol in _NO_PLACES, f"{protocol}:// cannot be written, listed and read by a URL alone"),
         (not path.strip("/"), "it names no folder"),
         (protocol in _BUCKETS and path.startswith("/"), "it names no bucket"),
+        (protocol in LOCAL and path.startswith("localhost/"), f"write {protocol}://{path.removeprefix('localhost')}"),
         (
             protocol in LOCAL and not path.startswith("/"),  # fsspec would take it from the working folder
             f"it is not a whole path; this folder is {protocol}://{os.path.abspath(os.path.expanduser(path))}",

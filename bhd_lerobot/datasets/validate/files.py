@@ -76,7 +76,7 @@ def read_files(root: Path, findings: Findings) -> Files:
     _read_tasks(files, findings)
     files.described = read_rows(files, report, is_full=True)
     frames = check_places(files, report)
-    if files.rows and frames != files.info["total_frames"]:
+    if files.info["total_episodes"] == len(files.rows) > 0 and frames != files.info["total_frames"]:
         what = f"it counts {files.info['total_frames']} frames; the episodes have {frames}"
         findings.error("counts", layout.INFO, what, f"{FIX} counts them.")
     if files.without_stats and not files.is_ours:

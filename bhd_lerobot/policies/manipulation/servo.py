@@ -105,6 +105,8 @@ class _ServoBrain(ConfiguredBrain):
                 f"{', '.join(robot.action_names[:3])}, …. Set --robot.action_space=tool --robot.tool_pose=true."
             )
         self._max_opening = robot.arm.gripper.max_opening
+        if (wider := getattr(self.config, "wider_m", 0.0)) > self._max_opening:
+            raise ConfigError(f"brain.wider_m is {wider}; the gripper opens by {self._max_opening} m at the most.")
         self._tool = find_columns(robot.observation_names, _TOOL, self.name, "observation")
         self._gripper = int(find_columns(robot.observation_names, [_GRIPPER], self.name, "observation")[0])
 

@@ -96,6 +96,8 @@ def test_without_network(hub: FakeHub, root: Path, tmp_path: Path, monkeypatch) 
         send(root)
     with pytest.raises(TransferError, match="cannot be reached"):
         pull(HubDataset("me/d"), tmp_path / "e")
+    with pytest.raises(DatasetError, match=r"cannot be reached.*HF_ENDPOINT"):
+        local_metadata("me/none", tmp_path / "f", revision="main")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(TransferError, match="HF_HUB_OFFLINE"):
         send(root)

@@ -39,6 +39,8 @@ def test_a_path_that_is_not_whole_is_refused_with_the_one_that_is(tmp_path: Path
             StoreDataset(url)
     with pytest.raises(ConfigError, match=f"this folder is file://{Path.home()}/d"):
         StoreDataset("file://~/d")
+    with pytest.raises(ConfigError, match="write file:///tmp/d"):
+        StoreDataset("file://localhost/tmp/d")
     assert StoreDataset(f"file://{tmp_path}/d").folder == tmp_path / "d"
 
 

@@ -15,6 +15,7 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
+from tests.cases import each_case
 from tests.datasets.foreign import edit, edit_json
 from tests.datasets.loader import support as loader_support
 from tests.datasets.support import snapshot
@@ -275,7 +276,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "mean": (stats(lambda all_: all_["action"]["mean"].reverse()), "stats", "action", "mean is not that of the data"),
     "stats of": (stats(lambda all_: all_.pop("action")), "stats", "meta/stats.json: action", "no min"),
     "frames": (info(total_frames=134), "counts", "info.json", "counts 134 frames; the episodes have 135"),
-    "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episodes are not described, 6 first"),
+    "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episode is not described, 6 first"),
     "names": (lambda root: names(root, *"abc"), "schema", "meta/info.json: action", "3 names for 2 numbers"),
     "shape": (no_shape, "schema", "meta/info.json: action", "it has the shape None"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
@@ -289,6 +290,17 @@ def test_one_name_for_several_numbers_is_valid(valid: Path, tmp_path: Path) -> N
     root = Path(shutil.copytree(valid, tmp_path / "d"))
     names(root, "actions")
     assert check_dataset(root).is_valid
+
+
+@each_case("value", [None, 0, -5])
+def test_a_row_that_cannot_be_read_is_one_finding(valid: Path, tmp_path: Path, value: int | None) -> None:
+    """What is not known of its episode is not held against the others, nor against the counts of `info.json`."""
+    root = Path(shutil.copytree(valid, tmp_path / "d"))
+    row("length", value)(root)
+    errors = [one for one in check_dataset(root).findings if one.severity == Severity.ERROR]
+    assert [one.check for one in errors if one.where != FILE] == ["schema"], errors
+    edit(episodes_file(root), lambda rows: rows["episode_index"].__setitem__(2, None))
+    assert any("episode_index of a row is null" in one.what for one in check_dataset(root).findings)
 
 
 def test_damaged_files_are_found(valid: Path, tmp_path: Path) -> None:

@@ -54,6 +54,11 @@ def tables(n: int) -> np.ndarray:
     return state.reshape(n, -1)
 
 
+def test_a_gripper_is_not_opened_wider_than_it_opens() -> None:
+    with pytest.raises(ConfigError, match=r"brain.wider_m is 0.5; the gripper opens by 0.085 m"):
+        pick(PickServoConfig(wider_m=0.5))
+
+
 def pick(config: PickServoConfig | None = None) -> PickServoBrain:
     brain = PickServoBrain(config)
     brain.bind(features(ENVIRONMENT))
