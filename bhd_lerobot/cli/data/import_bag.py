@@ -13,6 +13,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.errors import ConfigError, counted, quoted, unknown_name
 from bhd_lerobot.options.parse import read_line
 from bhd_lerobot.ros2.bag.importer.convert import ImportReport, import_bags
+from bhd_lerobot.ros2.bag.importer.exported import exported
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.sources import base_sources, mapped_sources
 from bhd_lerobot.ros2.bag.storage.find import check_distinct, find_bags
@@ -38,14 +39,14 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--repo_id", required=True, help="name of the dataset, user/name")
     command.add_argument("--root", type=Path, help="where to put it; LeRobot's default place if left out")
     command.add_argument("--task", help="the instruction, a sentence")
-    command.add_argument("--fps", type=int, default=10, help="frames a second (default: 10)")
+    command.add_argument("--fps", type=int, help="frames a second (default: 10, or those of an exported bag)")
     command.add_argument("--stamps", default="receive", help="source of timestamps: receive (default), header or auto")
     command.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
     command.add_argument(
         "--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (default: 1.0)"
     )
     command.add_argument(
-        "--min_episode_s", type=float, default=1.0, metavar="S", help="shorter episodes are left out (default: 1.0)"
+        "--min_episode_s", type=float, metavar="S", help="shorter episodes are left out (default: 1.0)"
     )
     command.add_argument("--outcome", help=f"outcome of the episodes: {', '.join(OUTCOMES)}; nothing if left out")
     real = command.add_argument_group("the robot")
@@ -84,6 +85,10 @@ def _run(options: argparse.Namespace) -> int:
     mapping = _mapping(options)
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
+    if mapping is None and options.robot is None and (found := exported(bags[0])):
+        mapping, options.robot = found.mapping, found.robot_type
+        options.task, options.fps = options.task or found.task, options.fps or found.fps
+        options.min_episode_s = options.min_episode_s or 0.0  # what was an episode is one, however short
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
     report = import_bags(bags, root, options.repo_id, _wanted(options, mapping))
@@ -105,7 +110,7 @@ def _common(options: argparse.Namespace) -> dict[str, Any]:
         raise ConfigError(unknown_name("stamps", options.stamps, _STAMPS))
     if options.outcome is not None and options.outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", options.outcome, OUTCOMES))
-    fps = options.fps
+    fps = 10 if options.fps is None else options.fps
     if fps < 1:
         raise ConfigError(f"--fps is {fps}; it must be a whole number of at least 1.")
     timeout = math.inf if options.command_timeout is None else options.command_timeout
@@ -122,8 +127,9 @@ def _common(options: argparse.Namespace) -> dict[str, Any]:
             raise ConfigError(
                 f"--{name} is {value}; it must be positive" + (f", {at_least:g} at least." if at_least else ".")
             )
-    if not 0 <= options.min_episode_s < math.inf:
-        raise ConfigError(f"--min_episode_s is {options.min_episode_s}; it must be 0 or positive.")
+    min_episode_s = 1.0 if options.min_episode_s is None else options.min_episode_s
+    if not 0 <= min_episode_s < math.inf:
+        raise ConfigError(f"--min_episode_s is {min_episode_s}; it must be 0 or positive.")
     default = turtlebot3_burger().limits.command_timeout_s
     return {
         "task": options.task,
@@ -133,7 +139,7 @@ def _common(options: argparse.Namespace) -> dict[str, Any]:
         "given": {name: getattr(options, name) for name in ("scan_frame", "scan_yaw", "odom_frame")},
         "max_age_s": max_age,
         "max_gap_s": options.max_gap,
-        "min_episode_s": options.min_episode_s,
+        "min_episode_s": min_episode_s,
         "stamps": options.stamps,
         "outcome": options.outcome,
     }

@@ -17,7 +17,7 @@ FORMAT = 2
 INTERFACES = "bhd_interfaces"
 """Package of the messages in the folder `msg`: what a brain, a cerebellum and a person send one another."""
 
-EPISODE = "bhd_msgs/msg/Episode"
+EPISODE, EPISODE_TOPIC = "bhd_msgs/msg/Episode", "/bhd/episode"
 STATE = "bhd_msgs/msg/CerebellumState"
 OUTCOME = "bhd_msgs/msg/Outcome"
 NUMBERS = "bhd_msgs/msg/Numbers"

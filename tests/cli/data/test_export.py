@@ -86,6 +86,29 @@ def arm(ur5):
     return decoded(bags / "episode_000001/episode_000001.mcap")
 
 
+def test_numbers_of_an_unknown_robot_come_back_as_they_were(tmp_path):
+    """With the names, the rate and the instruction that the bags state, and every episode, however short."""
+    plain, again = tmp_path / "plain", tmp_path / "again"
+    features = {
+        key: {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
+        for key in ("observation.state", "action")
+    }
+    with DatasetRecorder.create("t/t", 30, features, robot_type="toy", root=plain) as recorder:
+        for number in range(3):
+            writer = recorder.begin_episode()
+            frames = np.arange(20, dtype=np.float32)[:, None] * (1, 0.1) + number
+            writer.set_columns({"observation.state": np.sin(frames), "action": np.cos(frames)})
+            recorder.save(writer, task="Put it.", metadata={})
+    bags = export(plain, tmp_path / "bags")
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={again}"]) == 0
+    other = dataset_info(again)
+    assert (other.robot_type, other.fps, other.tasks) == ("toy", 30, ("Put it.",))
+    for key in ("observation.state", "action"):
+        assert other.features[key]["names"] == ["pan.pos", "lift.pos"]
+        for number in range(3):
+            assert np.array_equal(*(np.asarray(read_episode(root, number)[key]) for root in (plain, again)))
+
+
 def stamp(message):
     return message.header.stamp.sec * NANO + message.header.stamp.nanosec
 

@@ -143,7 +143,7 @@ def test_nobody_waits_for_an_encoder_that_does_not_keep_up(tmp_path: Path, monke
     assert encoder.frames == len(histograms) == count_frames(tmp_path / "a.mp4") == 60
     shown = histograms[:, 0].argmax(axis=1)
     expected = 4 * numbers
-    assert 20 < len(encoder.dropped) < 57
+    assert 20 < len(encoder.dropped) <= 57  # three fit; the first is taken at once, or not yet
     for number in encoder.dropped:
         expected[number] = expected[number - 1]
     assert shown.tolist() == expected.tolist()

@@ -43,7 +43,7 @@ STATE_COLUMNS = (
     keys.LIMITS, keys.WATCHDOG, keys.MODE,
 )  # fmt: skip
 OUTCOME_COLUMNS = (keys.REWARD, keys.SUCCESS, keys.DONE, keys.EVENT)
-EPISODE_TOPIC, STATE_TOPIC, OUTCOME_TOPIC = "/bhd/episode", "/bhd/cerebellum", "/bhd/outcome"
+STATE_TOPIC, OUTCOME_TOPIC = "/bhd/cerebellum", "/bhd/outcome"
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class EpisodeTopics:
         self._next_start = int(ended[-1]) + _PAUSE_NS
         index = np.arange(n)
         at_start, at_end = Frames(episode, index, observed), Frames(episode, index, ended)
-        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, start))], latched=True)]
+        streams = [Stream(types.EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, start))], latched=True)]
         motion = views.Motion.of(self._view, self._features, columns)
         if still := views.static_transforms(views.still_frames(self._view, motion), start):
             streams.append(Stream("/tf_static", views.TF, [(start, still[0])], latched=True))

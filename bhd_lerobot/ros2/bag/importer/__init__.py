@@ -4,6 +4,7 @@ __all__ = [
     "columns",
     "convert",
     "diagnostics",
+    "exported",
     "options",
     "resample",
     "segments",
