@@ -80,7 +80,8 @@ def test_what_is_recorded_is_what_the_robot_measured_and_was_sent(domain: int, t
                 if recording.process.wait() == 0:
                     break
                 # On a busy machine the stand-in stands still for a third of a second: to us its wheels are blocked.
-                assert "watchdog: blocked" in recording.text, recording.text
+                # Or a message comes after one that was sent later, of another clock: to us its wheels turned back.
+                assert any(one in recording.text for one in ("watchdog: blocked", "reads a change of")), recording.text
         assert recording.process.wait() == 0, recording.text
         until(lambda: robot.events("report")[-1]["command"] == [0.0, 0.0], "the robot stands")
     assert data(["check", str(recording.root)]) == 0
