@@ -29,7 +29,7 @@ def write_down(task: str, actions: np.ndarray, frames: int) -> tuple[list[Entry]
     """
     n = actions.shape[1]
     env = BhdVectorEnv(n, task, autoreset_mode="SameStep")
-    simulation = env.stage.simulation
+    simulation = env.episodes.simulation
     world, lidar = simulation.world, simulation.lidar  # type: ignore[attr-defined]
     log: list[Entry] = []
 
