@@ -85,26 +85,26 @@ def _run(options: argparse.Namespace) -> int:
     mapping = _mapping(options)
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
-    if mapping is None and options.robot is None and (found := exported(bags[0])):
-        mapping, options.robot = found.mapping, found.robot_type
-        options.task, options.fps = options.task or found.task, options.fps or found.fps
+    found = exported(bags[0]) if mapping is None and options.robot is None else None
+    if found is not None:
+        mapping, options.robot, options.fps = found.mapping, found.robot_type, options.fps or found.fps
         options.min_episode_s = options.min_episode_s or 0.0  # what was an episode is one, however short
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    report = import_bags(bags, root, options.repo_id, _wanted(options, mapping))
+    report = import_bags(bags, root, options.repo_id, _wanted(options, mapping, is_stated=found is not None))
     _print(report, bags)
     return 0
 
 
-def _wanted(options: argparse.Namespace, mapping: MappingConfig | None) -> ImportOptions:
+def _wanted(options: argparse.Namespace, mapping: MappingConfig | None, *, is_stated: bool) -> ImportOptions:
     """Return how bags are to be read: by a mapping, or by that of a TurtleBot3 with the options for its topics."""
-    common = _common(options)
+    common = _common(options, is_stated=is_stated)
     return _of_turtlebot3(options, common) if mapping is None else _of_mapping(options, mapping, common)
 
 
-def _common(options: argparse.Namespace) -> dict[str, Any]:
+def _common(options: argparse.Namespace, *, is_stated: bool) -> dict[str, Any]:
     """Return how bags are read whichever robot it is, by the names in `ImportOptions`."""
-    if not options.task:
+    if not options.task and not is_stated:
         raise ConfigError("Describe the robot's task: --task='Drive around without touching anything.'")
     if options.stamps not in _STAMPS:
         raise ConfigError(unknown_name("stamps", options.stamps, _STAMPS))
@@ -132,7 +132,8 @@ def _common(options: argparse.Namespace) -> dict[str, Any]:
         raise ConfigError(f"--min_episode_s is {min_episode_s}; it must be 0 or positive.")
     default = turtlebot3_burger().limits.command_timeout_s
     return {
-        "task": options.task,
+        "task": options.task or "",
+        "is_stated": is_stated,
         "fps": fps,
         "command_timeout_s": timeout,
         "timeouts": (math.inf, default) if options.command_timeout is None else (),

@@ -87,7 +87,7 @@ def arm(ur5):
 
 
 def test_numbers_of_an_unknown_robot_come_back_as_they_were(tmp_path):
-    """With the names, the rate and the instruction that the bags state, and every episode, however short."""
+    """With the names, rate, instructions and outcomes that the bags state, and every episode, however short."""
     plain, again = tmp_path / "plain", tmp_path / "again"
     features = {
         key: {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
@@ -98,11 +98,13 @@ def test_numbers_of_an_unknown_robot_come_back_as_they_were(tmp_path):
             writer = recorder.begin_episode()
             frames = np.arange(20, dtype=np.float32)[:, None] * (1, 0.1) + number
             writer.set_columns({"observation.state": np.sin(frames), "action": np.cos(frames)})
-            recorder.save(writer, task="Put it.", metadata={})
+            ended = {"outcome": "success" if number else "timeout", "success": bool(number)}
+            recorder.save(writer, task=f"Put {number}.", metadata=ended)
     bags = export(plain, tmp_path / "bags")
     assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={again}"]) == 0
     other = dataset_info(again)
-    assert (other.robot_type, other.fps, other.tasks) == ("toy", 30, ("Put it.",))
+    assert (other.robot_type, other.fps, other.tasks) == ("toy", 30, ("Put 0.", "Put 1.", "Put 2."))
+    assert [one.metadata["outcome"] for one in other.episodes] == ["timeout", "success", "success"]
     for key in ("observation.state", "action"):
         assert other.features[key]["names"] == ["pan.pos", "lift.pos"]
         for number in range(3):

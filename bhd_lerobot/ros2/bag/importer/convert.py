@@ -22,6 +22,7 @@ from bhd_lerobot.ros2.bag.importer.columns import (
     unanswered,
     unexplained_frames,
 )
+from bhd_lerobot.ros2.bag.importer.exported import as_stated
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
@@ -65,7 +66,7 @@ def import_bags(bags: Sequence[Bag], root: Path, repo_id: str, options: ImportOp
         _recording(folder, repo_id, options) as recording,
     ):
         for bag in bags:
-            robot_bag = _RobotBag(bag, options, recording)
+            robot_bag = _RobotBag(bag, as_stated(bag, options) if options.is_stated else options, recording)
             episodes = list(robot_bag.episodes())
             robot_bag.check_commands(episodes)
             for episode in episodes:

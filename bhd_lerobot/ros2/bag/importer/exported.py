@@ -1,22 +1,25 @@
 """Bags of robots that only their export knows: what `bhd-data export` writes down about them is their mapping."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.ros2.bag.importer.options import ImportOptions
 from bhd_lerobot.ros2.bag.storage.read import Bag
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig
 from bhd_lerobot.ros2.messages.serialize import decode
+from bhd_lerobot.tasks.task import OUTCOMES
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an exported bag states of its dataset."""
+    """What an exported bag states of its dataset, and of the episode in it; no outcome if that is not known."""
 
     robot_type: str
     task: str
+    outcome: str | None
     fps: int
     mapping: MappingConfig
 
@@ -26,7 +29,9 @@ def exported(bag: Bag) -> Exported | None:
     if types.EPISODE_TOPIC not in bag.topics or bag.topics[types.EPISODE_TOPIC].msgtype != types.EPISODE:
         return None
     try:
-        message = decode(types.EPISODE, bag.read([types.EPISODE_TOPIC])[types.EPISODE_TOPIC].data[0])
+        messages = bag.read([types.EPISODE_TOPIC])[types.EPISODE_TOPIC].data
+        message = decode(types.EPISODE, messages[0])
+        outcome = json.loads(message.metadata).get("outcome")
         topics = [one for one in json.loads(message.topics) if one["feature"] in (keys.OBSERVATION_STATE, keys.ACTION)]
         sections: dict[str, dict[str, FieldConfig]] = {keys.OBSERVATION_STATE: {}, keys.ACTION: {}}
         for one in topics:
@@ -39,5 +44,26 @@ def exported(bag: Bag) -> Exported | None:
         return None  # damaged; import names what it lacks
     if not all(sections.values()):
         return None
+    if len(messages) > 1:
+        raise ConfigError(
+            f"{bag.path} holds {len(messages)} episodes, whose instructions and outcomes may differ. Export a bag for "
+            "each, without --one_bag, or name the fields with --map."
+        )
     mapping = MappingConfig(sections[keys.OBSERVATION_STATE], sections[keys.ACTION])
-    return Exported(message.robot_type, message.task, message.fps, mapping)
+    return Exported(message.robot_type, message.task, outcome if outcome in OUTCOMES else None, message.fps, mapping)
+
+
+def as_stated(bag: Bag, options: ImportOptions) -> ImportOptions:
+    """Return the options of one of several exported bags: with the instruction and the outcome of its episode.
+
+    Raises:
+        DatasetError: it is of another robot or another rate than the first, or states nothing.
+    """
+    one = exported(bag)
+    if one is None or (one.robot_type, one.fps) != (options.robot_type, options.fps):
+        what = "states no such thing" if one is None else f"is of {one.robot_type!r} at {one.fps} fps"
+        raise DatasetError(
+            f"The first bag was exported of {options.robot_type!r} at {options.fps} fps, and {bag.path} {what}. Import "
+            "them one by one."
+        )
+    return replace(options, task=options.task or one.task, outcome=options.outcome or one.outcome)
