@@ -85,26 +85,32 @@ def _run(options: argparse.Namespace) -> int:
     mapping = _mapping(options)
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
+    stated_fps = None
     found = exported(bags[0]) if mapping is None and options.robot is None else None
     if found is not None:
-        mapping, options.robot, options.fps = found.mapping, found.robot_type, options.fps or found.fps
+        stated_fps = found.fps if options.fps is None else 0
+        mapping, options.robot, options.fps = (
+            found.mapping,
+            found.robot_type,
+            found.fps if options.fps is None else options.fps,
+        )
         options.min_episode_s = options.min_episode_s or 0.0  # what was an episode is one, however short
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    report = import_bags(bags, root, options.repo_id, _wanted(options, mapping, is_stated=found is not None))
+    report = import_bags(bags, root, options.repo_id, _wanted(options, mapping, stated_fps=stated_fps))
     _print(report, bags)
     return 0
 
 
-def _wanted(options: argparse.Namespace, mapping: MappingConfig | None, *, is_stated: bool) -> ImportOptions:
+def _wanted(options: argparse.Namespace, mapping: MappingConfig | None, *, stated_fps: int | None) -> ImportOptions:
     """Return how bags are to be read: by a mapping, or by that of a TurtleBot3 with the options for its topics."""
-    common = _common(options, is_stated=is_stated)
+    common = _common(options, stated_fps=stated_fps)
     return _of_turtlebot3(options, common) if mapping is None else _of_mapping(options, mapping, common)
 
 
-def _common(options: argparse.Namespace, *, is_stated: bool) -> dict[str, Any]:
+def _common(options: argparse.Namespace, *, stated_fps: int | None) -> dict[str, Any]:
     """Return how bags are read whichever robot it is, by the names in `ImportOptions`."""
-    if not options.task and not is_stated:
+    if not options.task and stated_fps is None:
         raise ConfigError("Describe the robot's task: --task='Drive around without touching anything.'")
     if options.stamps not in _STAMPS:
         raise ConfigError(unknown_name("stamps", options.stamps, _STAMPS))
@@ -133,7 +139,7 @@ def _common(options: argparse.Namespace, *, is_stated: bool) -> dict[str, Any]:
     default = turtlebot3_burger().limits.command_timeout_s
     return {
         "task": options.task or "",
-        "is_stated": is_stated,
+        "stated_fps": stated_fps,
         "fps": fps,
         "command_timeout_s": timeout,
         "timeouts": (math.inf, default) if options.command_timeout is None else (),

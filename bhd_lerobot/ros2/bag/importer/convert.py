@@ -66,7 +66,7 @@ def import_bags(bags: Sequence[Bag], root: Path, repo_id: str, options: ImportOp
         _recording(folder, repo_id, options) as recording,
     ):
         for bag in bags:
-            robot_bag = _RobotBag(bag, as_stated(bag, options) if options.is_stated else options, recording)
+            robot_bag = _RobotBag(bag, options if options.stated_fps is None else as_stated(bag, options), recording)
             episodes = list(robot_bag.episodes())
             robot_bag.check_commands(episodes)
             for episode in episodes:

@@ -60,10 +60,13 @@ def as_stated(bag: Bag, options: ImportOptions) -> ImportOptions:
         DatasetError: it is of another robot or another rate than the first, or states nothing.
     """
     one = exported(bag)
-    if one is None or (one.robot_type, one.fps) != (options.robot_type, options.fps):
-        what = "states no such thing" if one is None else f"is of {one.robot_type!r} at {one.fps} fps"
+    if one is None:
         raise DatasetError(
-            f"The first bag was exported of {options.robot_type!r} at {options.fps} fps, and {bag.path} {what}. Import "
-            "them one by one."
+            f"The first bag was exported from a dataset; {bag.path} was not, or is damaged. Leave it out."
+        )
+    if one.robot_type != options.robot_type or options.stated_fps not in (0, one.fps):
+        raise DatasetError(
+            f"The first bag is of {options.robot_type!r} at {options.fps} fps, and {bag.path} of {one.robot_type!r} at "
+            f"{one.fps} fps. Import them one by one; --fps sets one rate for all."
         )
     return replace(options, task=options.task or one.task, outcome=options.outcome or one.outcome)

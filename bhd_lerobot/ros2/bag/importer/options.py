@@ -22,7 +22,7 @@ class ImportOptions:
         command_timeout_s: silence after which a command is no longer in force and the robot stands.
         timeouts: those that the user chooses from where the robot moves without a command; none if one was given.
         min_episode_s: shorter episodes are left out.
-        is_stated: whether exported bags state instruction and outcome where they are not given here.
+        stated_fps: of bags that were exported, and state instruction and outcome; 0 for any rate; None of other bags.
         given: what else decides the episodes, JSON values.
     """
 
@@ -40,7 +40,7 @@ class ImportOptions:
     stamps: str = "receive"
     pose: bool = False
     outcome: str | None = None
-    is_stated: bool = False
+    stated_fps: int | None = None
     timeouts: tuple[float, ...] = ()
     given: Mapping[str, Any] = field(default_factory=dict)
 
