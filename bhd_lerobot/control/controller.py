@@ -1,6 +1,7 @@
 """What stands between a command and the actuators, for one kind of robot; the modes are the cerebellum's."""
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +9,24 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.record import LIMITS, new_states
 
 
 class Controller(ABC):
     """Turns commands into actuator commands that respect every limit, for n robots.
 
-    The cerebellum says where to head for and when to stop, and calls `run` once a tick. The arrays are the controller's
-    own and live; others only read them.
+    One that is no part of the compiled tick is a `SteppedController`. The arrays are the controller's own and live;
+    others only read them.
+
+    Args:
+        n: number of robots.
 
     Attributes:
+        states: the records of the robots, shape (n,).
+        numbers: the record of their limits, shape (1,).
+        is_compiled: whether it is a part of the compiled tick.
+        monitors: the records of the robots' collision monitors, shape (n,); a single one without beams if there are
+            none.
         width: number of values in a command.
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
@@ -40,6 +50,83 @@ class Controller(ABC):
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
+    is_compiled: ClassVar[bool] = False
+    monitors: NDArray
+
+    def __init__(self, n: int) -> None:
+        self.states, self.numbers = new_states(n), np.zeros(1, LIMITS)
+
+    @abstractmethod
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Return whether each robot is commanded to be at rest, shape (n,)."""
+
+    @abstractmethod
+    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Take the joints as they are for the start."""
+
+    def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Continue at rest from where the joints are: someone else has stopped the robots there."""
+        return
+
+    @abstractmethod
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about robots that were put somewhere else."""
+
+    def pressed(self) -> NDArray[np.float64]:
+        """Return the force with which each robot and something press on each other [N], shape (n,).
+
+        0 where it is small enough to reset and to activate the robot, and where it is not known.
+        """
+        return np.zeros(len(self.busy))
+
+    def take_limits(self) -> NDArray[np.int64]:
+        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
+        limits = self.limits.copy()
+        self.limits[:] = 0
+        return limits
+
+    @abstractmethod
+    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return the commanded efforts of the servos [N m; N for a gripper], shape (n, joints)."""
+
+    def odometry(self) -> NDArray[np.float64]:
+        """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3); shape (n, 0) for what does not drive."""
+        return np.zeros((len(self.busy), 0))
+
+    def measured(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return where the robots really are in the space of the commands, shape (n, width)."""
+        return reading.position.copy()
+
+    # --- goals: robots that take none refuse them --------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
+        """Take a goal.
+
+        Args:
+            sim: the robot.
+            command: the goal.
+            blocked: why the robot takes no goals now, or None.
+
+        Returns:
+            None if it was accepted, otherwise the refusal.
+        """
+        return CommandResult(command.task_id, False, ResultCode.BAD_TARGET, "This robot takes setpoints, not goals.")
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal; return `SUCCEEDED`, or `UNKNOWN_ID` if there is none of this name."""
+        return ResultCode.UNKNOWN_ID
+
+    def take_results(self, sim: int) -> list[CommandResult]:
+        """Return the results of one robot that were not taken yet."""
+        return []
+
+    def feedback(self, sim: int) -> Feedback | None:
+        """Return how far the goal is that one robot follows, or None."""
+        return None
+
+
+class SteppedController(Controller):
+    """A controller that the cerebellum tells where to head for and when to stop, and runs once a tick."""
 
     @abstractmethod
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
@@ -79,75 +166,7 @@ class Controller(ABC):
         """Do nothing that needs to know where some robots are: what they read now is made up. `mask` has shape (n,)."""
         return
 
-    @abstractmethod
-    def at_rest(self) -> NDArray[np.bool_]:
-        """Return whether each robot is commanded to be at rest, shape (n,)."""
-
-    @abstractmethod
-    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Take the joints as they are for the start."""
-
-    def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Continue at rest from where the joints are: someone else has stopped the robots there."""
-        return
-
-    @abstractmethod
-    def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget everything about robots that were put somewhere else."""
-
-    def pressed(self) -> NDArray[np.float64]:
-        """Return the force with which each robot and something press on each other [N], shape (n,).
-
-        0 where it is small enough to reset and to activate the robot, and where it is not known.
-        """
-        return np.zeros(len(self.busy))
-
-    def take_limits(self) -> NDArray[np.int64]:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        limits = self.limits.copy()
-        self.limits[:] = 0
-        return limits
-
-    @abstractmethod
-    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the commanded efforts of the servos [N m; N for a gripper], shape (n, joints)."""
-
     @property
     def following(self) -> NDArray[np.bool_]:
         """Whether each robot follows a goal, shape (n,)."""
         return np.zeros(len(self.busy), np.bool_)
-
-    def odometry(self) -> NDArray[np.float64]:
-        """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3); shape (n, 0) for what does not drive."""
-        return np.zeros((len(self.busy), 0))
-
-    def measured(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return where the robots really are in the space of the commands, shape (n, width)."""
-        return reading.position.copy()
-
-    # --- goals: robots that take none refuse them --------------------------------------------------------------------
-
-    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
-        """Take a goal.
-
-        Args:
-            sim: the robot.
-            command: the goal.
-            blocked: why the robot takes no goals now, or None.
-
-        Returns:
-            None if it was accepted, otherwise the refusal.
-        """
-        return CommandResult(command.task_id, False, ResultCode.BAD_TARGET, "This robot takes setpoints, not goals.")
-
-    def cancel(self, sim: int, task_id: str) -> ResultCode:
-        """Cancel a goal; return `SUCCEEDED`, or `UNKNOWN_ID` if there is none of this name."""
-        return ResultCode.UNKNOWN_ID
-
-    def take_results(self, sim: int) -> list[CommandResult]:
-        """Return the results of one robot that were not taken yet."""
-        return []
-
-    def feedback(self, sim: int) -> Feedback | None:
-        """Return how far the goal is that one robot follows, or None."""
-        return None

@@ -15,6 +15,7 @@ class EstopWord:
 
     Attributes:
         is_shared: whether other processes may press: then only a request of one that saw the press acknowledges it.
+        words: presses, what is acknowledged, and what a tick has seen, each of shape (n,).
         latched: the last presses that the cerebellum has seen, shape (n,).
 
     Args:
@@ -25,7 +26,8 @@ class EstopWord:
     def __init__(self, n: int, memory: Any = None) -> None:
         self.is_shared = memory is not None
         words = np.zeros(3 * n, np.int64) if memory is None else np.frombuffer(memory, np.int64, 3 * n)
-        self._pressed, self._acknowledged, self.latched = words.reshape(3, n)
+        self.words: NDArray[np.int64] = words.reshape(3, n)
+        self._pressed, self._acknowledged, self.latched = self.words
         self._flags = np.zeros(n, np.bool_)
 
     def press(self, ids: NDArray[np.intp] | None = None) -> None:
@@ -36,13 +38,6 @@ class EstopWord:
     def pressed(self) -> NDArray[np.bool_]:
         """Whether there is a press that was not acknowledged, shape (n,); valid until it is asked for again."""
         return np.not_equal(self._pressed, self._acknowledged, out=self._flags)
-
-    def see(self) -> NDArray[np.bool_]:
-        """Return `pressed`, and take note of those presses: `acknowledge` is about them. For the cerebellum."""
-        pressed = np.not_equal(self._pressed, self._acknowledged, out=self._flags)
-        if np.count_nonzero(pressed):
-            np.copyto(self.latched, self._pressed)
-        return pressed
 
     def acknowledge(self, mask: NDArray[np.bool_], press: int | None = None) -> None:
         """Acknowledge the presses of some robots that were seen, and no later ones. For the cerebellum.

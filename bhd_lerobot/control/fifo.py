@@ -10,206 +10,119 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.kernels import kernel
+from bhd_lerobot.control.record import NEVER, QUEUE, WAITING
 from bhd_lerobot.errors import ConfigError
 
 _MOST_READS = 100  # a writer overwrites what is being read once in a great while, and never so many times in a row
 
 
 class CommandFifo:
-    """A queue of commands for n simulations.
+    """The queues of commands of n robots, each with an end for its sender and one for its tick.
 
-    One entry holds the commands of all simulations, and a mask of those that it is for. Entries come out by due time,
-    and those of equal due time in the order in which they went in: the commands of one simulation, whose due times
-    never decrease, come out first in, first out, and none waits for another simulation's that is due later.
+    Entries come out by due time, and those of equal due time in the order in which they went in.
 
     Args:
-        n: number of simulations.
+        n: number of robots.
         width: number of values in a command.
-        capacity: number of entries; one that finds the queue full is refused.
-        buffer: memory of at least `nbytes(n, width, capacity)` bytes, zeroed before its first use; new memory if None.
+        capacity: number of entries of each; a command that finds the queue full is refused. At most 256.
+        buffer: memory of at least `nbytes(n)` bytes, zeroed before its first use; new memory if None.
+
+    Attributes:
+        queues: the queues as the tick reads them, shape (n,).
     """
 
-    def __init__(self, n: int, width: int, capacity: int = 256, buffer: Any = None) -> None:
-        if capacity < 1:
-            raise ConfigError(f"The command queue's capacity is {capacity}; it must be at least 1.")
+    def __init__(self, n: int, width: int, capacity: int = QUEUE, buffer: Any = None) -> None:
+        if not 1 <= capacity <= QUEUE:
+            raise ConfigError(f"The command queue's capacity is {capacity}; it must be from 1 to {QUEUE}.")
         self.n, self.width, self.capacity = n, width, capacity
-        if buffer is None:
-            buffer = bytearray(self.nbytes(n, width, capacity))
-        # The writer alone moves the head and the reader alone the tail. An aligned 64-bit store is atomic on every
-        # platform that CPython supports, and an entry is complete before the head that publishes it moves.
-        header = np.frombuffer(buffer, np.int64, 2)
-        self._head, self._tail = header[0:1], header[1:2]
-        entries = np.frombuffer(buffer, self._dtype(n, width), capacity, offset=16)
-        self._sequence, self._due = entries["sequence"], entries["due_ns"]
-        self._mask, self._values = entries["mask"], entries["values"]
-        # The next entry, as of a head.
-        self._seen_head = -1
-        self._next: int | None = None
-        self._next_due: int | None = None
-
-    @staticmethod
-    def _dtype(n: int, width: int) -> np.dtype:
-        return np.dtype(
-            [
-                ("sequence", np.int64),
-                ("due_ns", np.int64),
-                ("values", np.float64, (n, width)),
-                ("mask", np.bool_, (n,)),
-            ],
-            align=True,
-        )
+        self.queues = np.zeros(n, WAITING) if buffer is None else np.frombuffer(buffer, WAITING, n)
+        self._head, self._tail = self.queues["head"], self.queues["tail"]
+        self._sequence, self._due = self.queues["sequence"], self.queues["due_ns"]
+        self._waits, self._values = self.queues["waits"], self.queues["values"][:, :, :width]
+        self._all = np.arange(n)
 
     @classmethod
-    def nbytes(cls, n: int, width: int, capacity: int = 256) -> int:
+    def nbytes(cls, n: int) -> int:
         """Return the size of the memory block [bytes]."""
-        return 16 + capacity * cls._dtype(n, width).itemsize
+        return n * WAITING.itemsize
 
     def __len__(self) -> int:
-        """Return the number of entries in use: those that wait, and those between them; at most the capacity."""
-        return min(max(0, int(self._head[0]) - int(self._tail[0])), self.capacity)
+        """Return the number of entries in use of the fullest queue: those that wait, and those between them."""
+        return int(np.clip(self._head - self._tail, 0, self.capacity).max())
 
     @property
     def pushed(self) -> int:
-        """Number of entries that were ever appended."""
-        return int(self._head[0])
+        """Number of commands that were ever appended."""
+        return int(self._head.sum())
 
-    def push(self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> bool:
-        """Append an entry.
+    def push(
+        self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Append a command.
 
         Args:
             sequence: its sequence number.
             due_ns: when it is due [ns].
-            values: the commands, shape (n, width).
-            mask: the simulations it is for, shape (n,).
+            values: of each robot, shape (n, width).
+            mask: the robots that it is for, shape (n,).
 
         Returns:
-            False if the queue was full, and nothing was appended.
+            Whether it was appended for each robot, shape (n,): not where the queue was full, or `mask` is False.
         """
-        head = int(self._head[0])
-        if head - int(self._tail[0]) >= self.capacity:
-            return False
-        slot = head % self.capacity
-        self._sequence[slot], self._due[slot] = sequence, due_ns
-        self._values[slot], self._mask[slot] = values, mask
-        self._head[0] = head + 1
-        return True
+        has_room: NDArray[np.bool_] = mask & (self._head - self._tail < self.capacity)
+        ids = self._all if np.count_nonzero(has_room) == self.n else np.flatnonzero(has_room)
+        slots = self._head[ids] % QUEUE
+        self._sequence[ids, slots], self._due[ids, slots] = sequence, due_ns
+        self._values[ids, slots], self._waits[ids, slots] = values[ids], True
+        self._head[ids] += 1
+        return has_room
 
-    def next_due(self) -> int | None:
-        """Return when the next entry is due [ns], or None if nothing waits."""
-        if int(self._head[0]) != self._seen_head:
-            self._update()
-        return self._next_due
 
-    def pop(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[int, int] | None:
-        """Take the next entry.
+@kernel()
+def find_next(state: Any, queue: Any) -> None:
+    """Note when the next entry of a queue is due, and release the oldest entries that do not wait any more."""
+    head, tail = queue.head, queue.tail
+    if not 0 <= head - tail <= QUEUE:  # another process wrote garbage: the queue is emptied
+        queue.tail = tail = head
+    state.seen_head, state.next_due_ns = head, NEVER
+    is_first = True
+    for number in range(tail, head):
+        slot = number % QUEUE
+        if not queue.waits[slot]:
+            continue
+        if is_first:
+            queue.tail, is_first = number, False
+        if queue.due_ns[slot] < state.next_due_ns:
+            state.next_due_ns, state.next_entry = queue.due_ns[slot], slot
+    if is_first:
+        queue.tail = head
 
-        Args:
-            values: where the commands go, shape (n, width).
-            mask: where the mask goes, shape (n,).
 
-        Returns:
-            Sequence number and due time [ns], or None if nothing waits.
-        """
-        if self.next_due() is None or self._next is None:
-            return None
-        slot = self._next % self.capacity
-        values[:], mask[:] = self._values[slot], self._mask[slot]
-        result = int(self._sequence[slot]), int(self._due[slot])
-        self._mask[slot] = False
-        if self._next == int(self._tail[0]) == self._seen_head - 1:  # the only one, as nearly always
-            self._tail[0] = self._seen_head
-            self._next, self._next_due = None, None
-        else:
-            self._update()
-        return result
+@kernel()
+def drop(state: Any, queue: Any, lowest: int, highest: int) -> int:
+    """Drop what waits and has a sequence number in a range; return how many that were."""
+    dropped, head = 0, queue.head
+    for number in range(max(queue.tail, head - QUEUE), head):
+        slot = number % QUEUE
+        if queue.waits[slot] and lowest <= queue.sequence[slot] <= highest:
+            queue.waits[slot] = False
+            dropped += 1
+    find_next(state, queue)
+    return dropped
 
-    def drop(self, ids: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Drop what waits for some simulations, and return how many commands of each that were. For the reader."""
-        dropped = np.zeros(len(ids), np.int64)
-        for slot in self._slots():
-            dropped += self._mask[slot, ids]
-            self._mask[slot, ids] = False
-        self._update()
-        return dropped
 
-    def drop_outside(self, lowest: NDArray[np.int64], highest: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Drop commands whose sequence numbers are out of range; return how many of each simulation. For the reader.
-
-        Args:
-            lowest: the smallest that stay, shape (n,).
-            highest: the largest that stay, shape (n,).
-        """
-        slots = self._slots()
-        sequence = self._sequence[slots][:, None]
-        outside = self._mask[slots] & ((sequence < lowest) | (sequence > highest))
-        self._mask[slots] &= ~outside
-        self._update()
-        return np.asarray(outside.sum(axis=0))
-
-    def drop_older(self, sequence: int, mask: NDArray[np.bool_]) -> None:
-        """Drop what was sent to some simulations before a sequence number and still waits. For the reader.
-
-        Args:
-            sequence: the sequence number.
-            mask: the simulations, shape (n,).
-        """
-        if int(self._tail[0]) == int(self._head[0]):
-            return
-        slots = self._slots()
-        older = slots[self._sequence[slots] < sequence]
-        if len(older):
-            self._mask[np.ix_(older, np.flatnonzero(mask))] = False
-            self._update()
-
-    def keep_newest(self, now_ns: int) -> None:
-        """Drop every command that is due and that a later one, which is due too, takes the place of. For the reader.
-
-        Args:
-            now_ns: what is due by then is due [ns].
-        """
-        slots = self._slots()
-        due = slots[self._due[slots] <= now_ns]
-        # From the newest to the oldest: which simulations have had a newer one.
-        newer = np.logical_or.accumulate(self._mask[due][::-1], axis=0)[::-1]
-        self._mask[due[:-1]] &= ~newer[1:]
-        self._update()
-
-    def _slots(self) -> NDArray[np.intp]:
-        """Return where the entries in use lie, the oldest first."""
-        tail, head = self._ends()
-        return np.arange(tail, head) % self.capacity
-
-    def _ends(self) -> tuple[int, int]:
-        """Return tail and head; a queue that cannot be, because another process wrote garbage, is emptied."""
-        tail, head = int(self._tail[0]), int(self._head[0])
-        if not 0 <= head - tail <= self.capacity:
-            self._tail[0] = tail = head
-        return tail, head
-
-    def _update(self) -> None:
-        """Find the next entry, and release the oldest entries that are for no simulation any more."""
-        tail, head = self._ends()
-        self._seen_head = head
-        self._next, self._next_due = None, None
-        if tail == head:
-            return
-        if tail == head - 1:
-            slot = tail % self.capacity
-            if np.count_nonzero(self._mask[slot]):
-                self._next, self._next_due = tail, int(self._due[slot])
-            else:
-                self._tail[0] = head
-            return
-        # All at once: a chunk of actions is a hundred entries, and this runs within a tick.
-        slots = np.arange(tail, head) % self.capacity
-        waiting = np.flatnonzero(self._mask[slots].any(axis=1))
-        if not len(waiting):
-            self._tail[0] = head
-            return
-        first = int(self._due[slots[waiting]].argmin())  # of equal ones the first
-        self._next = tail + int(waiting[first])
-        self._next_due = int(self._due[slots[waiting[first]]])
-        self._tail[0] = tail + int(waiting[0])
+@kernel()
+def keep_newest(state: Any, queue: Any, now_ns: int) -> None:
+    """Drop every entry that is due and that a later one, which is due too, takes the place of."""
+    newest, head = -1, queue.head
+    for number in range(max(queue.tail, head - QUEUE), head):
+        slot = number % QUEUE
+        if queue.waits[slot] and queue.due_ns[slot] <= now_ns:
+            if newest >= 0:
+                queue.waits[newest] = False
+            newest = slot
+    find_next(state, queue)
 
 
 class StateRing:

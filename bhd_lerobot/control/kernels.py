@@ -17,20 +17,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 _values: float = 40_000  # that a loop handles in Python, until it is compiled
+_RECORD_VALUES = 8  # that a record counts for
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
 _CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
 
 
-class Kernel[**P, R]:
-    """A function of numbers and arrays; other kernels may call it.
+RECORDS: dict[str, np.dtype[Any]] = {}
+"""Structured types that signatures name."""
 
-    Called as it is, it runs as plain Python.
+
+def record(name: str, fields: list[Any]) -> np.dtype[Any]:
+    """Return a structured type for arrays of records, which signatures name; aligned, so that a field is one store."""
+    RECORDS[name] = np.dtype(fields, align=True)
+    return RECORDS[name]
+
+
+class Kernel[**P, R]:
+    """A function of numbers, arrays and records; other kernels may call it.
+
+    Called as it is, it runs as plain Python. An array of records is a list of objects then, see `as_objects`.
 
     Args:
         function: the function.
-        signature: the types of its arguments, in numba's words; empty for what only other kernels call.
+        signature: the types of its arguments, in numba's words and those of `RECORDS`; empty for what only other
+            kernels call.
     """
 
     def __init__(self, function: Callable[P, R], signature: str) -> None:
@@ -52,10 +65,13 @@ class Kernel[**P, R]:
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        names = {name: numba.from_dtype(dtype) for name, dtype in RECORDS.items()}
+        signature = eval(self.signature, {}, {**vars(numba.types), **names})  # as numba does
+        options = {"error_model": "numpy", "nogil": True}
         try:
-            return numba.njit(self.signature, error_model="numpy", cache=folder is not None)(self.function)
+            return numba.njit(signature, cache=folder is not None, **options)(self.function)
         except Exception:  # a full disk, or a damaged file: compiled at every start
-            return numba.njit(self.signature, error_model="numpy")(self.function)
+            return numba.njit(signature, **options)(self.function)
         finally:
             config.CACHE_DIR = before
 
@@ -65,24 +81,25 @@ class Kernel[**P, R]:
         It is compiled once it has handled `_values` values of its very first argument.
         """
         self._check(0, bound)
-        if not _values or "compiled" in vars(self):  # by another one
+        if not _values or (_values < math.inf and "compiled" in vars(self)):  # by another one
             return partial(self.compiled, *bound)
         left, is_checked = _values, False
         python: Callable[..., R] = self.function
         machine: Callable[..., R] | None = None
+        plain = [as_objects(value) for value in bound]
 
         def call(*arguments: Any) -> R:
             nonlocal left, is_checked, machine
             if machine is not None:
                 return machine(*arguments)
-            left -= (bound[0] if bound else arguments[0]).size
+            left -= _work(bound[0] if bound else arguments[0])
             if left < 0:
                 machine = partial(self.compiled, *bound)
                 return machine(*arguments)
             if not is_checked:
                 self._check(len(bound), arguments)
                 is_checked = True
-            return python(*bound, *arguments)
+            return python(*plain, *arguments)
 
         return call
 
@@ -90,7 +107,9 @@ class Kernel[**P, R]:
     def arrays(self) -> list[tuple[np.dtype[Any], int, bool] | None]:
         """Type, dimensions and whether it must be C-contiguous of each argument; None for a number."""
         kinds = re.findall(r"(\w+)(\[[^\]]*\])?", self.signature.partition("(")[2])
-        return [(np.dtype(name), shape.count(",") + 1, "::1" in shape) if shape else None for name, shape in kinds]
+        types = [RECORDS[name] if name in RECORDS else np.dtype(name) if shape else None for name, shape in kinds]
+        shapes = [(shape.count(",") + 1, "::1" in shape) for _, shape in kinds]
+        return [None if kind is None else (kind, *shape) for kind, shape in zip(types, shapes, strict=True)]
 
     def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
         """Refuse what the machine code would refuse."""
@@ -108,6 +127,44 @@ class Kernel[**P, R]:
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
+
+
+def _work(array: NDArray) -> int:
+    """Return how many values a loop handles; a record stands for many."""
+    return array.size * _RECORD_VALUES if array.dtype.names else array.size
+
+
+def as_objects(array: Any) -> Any:
+    """Return an array of records as a list of objects with their fields, as plain Python reads them; others as it is.
+
+    A number is a number, and an array a view.
+    """
+    if not (isinstance(array, np.ndarray) and array.dtype.names):
+        return array
+    kind = _object_type(array.dtype)
+    return [kind(array[row : row + 1]) for row in range(len(array))]
+
+
+@cache
+def _object_type(dtype: np.dtype[Any]) -> Callable[[NDArray], Any]:
+    fields = {name: kind for name, (kind, *_) in (dtype.fields or {}).items()}
+    numbers = [name for name, kind in fields.items() if not kind.shape]
+
+    def __init__(self: Any, row: NDArray) -> None:
+        for name in numbers:
+            setattr(self, f"_{name}", row[name])
+        for name in fields.keys() - set(numbers):
+            setattr(self, name, row[name][0])
+
+    def number(name: str) -> property:
+        def write(self: Any, value: Any) -> None:
+            getattr(self, f"_{name}")[0] = value
+
+        return property(lambda self: getattr(self, f"_{name}").item(), write)
+
+    slots = [f"_{name}" if name in numbers else name for name in fields]
+    body = {"__slots__": slots, "__init__": __init__, **{name: number(name) for name in numbers}}
+    return type("Record", (), body)
 
 
 def compile_at_once() -> None:

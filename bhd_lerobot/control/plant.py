@@ -7,6 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.record import new_states
+
 
 class SafetyStatus(IntEnum):
     """What a robot's own safety functions say of it."""
@@ -28,6 +30,7 @@ class PlantReading:
         n: number of robots.
         joints: number of joints.
         sensors: number of further values that the plant measures, such as the ranges of a scan.
+        states: records whose fields it fills, shape (n,); new ones if None.
 
     Attributes:
         position: joint angles [rad], a gripper's opening [m], shape (n, joints).
@@ -43,15 +46,14 @@ class PlantReading:
         sensors_ns: when the oldest of these was measured, as `stamp_ns` [ns], shape (n,).
     """
 
-    def __init__(self, n: int, joints: int, sensors: int = 0) -> None:
-        # One block, so that a single sum checks that every number in it is finite.
-        self.values = np.zeros((3, n, joints))
-        self.position: NDArray[np.float64] = self.values[0]
-        self.velocity: NDArray[np.float64] = self.values[1]
-        self.effort: NDArray[np.float64] = self.values[2]
+    def __init__(self, n: int, joints: int, sensors: int = 0, states: NDArray | None = None) -> None:
+        states = new_states(n) if states is None else states
+        self.position: NDArray[np.float64] = states["position"][:, :joints]
+        self.velocity: NDArray[np.float64] = states["velocity"][:, :joints]
+        self.effort: NDArray[np.float64] = states["effort"][:, :joints]
         self.has_effort = False
         self.stamp_ns: NDArray[np.int64] | None = None
-        self.safety = np.zeros(n, np.int8)
+        self.safety: NDArray[np.int8] = states["safety"]
         self.sensors = np.zeros((n, sensors))
         self.sensors_ns = np.zeros(n, np.int64)
 

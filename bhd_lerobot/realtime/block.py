@@ -100,7 +100,7 @@ class LiveLayout:
         """
         sections = {
             "words": 8 * WORDS,
-            "fifo": CommandFifo.nbytes(1, self.width, self.fifo_capacity),
+            "fifo": CommandFifo.nbytes(1),
             "ring": StateRing.nbytes(self.state, self.ring_capacity),
             "scenes": StateRing.nbytes(_SCENE, 2),
             **self.extra,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive, LidarSpec, without_jerk_limits
 from bhd_lerobot.bodies.truth import BaseTruth
-from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
+from bhd_lerobot.control.base.collision_monitor import new_monitors
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import NANOSECONDS
@@ -44,12 +44,12 @@ class BaseHost(Host):
         body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
         drive, lidar = body.need(Drive), body.need(LidarSpec)
         self.plant = plant
-        monitor = None
+        monitors = None
         if config.collision_monitor:
-            monitor = CollisionMonitor(drive, lidar, plant.n, config.control_hz, config.beams)
+            monitors = new_monitors(drive, lidar, plant.n, config.control_hz, config.beams)
         gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
         self._controller = BaseController(
-            drive, plant.n, config.control_hz, monitor=monitor, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
+            drive, plant.n, config.control_hz, monitors=monitors, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
         )
         super().__init__(
             config,
@@ -66,10 +66,9 @@ class BaseHost(Host):
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
         reading, beams = self.cerebellum.reading, self.config.beams
-        drive = self._controller.drive
-        parts = [drive.twist_from_wheels(reading.velocity), reading.sensors[:, :beams]]
+        parts = [self._controller.measured(reading), reading.sensors[:, :beams]]
         if self.config.odometry:
-            parts.append(drive.odometry_at(reading.position))
+            parts.append(self._controller.odometry_at(reading.position))
         if self.config.imu:
             parts.append(reading.sensors[:, beams:])
         age = np.zeros(self.n, np.int64)
@@ -88,7 +87,7 @@ class BaseHost(Host):
     def show(self, state: Any) -> None:
         """Take over what the process of a robot on the wall clock published, a record of `state_dtype`."""
         super().show(state)
-        self._controller.drive.odometry[:] = state["odometry"]
+        self.cerebellum.states["odometry"] = state["odometry"]
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Take over where in their arenas the bases start: a person has put them there."""

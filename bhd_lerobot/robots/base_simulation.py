@@ -106,10 +106,9 @@ class BaseSimulation(BaseHost, Simulation):
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
         self.plant.read(self._reading)
-        drive = self._controller.drive
-        parts = [drive.twist_from_wheels(self._reading.velocity), self.lidar.ranges]
+        parts = [self._controller.measured(self._reading), self.lidar.ranges]
         if self.config.odometry:
-            parts.append(drive.odometry_at(self._reading.position))
+            parts.append(self._controller.odometry_at(self._reading.position))
         if self.config.imu:
             parts.append(self._gyro)
         return np.concatenate(parts, axis=1), self._scanned_tick

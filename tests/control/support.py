@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.base.diff_drive import wheels_from_twist
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
@@ -23,9 +22,8 @@ BODY = turtlebot3_burger()
 
 def wheel_speeds(twist: NDArray[np.float64], drive: Drive = BODY.drive) -> NDArray[np.float64]:
     """Return the wheel speeds of twists, shape (n, 2) [rad/s]."""
-    wheels = np.empty_like(twist)
-    wheels_from_twist(twist, 1.0 / drive.wheel_radius, drive.wheel_separation / 2 / drive.wheel_radius, wheels)
-    return wheels
+    straight, turn = twist[:, :1] / drive.wheel_radius, twist[:, 1:] * drive.wheel_separation / 2 / drive.wheel_radius
+    return straight + turn * (-1.0, 1.0)
 
 
 class PerfectPlant(Plant):
@@ -118,7 +116,7 @@ def push_commands(path: Path, count: int) -> None:
     for number in range(count):
         values = np.full((3, 2), float(number))
         mask = np.array([True, number % 2 == 0, number % 3 == 0])
-        while not fifo.push(number, number, values, mask):
+        while (mask := mask & ~fifo.push(number, number, values, mask)).any():
             pass
 
 

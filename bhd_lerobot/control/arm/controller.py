@@ -12,7 +12,7 @@ from bhd_lerobot.control.arm.held import HeldObjects
 from bhd_lerobot.control.arm.relief import ContactRelief, Sensed
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.controller import SteppedController
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.guard import WireLimits
@@ -44,7 +44,7 @@ _DEAF = "The arm has not moved since it was activated: it takes no commands, its
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
-@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
+@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[:,:], f8[:,:])")
 def lead_commands(  # noqa: PLR0917
     reference: Array,
     speed: Array,
@@ -69,7 +69,7 @@ def lead_commands(  # noqa: PLR0917
     return any_limited
 
 
-class ArmController(Controller):
+class ArmController(SteppedController):
     """Joint positions and the gripper's opening, from setpoints or from goals.
 
     A command is the position of each joint [rad] and the gripper's opening [m]. What goes to the servos is the
@@ -86,6 +86,7 @@ class ArmController(Controller):
     """
 
     def __init__(self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
+        super().__init__(n)
         arm, limits = body.need(Arm), body.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)

@@ -16,7 +16,7 @@ _HIGHEST = 0.2  # [m] what is taken with the tool higher than this above the tab
 _SLACK = 0.0002  # [m] by which it may come nearer to the table than when it was taken: it can be put back
 
 
-@kernel("b1(i8[::1], f8[:,::1], b1[::1], i8, f8[:,::1], f8[:,::1], f8[:,::1])")
+@kernel("b1(i8[::1], f8[:,::1], b1[::1], i8, f8[:,:], f8[:,:], f8[:,:])")
 def follow_grippers(  # noqa: PLR0917
     ticks: NDArray[np.int64],
     where: Array,

@@ -8,7 +8,7 @@ from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
 from bhd_lerobot.control.arm.equilibrium import SPEED, TURN_SPEED, Equilibrium
 from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
-from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.controller import SteppedController
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, DynamicsTerms, product
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.guard import FULL_TORQUE_S
@@ -39,7 +39,7 @@ _ROOM_RAD = 0.1  # so far from where a brake closed does the torque that carries
 _NORM_RANGE = (0.5, 2.0)  # a quaternion with a norm beyond this is no orientation with a rounding error
 
 
-class ImpedanceController(Controller):
+class ImpedanceController(SteppedController):
     """Tool poses and the gripper's opening, held by a spring and a damper; beside them a feed-forward wrench.
 
     A command is the equilibrium: the tool's position in the base frame x, y, z [m], its orientation as a quaternion
@@ -72,6 +72,7 @@ class ImpedanceController(Controller):
     width = WIDTH
 
     def __init__(self, body: Body, n: int, control_hz: int, frame_ticks: int, max_force: float = 150.0) -> None:
+        super().__init__(n)
         arm = body.need(Arm)
         if arm.actuation != "torque":
             raise ConfigError(f"The arm {body.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")

@@ -1,3 +1,3 @@
 """The controllers of a base on wheels."""
 
-__all__ = ["collision_monitor", "controller", "diff_drive", "limits"]
+__all__ = ["collision_monitor", "controller", "drive"]

@@ -1,11 +1,15 @@
 """Keeps bases from driving into what their scans show, whatever commands them."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive, LidarSpec
+from bhd_lerobot.control.kernels import clamp, kernel, record
+from bhd_lerobot.control.messages import NANOSECONDS, Limit
+from bhd_lerobot.errors import ConfigError
 
 MARGIN = 0.02  # [m] beside the robot's outline: twice the noise of an LDS-01
 _DELAY_S = 0.03  # from a measurement to wheels that brake: two ticks and the servos' time constant, 11 ms
@@ -14,11 +18,41 @@ _DELAY_S = 0.03  # from a measurement to wheels that brake: two ticks and the se
 _SHARE = 0.5
 _NEVER = 1e-9
 _BESIDE_DEG = 3.0  # two directions that are no farther apart show the same thing
+_CLEARANCE = int(Limit.CLEARANCE)
 _OLDEST_SCANS = 3  # a scan that is older than so many periods shows nothing of the present
 
 
-class CollisionMonitor:
-    """Limits what n bases are commanded, so that each can brake before it gets to what its scan shows.
+BEAMS = 1024
+"""Most ranges of a scan."""
+_POINTS = 2 * BEAMS
+
+MONITOR = record(
+    "monitor",
+    [
+        ("beams", np.int64),  # ranges in a scan, counter-clockwise from ahead; 0 if there is no monitor
+        ("directions", np.float64, (BEAMS, 2)),
+        ("ahead", np.float64),  # [m] the lidar of the middle between the wheels
+        ("range_min", np.float64),
+        ("range_max", np.float64),
+        ("reach", np.float64),  # [m] what is farther cannot matter before the scan is too old
+        ("deceleration", np.float64),
+        ("oldest_ticks", np.int64),
+        ("beside", np.int64),  # beams to each side that show the same thing
+        ("rectangles", np.int64),
+        ("outline", np.float64, (8, 3)),
+        # What was seen: returns in the frame of the odometry [m], and whether they are nearer than can be measured.
+        ("seen_ns", np.int64),
+        ("age", np.int64),  # [ticks]
+        ("count", np.int64),
+        ("points", np.float64, (_POINTS, 2)),
+        ("is_too_near", np.int8, (_POINTS,)),
+        ("is_hidden", np.int8, (BEAMS,)),
+    ],
+)
+
+
+def new_monitors(drive: Drive, lidar: LidarSpec, n: int, control_hz: int, beams: int) -> NDArray:
+    """Return the records of what keeps n bases from driving into what their scans show, shape (n,).
 
     The speed at which a return comes nearer to the robot's outline may be no larger than what can be braked on the way
     that is left; what leads away from it is free. Yaw rates come first, because turning is what avoids an obstacle, and
@@ -35,162 +69,144 @@ class CollisionMonitor:
         n: number of bases.
         control_hz: ticks a second [Hz].
         beams: ranges in a scan, counter-clockwise from ahead.
+
+    Raises:
+        ConfigError: there are more beams, or rectangles of the outline, than a record holds.
     """
+    monitors = np.zeros(n, MONITOR)
+    if beams > BEAMS or len(drive.outline) > len(monitors["outline"][0]):
+        raise ConfigError(
+            f"The collision monitor takes up to {BEAMS} beams and an outline of 8 rectangles; the robot has {beams} "
+            f"and {len(drive.outline)}."
+        )
+    angle = 2 * np.pi * np.arange(beams) / beams
+    fastest, deceleration = drive.limits.velocity[0], _SHARE * drive.limits.stop_deceleration[0]
+    way = fastest * (_OLDEST_SCANS / lidar.rate_hz + _DELAY_S) + fastest**2 / (2 * deceleration)
+    monitors["beams"], monitors["ahead"] = beams, lidar.ahead
+    monitors["directions"][:, :beams] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    monitors["range_min"], monitors["range_max"] = lidar.range_min, lidar.range_max
+    monitors["reach"], monitors["deceleration"] = drive.radius + MARGIN + way, deceleration
+    monitors["oldest_ticks"] = round(_OLDEST_SCANS * control_hz / lidar.rate_hz)
+    monitors["beside"] = round(math.radians(_BESIDE_DEG) / (2 * np.pi) * beams)
+    monitors["rectangles"] = len(drive.outline)
+    monitors["outline"][:, : len(drive.outline)] = drive.outline
+    forget_scans(monitors, np.arange(n))
+    return monitors
 
-    def __init__(self, drive: Drive, lidar: LidarSpec, n: int, control_hz: int, beams: int) -> None:
-        self.beams = beams
-        angle = 2 * np.pi * np.arange(beams) / beams
-        self._directions, self._ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1), lidar.ahead
-        self._range_min, self._range_max = lidar.range_min, lidar.range_max
-        fastest = drive.limits.velocity[0]
-        self._deceleration = _SHARE * drive.limits.stop_deceleration[0]
-        self._largest_change = np.asarray(drive.limits.stop_deceleration) / control_hz
-        self._outline = drive.outline
-        self._oldest_ticks = round(_OLDEST_SCANS * control_hz / lidar.rate_hz)
-        way = fastest * (_OLDEST_SCANS / lidar.rate_hz + _DELAY_S) + fastest**2 / (2 * self._deceleration)
-        self._reach = drive.radius + MARGIN + way  # what is farther cannot matter before the scan is too old
-        self._near: list[NDArray[np.float64]] = [np.zeros((0, 2))] * n  # returns in the frame of the odometry [m]
-        self._too_near: list[NDArray[np.bool_]] = [np.zeros(0, np.bool_)] * n  # nearer than the lidar can measure
-        width = round(math.radians(_BESIDE_DEG) / (2 * np.pi) * beams)
-        self._beside = np.arange(-width, width + 1)
-        self._hidden: NDArray[np.bool_] = np.zeros(0, np.bool_)
-        self._points: NDArray[np.float64] = np.zeros((0, 2))
-        self._sims: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._seen_ns = np.full(n, -1, np.int64)
-        self._age = np.full(n, self._oldest_ticks + 1)  # [ticks]
 
-    def forget(self, ids: NDArray[np.intp]) -> None:
-        """Forget the scans of bases that were put somewhere else."""
-        for sim in ids:
-            self._near[sim], self._too_near[sim] = np.zeros((0, 2)), np.zeros(0, np.bool_)
-        self._seen_ns[ids] = -1
-        self._age[ids] = self._oldest_ticks + 1
+def forget_scans(monitors: NDArray, ids: NDArray[np.intp]) -> None:
+    """Forget the scans of bases that were put somewhere else."""
+    monitors["count"][ids], monitors["seen_ns"][ids] = 0, -1
+    monitors["age"][ids] = monitors["oldest_ticks"][ids] + 1
 
-    def see(
-        self,
-        ranges: NDArray[np.float64],
-        stamp_ns: NDArray[np.int64],
-        pose: NDArray[np.float64],
-        age: NDArray[np.int64] | None = None,
-    ) -> None:
-        """Take what was measured since the last tick.
 
-        Args:
-            ranges: the newest scan [m], shape (n, beams).
-            stamp_ns: when it was taken: one that is not new is not taken again, shape (n,).
-            pose: x, y [m] and yaw [rad] of the bases when it was taken, by odometry, shape (n, 3).
-            age: how many ticks ago that was, shape (n,); none if None.
-        """
-        self._age += 1
-        new = stamp_ns != self._seen_ns
-        if not np.count_nonzero(new):
-            return
-        for sim in np.flatnonzero(new):
-            old = 0 if age is None else int(age[sim])
-            # A scan that is no measurement, or from the future, is not taken: the last gets old, and the base stops.
-            if old >= -1 and np.isfinite(ranges[sim]).all():
-                self._seen_ns[sim], self._age[sim] = stamp_ns[sim], max(old, 0)
-                self._keep(sim, ranges[sim], pose[sim])
-        self._points, self._hidden = np.concatenate(self._near), np.concatenate(self._too_near)
-        self._sims = np.repeat(np.arange(len(self._near)), [len(near) for near in self._near])
+@kernel()
+def keep_clear(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stamp_ns: int) -> None:
+    """Take a new scan, and take away speed and yaw rate of the command.
 
-    def _keep(self, sim: int, scan: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
-        """Remember the near returns of a scan, and those of the last which have come too near to be measured."""
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        to_world, middle = np.array([[cos, sin], [-sin, cos]]), pose[:2]
-        hidden = scan <= self._range_min
-        near = (scan < min(self._reach + abs(self._ahead), self._range_max)) & ~hidden
-        points = [self._ahead_of(scan[near, None] * self._directions[near])]
-        unknown: NDArray[np.float64] = np.zeros((0, 2))
-        if np.count_nonzero(hidden):
-            last = self._near[sim][~self._too_near[sim]]
-            seen: NDArray[np.float64] = (last - middle) @ to_world.T - (self._ahead, 0.0)
-            beam = np.rint(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) * self.beams).astype(np.int64)
-            around = (beam[:, None] + self._beside) % self.beams
-            kept = hidden[around].any(axis=1)
-            points.append(self._ahead_of(seen[kept]))
-            hidden[around[kept]] = False
-            unknown = self._ahead_of(scan[hidden, None] * self._directions[hidden])
-        both: NDArray[np.float64] = np.concatenate([*points, unknown]) @ to_world + middle
-        self._near[sim] = both
-        self._too_near[sim] = np.arange(len(both)) >= len(both) - len(unknown)
-
-    def _ahead_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return points + np.array((self._ahead, 0.0))
-
-    def limit(
-        self, twist: NDArray[np.float64], before: NDArray[np.float64], pose: NDArray[np.float64]
-    ) -> NDArray[np.bool_] | None:
-        """Take away speed and yaw rate, in place.
-
-        Args:
-            twist: forward speeds [m/s] and yaw rates [rad/s] to be applied, shape (n, 2).
-            before: what was applied a tick ago, shape (n, 2).
-            pose: x, y [m] and yaw [rad] of the bases now, by odometry, shape (n, 3).
-
-        Returns:
-            What was limited, shape (n, 2); None if nothing was.
-        """
-        room = np.full((2, 2, len(twist)), np.inf)  # speeds, yaw rates; up, down
-        if len(self._points):
-            self._measure(twist, pose, room)
-        room[:, :, self._age > self._oldest_ticks] = 0.0
+    Args:
+        ranges: the newest scan, and more [m].
+        stamp_ns: when it was taken: one that is not new is not taken again.
+    """
+    monitor.age += 1
+    if stamp_ns != monitor.seen_ns:
+        see(state, limits, monitor, ranges, stamp_ns)
+    up, down, turn_up, turn_down = np.inf, np.inf, np.inf, np.inf
+    for number in range(monitor.count):
+        _, lever, speed = approach(state, monitor, number)
+        turn_up = min(turn_up, speed / max(lever, _NEVER))
+        turn_down = min(turn_down, speed / max(-lever, _NEVER))
+    # Turning comes first: it is what avoids an obstacle. What it leaves is for driving.
+    yaw_rate = clamp(state.command[1], -turn_down, turn_up)
+    for number in range(monitor.count):
+        ahead, lever, speed = approach(state, monitor, number)
+        speed = max(speed - lever * yaw_rate, 0.0)
+        up, down = min(up, speed / max(ahead, _NEVER)), min(down, speed / max(-ahead, _NEVER))
+    if monitor.age > monitor.oldest_ticks:
+        up = down = turn_up = turn_down = 0.0
+    for k in range(2):
         # No harder than a stop: what appears nearer than that is not avoided.
-        limited = np.minimum(twist, np.maximum(room[:, 0].T, before - self._largest_change))
-        np.maximum(limited, np.minimum(-room[:, 1].T, before + self._largest_change), out=limited)
-        changed: NDArray[np.bool_] = limited != twist
-        if not np.count_nonzero(changed):
-            return None
-        twist[:] = limited
-        return changed
+        most = max(turn_up if k else up, state.before[k] - limits.stop[k])
+        least = min(-turn_down if k else -down, state.before[k] + limits.stop[k])
+        limited = max(min(state.command[k], most), least)
+        if limited != state.command[k]:
+            state.command[k], state.limits = limited, state.limits | _CLEARANCE
+            state.rate[k] = 0.0  # the next change starts anew: such a large one could not end in time
 
-    def _measure(
-        self,
-        twist: NDArray[np.float64],
-        pose: NDArray[np.float64],
-        room: NDArray[np.float64],
-    ) -> None:
-        """Lower the largest speeds and yaw rates to what the returns leave; see `limit`.
 
-        A return whose nearest point of the outline is `normal` away comes nearer by normal[0] per metre that is driven,
-        and by `lever` per radian that is turned.
-        """
-        sims = self._sims
-        x, y, yaw = pose.T[:, sims]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        apart = self._points[:, 0] - x, self._points[:, 1] - y
-        ahead, left = apart[0] * cos + apart[1] * sin, apart[1] * cos - apart[0] * sin
-        normal, distance = self._from_outline(ahead, left)
-        lever = normal[1] * ahead - normal[0] * left
-        way = np.maximum(distance - MARGIN, 0.0)
-        way[self._hidden] = 0.0
-        # The largest v with v * delay + v^2 / (2 deceleration) = way.
-        slope = self._deceleration * _DELAY_S
-        speed = np.sqrt(slope**2 + 2.0 * self._deceleration * way) - slope
-        for up, sign in enumerate((1.0, -1.0)):
-            np.minimum.at(room[1, up], sims, speed / np.maximum(sign * lever, _NEVER))
-        # Turning comes first: it is what avoids an obstacle. What it leaves is for driving.
-        yaw_rate = np.minimum(np.maximum(twist[:, 1], -room[1, 1]), room[1, 0])[sims]
-        speed -= lever * yaw_rate
-        np.maximum(speed, 0.0, out=speed)
-        for up, sign in enumerate((1.0, -1.0)):
-            np.minimum.at(room[0, up], sims, speed / np.maximum(sign * normal[0], _NEVER))
+@kernel()
+def see(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stamp_ns: int) -> None:
+    """Remember the near returns of a scan, and those of the last which have come too near to be measured."""
+    x, y, yaw, age = state.odometry[0], state.odometry[1], state.odometry[2], 0.0
+    if limits.has_stamps:
+        age = (state.stamp_ns - stamp_ns) / NANOSECONDS
+        forward = (state.velocity[0] + state.velocity[1]) * limits.half_radius * age
+        turned = (state.velocity[1] - state.velocity[0]) * limits.turn * age
+        x -= forward * math.cos(yaw - turned / 2)
+        y -= forward * math.sin(yaw - turned / 2)
+        yaw -= turned
+    # A scan that is no measurement, or from the future, is not taken: the last gets old, and the base stops.
+    old = np.rint(age * limits.hz)  # [ticks]
+    is_taken = old >= -1.0
+    for beam in range(monitor.beams):
+        is_taken &= math.isfinite(ranges[beam])
+    if not is_taken:
+        return
+    monitor.seen_ns, monitor.age = stamp_ns, int(min(max(old, 0.0), 1e9))
+    cos, sin, beams = math.cos(yaw), math.sin(yaw), monitor.beams
+    for beam in range(beams):
+        monitor.is_hidden[beam] = ranges[beam] <= monitor.range_min
+    # Of the last, what is hidden now is kept in front of the list.
+    kept = 0
+    for number in range(monitor.count):
+        dx, dy = monitor.points[number, 0] - x, monitor.points[number, 1] - y
+        angle = math.atan2(dy * cos - dx * sin, dx * cos + dy * sin - monitor.ahead)
+        beam = int(np.rint(angle / (2 * math.pi) * beams))
+        is_kept = False
+        for one in range(beam - monitor.beside, beam + monitor.beside + 1):
+            is_kept |= ranges[one % beams] <= monitor.range_min
+        if not is_kept or monitor.is_too_near[number] or kept >= _POINTS - beams:
+            continue
+        for one in range(beam - monitor.beside, beam + monitor.beside + 1):
+            monitor.is_hidden[one % beams] = False
+        monitor.points[kept, 0], monitor.points[kept, 1] = monitor.points[number, 0], monitor.points[number, 1]
+        monitor.is_too_near[kept] = False
+        kept += 1
+    most = min(monitor.reach + abs(monitor.ahead), monitor.range_max)
+    for beam in range(beams):
+        is_unknown = monitor.is_hidden[beam]
+        if is_unknown or monitor.range_min < ranges[beam] < most:
+            ahead = ranges[beam] * monitor.directions[beam, 0] + monitor.ahead
+            left = ranges[beam] * monitor.directions[beam, 1]
+            monitor.points[kept, 0], monitor.points[kept, 1] = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+            monitor.is_too_near[kept] = is_unknown
+            kept += 1
+    monitor.count = kept
 
-    def _from_outline(
-        self, ahead: NDArray[np.float64], left: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the directions from the outline to points, shape (2, points), and their distances, shape (points,)."""
-        normal, distance = np.zeros((2, len(ahead))), np.full(len(ahead), np.inf)
-        for rear, front, half in self._outline:
-            dx = ahead - np.minimum(np.maximum(ahead, rear), front)
-            dy = left - np.minimum(np.maximum(left, -half), half)
-            apart = np.hypot(dx, dy)
-            nearer = apart < distance
-            np.copyto(distance, apart, where=nearer)
-            np.copyto(normal[0], dx, where=nearer)
-            np.copyto(normal[1], dy, where=nearer)
-        # Inside there is no direction out of it: away from the middle.
-        inside = distance < 1e-6
-        normal[:, inside] = ahead[inside], left[inside]
-        normal /= np.maximum(np.hypot(*normal), 1e-6)
-        return normal, distance
+
+@kernel()
+def approach(state: Any, monitor: Any, number: int) -> tuple[float, float, float]:
+    """Return how a return comes nearer to the outline, and how fast it may.
+
+    Returns:
+        By how much it comes nearer for each metre that is driven, and for each radian that is turned [m]; and the
+        largest speed at which it may [m/s].
+    """
+    cos, sin = math.cos(state.odometry[2]), math.sin(state.odometry[2])
+    dx, dy = monitor.points[number, 0] - state.odometry[0], monitor.points[number, 1] - state.odometry[1]
+    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+    distance, to_x, to_y = np.inf, 0.0, 0.0  # from the nearest point of the outline
+    for one in range(monitor.rectangles):
+        off_x = ahead - clamp(ahead, monitor.outline[one, 0], monitor.outline[one, 1])
+        off_y = left - clamp(left, -monitor.outline[one, 2], monitor.outline[one, 2])
+        apart = math.hypot(off_x, off_y)
+        if apart < distance:
+            distance, to_x, to_y = apart, off_x, off_y
+    if distance < 1e-6:  # inside there is no direction out of it: away from the middle
+        to_x, to_y = ahead, left
+    length = max(math.hypot(to_x, to_y), 1e-6)
+    to_x, to_y = to_x / length, to_y / length
+    way = 0.0 if monitor.is_too_near[number] else max(distance - MARGIN, 0.0)
+    # The largest v with v * delay + v^2 / (2 deceleration) = way.
+    slope = monitor.deceleration * _DELAY_S
+    return to_x, to_y * ahead - to_x * left, math.sqrt(slope**2 + 2.0 * monitor.deceleration * way) - slope

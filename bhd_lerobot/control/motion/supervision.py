@@ -58,7 +58,7 @@ class FollowingLimit:
         return self.at_rest + np.abs(velocity) * self.latency_s[:, None] if late else self.at_rest
 
 
-@kernel("b1(f8[:,::1], f8[:,::1], b1[:,::1], i8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1])")
+@kernel("b1(f8[:,::1], f8[:,::1], b1[:,::1], i8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,:], f8[:,:])")
 def follow_references(  # noqa: PLR0917
     away: Array,
     most: Array,

@@ -132,7 +132,7 @@ class LiveProcess:
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
         self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns, age_ns, self._problem)
         # A tick is for the time that it was due at. How far stamps are ahead of now is checked where they are read.
-        cerebellum.readings.oldest_ns = cerebellum.readings.ahead_ns = spec.oldest_ns
+        cerebellum.readings.accept_until(spec.oldest_ns, spec.oldest_ns)
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
@@ -179,7 +179,6 @@ class LiveProcess:
         self._reset(scene, seed)
 
     def _reset(self, scene: Any, seed: int) -> None:
-        self._block.fifo.drop(np.zeros(1, np.intp))
         if self._plant is not None:
             self._plant.prepare(self._host.cerebellum.reading)
         self._host.reset(np.zeros(1, np.intp), [scene], [seed])

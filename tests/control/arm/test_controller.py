@@ -314,7 +314,7 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     assert rig.results(1) == [("2", ResultCode.SUCCEEDED)]
     # The reference of a protective stop is where the joints are, at once; what the servos get does not jump.
     change = np.abs(np.diff(rig.plant.written, axis=0)).max(axis=(0, 1))
-    assert (change <= rig.cerebellum.guard.limits.change).all()
+    assert (change <= rig.cerebellum.numbers["change"][0, :7]).all()
     assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
 
 
@@ -379,7 +379,7 @@ def test_random_histories_have_no_jump_and_one_result_per_goal(script: list) -> 
 def test_while_nothing_is_read_a_moving_arm_is_not_blocked(silence: float) -> None:
     """The readings stand for a while, with their stamps; the arm moves on, and then reads where it is."""
     rig = Rig()
-    rig.cerebellum.readings.oldest_ns = NANOSECONDS
+    rig.cerebellum.readings.accept_until(NANOSECONDS, NANOSECONDS)
     stamp, read = np.ones(1, np.int64), rig.plant.read
     kept: list[np.ndarray] = []
 

@@ -70,7 +70,8 @@ def test_what_is_estimated_does_not_depend_on_how_many_arms_there_are() -> None:
         together.update(reading)
     for sim in range(3):
         alone, one = ForceLimit(ARM, 1, HZ, 150.0), reading_of(forces[sim : sim + 1])
-        one.values[:] = reading.values[:, sim : sim + 1]
+        for name in ("position", "velocity", "effort"):
+            getattr(one, name)[:] = getattr(reading, name)[sim : sim + 1]
         for _ in range(50):
             alone.update(one)
         assert alone.force[0] == together.force[sim]

@@ -36,7 +36,8 @@ class StuckPlant(Plant):
         self._noise = -self._noise
         self.position += self.velocity / HZ
         out.position[0], out.velocity[0], out.safety[0] = self.position, self.velocity, self.fault
-        out.values[:2, :, :6] += self._noise
+        out.position[:, :6] += self._noise
+        out.velocity[:, :6] += self._noise
 
     def write(self, ctrl: Array) -> None:
         self.written.append(ctrl[0].copy())

@@ -1,0 +1,223 @@
+"""What a tick does for a base with two driven wheels: from a twist to wheel speeds, and odometry."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.base.collision_monitor import keep_clear
+from bhd_lerobot.control.kernels import clamp, kernel, largest_change
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+
+REST = 1e-9  # a ramp has arrived when the command is this close to zero
+_ARRIVED = 1e-12  # nearer than this it is there
+LOOKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
+_LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
+_STANDS = 0.02  # [rad] a wheel that turned less has not moved
+_LEAST_TURN = 0.3  # [rad/s] by which wheels and gyroscope may differ: several times what a cheap one drifts
+_ESTOP = int(Mode.ESTOP)  # it and FAULT are the last modes
+_NON_FINITE, _VELOCITY, _ACCELERATION = int(Limit.NON_FINITE), int(Limit.VELOCITY), int(Limit.ACCELERATION)
+_EFFORT, _CLEARANCE = int(Limit.EFFORT), int(Limit.CLEARANCE)
+_BLOCKED, IMPLAUSIBLE = int(Watchdog.BLOCKED), int(Watchdog.PLANT)
+
+
+@kernel()
+def drive(state: Any, limits: Any, monitor: Any, sensors: NDArray[np.float64], sensors_ns: int) -> None:
+    """Advance a base by one tick.
+
+    Args:
+        monitor: what keeps it from driving into what its scans show; a record without beams if nothing does.
+        sensors: the ranges of a scan [m], and what the gyroscope reads [rad/s].
+        sensors_ns: when they were measured [ns].
+    """
+    integrate(state, limits)
+    if state.entered:
+        # What is to stop gets no faster meanwhile: an acceleration ends at once, the brake comes gradually.
+        for k in range(2):
+            state.target[k] = 0.0
+            if state.rate[k] * state.command[k] > 0.0:
+                state.rate[k] = 0.0
+        state.brakes_hard = state.mode >= _ESTOP
+        if not state.brakes_hard:
+            state.stopped_for = 0
+        state.entered = 0
+    if state.has_setpoint:
+        for k in range(2):
+            state.target[k] = state.requested[k]
+        state.brakes_hard = state.has_setpoint = False
+    limit_command(state, limits)
+    if monitor.beams:
+        keep_clear(state, limits, monitor, sensors, sensors_ns)
+    turn_wheels(state, limits)
+    state.ticks += 1
+    check_wheels(state, limits, sensors)
+
+
+@kernel()
+def drives_not(state: Any) -> bool:
+    """Return whether a base is commanded to be at rest."""
+    return abs(state.command[0]) < REST and abs(state.command[1]) < REST
+
+
+@kernel()
+def odometry_after(state: Any, limits: Any, left: float, right: float) -> tuple[float, float, float]:
+    """Return x, y [m] and yaw [rad] with the motion since the last tick, along the chord of the arc.
+
+    The encoders' resolution and the tyres' slip make it drift, as odometry does.
+
+    Args:
+        left: the left wheel's encoder [counts].
+        right: the right wheel's.
+    """
+    moved_left, moved_right = left - state.encoder[0], right - state.encoder[1]
+    distance, turn = (moved_left + moved_right) * limits.per_count, (moved_right - moved_left) * limits.yaw_per_count
+    heading = turn * 0.5 + state.odometry[2]
+    x, y = state.odometry[0] + math.cos(heading) * distance, state.odometry[1] + math.sin(heading) * distance
+    return x, y, state.odometry[2] + turn
+
+
+@kernel()
+def integrate(state: Any, limits: Any) -> None:
+    """Add the motion since the last tick to the odometry."""
+    left, right = np.floor(state.position[0] * limits.counts), np.floor(state.position[1] * limits.counts)
+    state.odometry[0], state.odometry[1], state.odometry[2] = odometry_after(state, limits, left, right)
+    state.encoder[0], state.encoder[1] = left, right
+
+
+@kernel("void(state[::1], limits[::1], f8[:,:], f8[:,:])")
+def read_odometry(states: Any, limits: Any, angles: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Write the odometry of n bases with these wheel angles [rad], shape (n, 2), without updating it."""
+    for sim in range(len(states)):
+        left, right = np.floor(angles[sim, 0] * limits[0].counts), np.floor(angles[sim, 1] * limits[0].counts)
+        out[sim, 0], out[sim, 1], out[sim, 2] = odometry_after(states[sim], limits[0], left, right)
+
+
+@kernel()
+def wheel_room(limits: Any, yaw_rate: float) -> float:
+    """Return the largest forward speed with which no wheel is faster than its limit.
+
+    Turning has precedence because it is what avoids an obstacle, and because the two limits cannot fight: in one tick
+    the yaw rate changes by so little that the forward speed which it costs stays within its own acceleration limit.
+    """
+    return max((abs(yaw_rate) * -limits.per_yaw + limits.most_wheel_speed) * (1.0 / limits.per_speed), 0.0)
+
+
+@kernel()
+def limit_command(state: Any, limits: Any) -> None:
+    """Bring the command as near to its target as one tick may; note why no nearer.
+
+    The change of each tick is the largest from which the changes can still fall, by the jerk limit from tick to tick,
+    so that their sum ends at the target: it arrives without overshoot. A base that brakes hard goes as far as the
+    deceleration of a stop allows.
+    """
+    # Commands are checked when they are sent; a queue in shared memory is written by another process.
+    if not (math.isfinite(state.target[0]) and math.isfinite(state.target[1])):
+        state.target[0] = state.target[1] = 0.0
+        state.limits |= _NON_FINITE
+    yaw_rate = clamp(state.target[1], -limits.velocity[1], limits.velocity[1])
+    room = min(limits.velocity[0], wheel_room(limits, yaw_rate))
+    for k in range(2):
+        target = yaw_rate if k else clamp(state.target[0], -room, room)
+        if target != state.target[k]:
+            state.limits |= _VELOCITY
+        before, last = state.command[k], state.rate[k]
+        state.before[k] = before
+        jerk, step = limits.jerk[k], target - before
+        way = abs(step) / jerk
+        if way > limits.acceleration[k] / jerk:
+            state.limits |= _ACCELERATION
+        if state.brakes_hard:
+            if abs(step) > limits.stop[k]:
+                state.limits |= _ACCELERATION
+                state.command[k] = before + clamp(step, -limits.stop[k], limits.stop[k])
+            else:
+                state.command[k] = target
+            state.rate[k] = state.command[k] - before
+            continue
+        change = math.copysign(min(largest_change(way) * jerk, limits.acceleration[k]), step)
+        change = clamp(change, last - jerk, last + jerk)
+        state.command[k] = before + change
+        if abs(step - change) <= _ARRIVED:  # sums miss it by their rounding
+            state.command[k] = target
+        state.rate[k] = 0.0 if way <= _ARRIVED / jerk and abs(last) <= jerk else change
+    # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions change at
+    # different rates.
+    room = wheel_room(limits, state.command[1])
+    if abs(state.command[0]) > room:
+        state.command[0] = clamp(state.command[0], -room, room)
+        state.limits |= _VELOCITY
+        for k in range(2):
+            state.rate[k] = state.command[k] - state.before[k]
+
+
+@kernel()
+def turn_wheels(state: Any, limits: Any) -> None:
+    """Go from the command to wheel speeds; note whether a servo gives its largest torque."""
+    straight, turn = state.command[0] * limits.per_speed, state.command[1] * limits.per_yaw
+    for k in range(2):
+        speed = straight + turn if k else straight - turn
+        # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
+        if abs(speed - state.velocity[k]) > limits.largest_error:
+            state.limits |= _EFFORT
+        state.asked[k] += speed
+        state.actuators[k] = state.command[k] if limits.takes_twist else speed
+
+
+@kernel()
+def check_wheels(state: Any, limits: Any, sensors: NDArray[np.float64]) -> None:
+    """Compare now and then how the wheels turned with what was commanded, and with a gyroscope."""
+    state.protective_stop = 0
+    if limits.gyro >= 0:
+        state.turned += sensors[limits.gyro]
+    stamp_ns = state.stamp_ns if limits.has_stamps else state.ticks  # readings without stamps are those of the tick
+    if state.ticks < state.look_at[0] or stamp_ns == state.look_at[2]:
+        return  # what has not been read again says nothing
+    passed = state.ticks - state.look_at[1]
+    seconds = passed * limits.period_s
+    for k in range(2):
+        # A wheel that does not turn as it is commanded to: it is blocked, or its encoder lies.
+        for j in range(limits.late - 1, 0, -1):
+            state.late[k, j] = state.late[k, j - 1]
+        state.late[k, 0] = state.asked[k] / passed
+        # By all that was commanded within the latency it is to turn so fast at the least.
+        least = state.late[k, 0]
+        for j in range(1, limits.late):
+            is_same = state.late[k, j] * least > 0.0
+            least = math.copysign(min(abs(state.late[k, j]), abs(least)), least) if is_same else 0.0
+        done = (state.position[k] - state.start[k]) / seconds
+        is_slow = abs(least) > _LEAST_SPEED and (done if least > 0.0 else -done) < 0.5 * abs(least)
+        state.looks[k] = state.looks[k] + 1 if is_slow else 0
+    if max(state.looks[0], state.looks[1]) >= LOOKS:
+        state.protective_stop, state.looks[0], state.looks[1] = _BLOCKED, 0, 0
+    if limits.gyro >= 0:
+        # Wheels and gyroscope that do not agree about how far the base turned: one of them lies, or slips.
+        yaw = (state.position[1] - state.start[1]) - (state.position[0] - state.start[0])
+        yaw, turned = yaw * limits.turn, state.turned * limits.period_s
+        apart, largest = abs(yaw - turned), max(abs(yaw), abs(turned))
+        is_apart = apart > _LEAST_TURN * seconds and apart > 0.5 * largest
+        state.looks[2] = state.looks[2] + 1 if is_apart else 0
+        if state.looks[2] >= LOOKS:
+            state.protective_stop, state.looks[2] = IMPLAUSIBLE, 0
+    if state.protective_stop:
+        state.stopped_for = state.protective_stop
+        state.stood = abs(state.position[0] - state.first[0]) < _STANDS and abs(state.position[1] - state.first[1]) < _STANDS
+        for k in range(2):
+            turn = state.command[1] * limits.per_yaw
+            state.stopped_at[k] = state.command[0] * limits.per_speed + (turn if k else -turn)
+            state.stopped_at[2 + k] = state.velocity[k]
+    state.turned = 0.0
+    state.look_at[0], state.look_at[1], state.look_at[2] = state.ticks + limits.period_ticks, state.ticks, stamp_ns
+    for k in range(2):
+        state.asked[k], state.start[k] = 0.0, state.position[k]
+
+
+@kernel()
+def drive_back(state: Any, limits: Any) -> None:
+    """Make the command again what the wheels have."""
+    if limits.takes_twist:
+        state.command[0], state.command[1] = state.written[0], state.written[1]
+    else:
+        state.command[0] = (state.written[0] + state.written[1]) * limits.half_radius
+        state.command[1] = (state.written[1] - state.written[0]) * limits.turn
+    state.rate[0] = state.rate[1] = 0.0

@@ -1,0 +1,190 @@
+"""The record of a robot: everything that a tick reads or changes, and the numbers of its body that it goes by.
+
+In lockstep a robot is a row of an array of records. Their size is fixed, so that the tick is compiled once for every
+robot; values beyond the robot's own joints stay 0.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.kernels import record
+from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.errors import ConfigError
+
+JOINTS = 8
+"""Most joints of a robot, and most values of a command."""
+QUEUE = 256
+"""Most commands that wait."""
+LOOKS = 64
+"""Most looks at the wheels' progress within a robot's latency."""
+NEVER = np.iinfo(np.int64).max
+"""Due time of no command [ns]."""
+
+_f, _i, _b, _vector = np.float64, np.int64, np.bool_, (np.float64, (JOINTS,))
+
+STATE = record(
+    "state",
+    [
+        # Readings, as far as they are measurements.
+        ("position", *_vector),  # [rad], a gripper's opening [m]
+        ("velocity", *_vector),  # [rad/s, m/s]
+        ("effort", *_vector),  # [N m, N]
+        ("stamp_ns", _i),  # when the hardware measured them, on the clock of the ticks' origin
+        ("safety", np.int8),  # `SafetyStatus`
+        # What they are checked with: see `reading_check`.
+        ("near", *_vector),
+        ("last", *_vector),
+        ("read_ns", _i),
+        ("elapsed_ns", _i),
+        ("beyond", *_vector),
+        ("seen_position", *_vector),
+        ("seen_velocity", *_vector),
+        ("seen_ns", _i),
+        ("same_ticks", np.int64, (JOINTS,)),
+        ("same_effort", *_vector),
+        ("off", *_vector),
+        ("way", *_vector),
+        ("problem", _i),
+        ("problem_joint", _i),
+        ("problem_value", _f),
+        ("problem_ns", _i),
+        ("silence_ns", _i),  # age of the last reading that was refused for its age; 0 if none was
+        ("is_distrusted", _b),  # in this tick: positions are made up
+        # Modes.
+        ("mode", np.int8),  # `Mode`
+        ("mode_is_new", _b),  # the plant has not been told it
+        ("is_configured", _b),
+        ("is_deactivating", _b),
+        ("by_goal", _b),  # it moves because of a goal, not because of setpoints
+        ("watchdog", _i),  # `Watchdog` flags raised since they were last taken
+        ("limits", _i),  # `Limit` flags raised since they were last taken
+        ("refusals", np.int64, (len(Reason),)),
+        # Commands.
+        ("requested", *_vector),  # the setpoint that was taken last, before all limits
+        ("setpoints_taken", _i),
+        ("due_ns", _i),  # when it was due
+        ("sent_sequence", _i),
+        ("taken_sequence", _i),
+        ("sent_due_ns", _i),
+        ("next_due_ns", _i),  # when the next in the queue is due; `NEVER` if none waits
+        ("next_entry", _i),
+        ("seen_head", _i),
+        # To the controller, for its next run: modes that were entered, as bits, and whether there is a new setpoint.
+        ("entered", _i),
+        ("has_setpoint", _b),
+        ("goes_back", _b),  # its reference is to be again what is written
+        # From the controller.
+        ("command", *_vector),  # what is applied, after all limits
+        ("actuators", *_vector),  # what it wants to write
+        ("busy", _b),
+        ("follows_goal", _b),
+        ("is_at_rest", _b),
+        ("protective_stop", _i),  # `Watchdog` flag of a stop of its own that has just begun
+        # The guard.
+        ("written", *_vector),  # what may be written
+        ("written_rate", *_vector),  # its last change, for each tick
+        # Wheels: twist, odometry, and how they turned since the last look.
+        ("target", _f, (2,)),
+        ("before", _f, (2,)),
+        ("rate", _f, (2,)),
+        ("brakes_hard", _b),
+        ("encoder", _f, (2,)),  # [counts]
+        ("odometry", _f, (3,)),  # x, y [m], yaw [rad]
+        ("ticks", _i),
+        ("look_at", np.int64, (3,)),  # tick of the next look, of the last one, and the reading's stamp then
+        ("looks", np.int64, (3,)),  # that found the two wheels and the gyroscope wrong, in a row
+        ("asked", _f, (2,)),  # [rad/s] times ticks that were commanded since the last look
+        ("turned", _f),  # [rad/s] times ticks that the gyroscope read since then
+        ("start", _f, (2,)),  # [rad] of the wheels then
+        ("first", _f, (2,)),  # [rad] when it was configured
+        ("stopped_for", _i),  # `Watchdog` flag of the last stop of its own
+        ("stood", _b),  # the wheels had not turned at all then
+        ("stopped_at", _f, (4,)),  # [rad/s] of the wheels then, commanded and read
+        ("late", _f, (2, LOOKS)),  # [rad/s] commanded between looks, the newest first
+    ],
+)
+
+WAITING = record(
+    "queue",
+    [
+        # The sender alone moves the head and the tick alone the tail; an entry is complete before the head moves.
+        ("head", _i),
+        ("tail", _i),
+        ("sequence", np.int64, (QUEUE,)),
+        ("due_ns", np.int64, (QUEUE,)),
+        ("waits", np.int8, (QUEUE,)),
+        ("values", np.float64, (QUEUE, JOINTS)),
+    ],
+)
+
+LIMITS = record(
+    "limits",
+    [
+        ("joints", _i),
+        ("width", _i),  # values of a command
+        ("hz", _f),
+        ("timeout_ns", _i),  # age of a setpoint at which the robot stops
+        ("has_stamps", _b),
+        ("has_sensors", _b),
+        ("oldest_ns", _i),  # largest age of a reading
+        ("ahead_ns", _i),  # by how much a stamp may be ahead of the tick
+        ("origin_ns", _i),  # time 0 of the ticks, on the clock of the stamps
+        # Of readings, for each nanosecond, for a period, and for the periods by which stamps may be off.
+        ("fastest", *_vector),
+        ("step", *_vector),
+        ("slack", *_vector),
+        ("is_torque", _b),  # the motors take torques, and readings are checked against each other
+        ("period_s", _f),
+        ("frozen_ticks", _i),
+        ("least_torque", *_vector),
+        # Of what is written: see `guard.WireLimits`.
+        ("lower", *_vector),
+        ("upper", *_vector),
+        ("change", *_vector),
+        ("bend", *_vector),
+        # Of a drive: commands, for each tick; wheels; encoders; looks at the wheels' progress.
+        ("is_drive", _b),
+        ("takes_twist", _b),
+        ("velocity", _f, (2,)),
+        ("acceleration", _f, (2,)),
+        ("stop", _f, (2,)),
+        ("jerk", _f, (2,)),
+        ("per_speed", _f),  # [rad/m] a wheel's speed for each forward speed
+        ("per_yaw", _f),  # [rad/rad] and for each yaw rate
+        ("most_wheel_speed", _f),
+        ("half_radius", _f),  # [m/rad] forward speed of both wheels' speeds
+        ("turn", _f),  # [rad/rad] yaw rate of the difference of their speeds
+        ("largest_error", _f),  # [rad/s] of a wheel's speed with which its servo gives its largest torque
+        ("counts", _f),  # [1/rad] of the encoders
+        ("per_count", _f),  # [m] forward for a count of each wheel
+        ("yaw_per_count", _f),
+        ("period_ticks", _i),
+        ("late", _i),  # looks within the latency
+        ("gyro", _i),  # the sensor that is the yaw rate of a gyroscope; -1 if there is none
+    ],
+)
+
+
+def new_states(n: int) -> NDArray:
+    """Return the records of n robots that are not configured, shape (n,)."""
+    states = np.zeros(n, STATE)
+    states["near"] = states["seen_position"] = np.nan
+    states["sent_sequence"] = states["taken_sequence"] = states["seen_head"] = -1
+    states["sent_due_ns"] = np.iinfo(np.int64).min
+    states["next_due_ns"] = NEVER
+    return states
+
+
+def put(row: Any, field: str, values: Any) -> None:
+    """Write values into the first places of a field of a record, or of an array of records.
+
+    Raises:
+        ConfigError: there are more of them than a record holds.
+    """
+    values = np.asarray(values)
+    room = row[field].shape[-1]
+    if values.shape[-1] > room:
+        raise ConfigError(f"The robot has {values.shape[-1]} values of {field}; a record holds {room}.")
+    row[field][..., : values.shape[-1]] = values

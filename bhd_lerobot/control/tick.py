@@ -1,0 +1,263 @@
+"""One tick of one robot: read, supervise, take the command, run the controller, guard what is written.
+
+It never sleeps, blocks, logs or allocates. It runs as plain Python, and as the machine code that numba makes of it.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.base.drive import drive, drive_back, drives_not
+from bhd_lerobot.control.fifo import drop, find_next, keep_newest
+from bhd_lerobot.control.guard import guard
+from bhd_lerobot.control.kernels import kernel
+from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Mode, Reason, Watchdog
+from bhd_lerobot.control.plant import SafetyStatus
+from bhd_lerobot.control.reading_check import are_motions_wrong, are_positions_wrong, is_time_wrong
+from bhd_lerobot.control.record import NEVER
+
+_HOLD, _TRACKING, _STOPPING, _SAFE_OFF = (int(Mode[name]) for name in ("HOLD", "TRACKING", "STOPPING", "SAFE_OFF"))
+_UNCONFIGURED, _ESTOP, _FAULT = int(Mode.UNCONFIGURED), int(Mode.ESTOP), int(Mode.FAULT)
+_ACCEPTED, _STALE, _NOT_ACTIVE = int(Reason.ACCEPTED), int(Reason.STALE), int(Reason.NOT_ACTIVE)
+_OUT_OF_ORDER, _BEYOND_HORIZON = int(Reason.OUT_OF_ORDER), int(Reason.BEYOND_HORIZON)
+_ESTOP_REASON, _FAULT_REASON = int(Reason.ESTOP), int(Reason.FAULT)
+_COMMAND_AGE, _PLANT, _GUARD = int(Watchdog.COMMAND_AGE), int(Watchdog.PLANT), int(Watchdog.GUARD)
+_NORMAL, _EMERGENCY_STOP = int(SafetyStatus.NORMAL), int(SafetyStatus.EMERGENCY_STOP)
+_LEAST, _MOST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+_MOST_TAKEN = 3  # commands in one tick, while another process fills the queue
+
+Numbers = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+
+@kernel()
+def tick(  # noqa: PLR0917
+    state: Any, queue: Any, estop: Counts, monitor: Any, limits: Any, sensors: Numbers, sensors_ns: int, now_ns: int
+) -> None:
+    """Run one tick of a robot whose controller is compiled, between reading its plant and writing to it.
+
+    The reference advances by one period, also after ticks that were skipped: it is late then, and what is written to
+    the plant does not jump to where it would be by now.
+
+    Args:
+        state: the robot's record.
+        queue: its commands.
+        estop: the word of its emergency stop, see `EstopWord`.
+        monitor: its collision monitor; one without beams if there is none.
+        limits: the numbers of its body.
+        sensors: further values that the plant measures.
+        sensors_ns: when the oldest of them was measured [ns].
+        now_ns: the time that the tick is for [ns].
+    """
+    begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+    drive(state, limits, monitor, sensors, sensors_ns)
+    end_tick(state, limits)
+
+
+@kernel()
+def begin_tick(state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int) -> None:
+    """Do what comes before the controller: judge the reading, supervise, take what is due."""
+    supervise(state, queue, estop, limits, sensors_ns, now_ns)
+    take_command(state, queue, estop, limits, now_ns)
+
+
+@kernel()
+def end_tick(state: Any, limits: Any) -> None:
+    """Do what comes after the controller: follow it with the mode, and guard what is written."""
+    follow_controller(state)
+    if not guard(state, limits):
+        # As hard as possible, from the last that was safe.
+        state.watchdog |= _GUARD
+        state.goes_back = True
+        if limits.is_drive:
+            drive_back(state, limits)
+            state.goes_back = False
+        if state.mode >= _ESTOP:
+            state.entered |= 1 << _FAULT  # the present stop is not safe either
+        else:
+            set_mode(state, _FAULT)
+
+
+@kernel()
+def set_mode(state: Any, mode: int) -> None:
+    """Enter a mode; the controller learns of it before it runs next."""
+    state.mode, state.mode_is_new, state.is_deactivating = mode, True, False
+    if mode != _TRACKING:
+        state.entered |= 1 << mode
+
+
+@kernel()
+def supervise(state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int) -> None:
+    """Change the mode for what nobody requested: emergency stop, plant faults, watchdogs, the end of a stop."""
+    press = estop[0]
+    if press != estop[1]:
+        estop[2] = press
+        if state.mode != _ESTOP:
+            set_mode(state, _ESTOP)
+    judge_reading(state, limits)
+    if limits.has_stamps and is_time_wrong(state, limits, sensors_ns, now_ns) and state.mode != _UNCONFIGURED:
+        fail(state, _PLANT)
+    if state.mode == _TRACKING and not state.by_goal and now_ns - state.due_ns > limits.timeout_ns:
+        state.watchdog |= _COMMAND_AGE
+        # What a brain left behind that fell silent moves nothing later.
+        state.refusals[_STALE] += drop(state, queue, _LEAST, _MOST)
+        set_mode(state, _STOPPING)
+    if state.mode == _STOPPING and (drives_not(state) if limits.is_drive else state.is_at_rest):
+        set_mode(state, _SAFE_OFF if state.is_deactivating else _HOLD)
+
+
+@kernel()
+def fail(state: Any, cause: int) -> None:
+    """Enter FAULT for a cause, unless the robot is stopped already."""
+    if state.mode < _ESTOP:
+        state.watchdog |= cause
+        set_mode(state, _FAULT)
+
+
+@kernel()
+def judge_reading(state: Any, limits: Any) -> None:
+    """Stop a robot that reports a stop of its own, or whose reading is no measurement."""
+    is_bad = are_positions_wrong(state, limits)
+    if limits.is_torque and are_motions_wrong(state, limits):
+        is_bad = True
+    is_finite, has_effort = True, True
+    for k in range(limits.joints):
+        is_finite &= math.isfinite(state.velocity[k])
+        has_effort &= math.isfinite(state.effort[k])
+    is_bad = is_bad or not is_finite or not has_effort
+    state.is_distrusted = is_bad
+    if is_bad:
+        # What is no measurement must not spread: it is treated as a joint at rest where the encoder last was. Efforts
+        # do not depend on encoders.
+        for k in range(limits.joints):
+            state.velocity[k] = 0.0
+            if not has_effort:
+                state.effort[k] = 0.0
+    if state.safety == _EMERGENCY_STOP and state.mode != _ESTOP:
+        set_mode(state, _ESTOP)
+    if is_bad or state.safety != _NORMAL:
+        fail(state, _PLANT)
+
+
+@kernel()
+def refusal(state: Any, estop: Counts) -> int:
+    """Return why a robot takes no setpoint, or `Reason.ACCEPTED`."""
+    if estop[0] != estop[1] or state.mode == _ESTOP:  # the word counts from the moment that it is set
+        return _ESTOP_REASON
+    if state.is_deactivating:
+        return _NOT_ACTIVE
+    if state.mode == _FAULT:
+        return _FAULT_REASON
+    return _ACCEPTED if _HOLD <= state.mode <= _STOPPING else _NOT_ACTIVE
+
+
+@kernel()
+def take_command(state: Any, queue: Any, estop: Counts, limits: Any, now_ns: int) -> None:
+    """Take what is due from the queue; the newest that is due wins."""
+    if queue.head != state.seen_head:
+        find_next(state, queue)
+    if state.next_due_ns != NEVER and state.next_due_ns > now_ns + HORIZON_NS:
+        # By a sender whose clock is another one.
+        state.refusals[_BEYOND_HORIZON] += drop(state, queue, _LEAST, _MOST)
+    for taken in range(_MOST_TAKEN):
+        if state.next_due_ns > now_ns:
+            return
+        last = state.taken_sequence
+        if taken:
+            state.refusals[_OUT_OF_ORDER] += drop(state, queue, _LEAST, last)
+            state.refusals[_OUT_OF_ORDER] += drop(state, queue, last + SEQUENCE_STEP + 1, _MOST)
+            keep_newest(state, queue, now_ns)  # however many are due, a tick takes its time for one
+            if state.next_due_ns > now_ns:
+                return
+        entry = state.next_entry
+        sequence, due_ns = queue.sequence[entry], queue.due_ns[entry]
+        queue.waits[entry] = False
+        # None is taken twice, and none is so far ahead that all that follow would be refused.
+        if not last < sequence <= last + SEQUENCE_STEP:
+            state.refusals[_OUT_OF_ORDER] += 1
+            find_next(state, queue)
+            continue
+        state.taken_sequence = sequence
+        # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
+        drop(state, queue, _LEAST, sequence - 1)
+        reason = refusal(state, estop)  # modes may have changed since it was sent
+        if reason == _ACCEPTED and due_ns < now_ns - limits.timeout_ns:
+            reason = _STALE
+        if reason != _ACCEPTED:
+            state.refusals[reason] += 1
+            continue
+        if state.mode != _TRACKING:
+            set_mode(state, _TRACKING)
+        for k in range(limits.width):
+            state.requested[k] = queue.values[entry, k]
+        state.due_ns, state.by_goal, state.has_setpoint = due_ns, False, True
+        state.setpoints_taken += 1
+
+
+@kernel()
+def follow_controller(state: Any) -> None:
+    """Keep the mode in step with the controller.
+
+    TRACKING while a goal is followed, HOLD when all are done, FAULT for a robot that something is in the way of.
+    """
+    if state.protective_stop:
+        state.watchdog |= state.protective_stop  # whatever moved it there would keep pressing
+        fail(state, state.protective_stop)
+    if state.busy == state.by_goal:
+        return
+    resumes = state.follows_goal and state.mode == _STOPPING and not state.is_deactivating
+    if resumes or (state.busy and state.mode == _HOLD):
+        state.by_goal = True
+        set_mode(state, _TRACKING)
+    if state.by_goal and not state.busy:
+        state.by_goal = False
+        if state.mode == _TRACKING:
+            set_mode(state, _HOLD)
+
+
+@kernel("void(state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], i8)")
+def tick_all(  # noqa: PLR0917
+    states: Any,
+    queues: Any,
+    estop: Counts,
+    monitors: Any,
+    limits: Any,
+    sensors: Numbers,
+    sensors_ns: Counts,
+    now_ns: int,
+) -> None:
+    """Run one tick of n robots; a monitor without beams may be one for all."""
+    for sim in range(len(states)):
+        monitor = monitors[sim % len(monitors)]
+        tick(states[sim], queues[sim], estop[:, sim], monitor, limits[0], sensors[sim], sensors_ns[sim], now_ns)
+
+
+@kernel("void(state[::1], queue[::1], i8[:,:], limits[::1], i8[:], i8)")
+def begin_all(states: Any, queues: Any, estop: Counts, limits: Any, sensors_ns: Counts, now_ns: int) -> None:
+    """Do what comes before the controller of n robots."""
+    for sim in range(len(states)):
+        begin_tick(states[sim], queues[sim], estop[:, sim], limits[0], sensors_ns[sim], now_ns)
+
+
+@kernel("void(state[::1], limits[::1])")
+def end_all(states: Any, limits: Any) -> None:
+    """Do what comes after the controller of n robots."""
+    for sim in range(len(states)):
+        end_tick(states[sim], limits[0])
+
+
+@kernel("void(state[::1], limits[::1], b1[:])")
+def judge_all(states: Any, limits: Any, mask: NDArray[np.bool_]) -> None:
+    """Judge the readings of some robots."""
+    for sim in range(len(states)):
+        if mask[sim]:
+            judge_reading(states[sim], limits[0])
+
+
+@kernel("void(state[::1], queue[::1], i8[::1], b1[:])")
+def drop_all(states: Any, queues: Any, dropped: Counts, mask: NDArray[np.bool_]) -> None:
+    """Drop what waits for some robots; write how many commands that were."""
+    for sim in range(len(states)):
+        dropped[sim] = drop(states[sim], queues[sim], _LEAST, _MOST) if mask[sim] else 0
