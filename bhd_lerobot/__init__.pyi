@@ -11,6 +11,8 @@ from bhd_lerobot.bodies.arenas import register_arena as register_arena
 from bhd_lerobot.bodies.body import Arm as Arm
 from bhd_lerobot.bodies.body import Body as Body
 from bhd_lerobot.bodies.body import Drive as Drive
+from bhd_lerobot.bodies.body import GripperSpec as GripperSpec
+from bhd_lerobot.bodies.body import LidarSpec as LidarSpec
 from bhd_lerobot.bodies.body import Shape as Shape
 from bhd_lerobot.bodies.differential_base import differential_base as differential_base
 from bhd_lerobot.bodies.tabletop import TableObject as TableObject

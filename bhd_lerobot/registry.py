@@ -4,7 +4,7 @@ Those of this package are in the tables here; importing this module registers al
 packages add theirs with `register_robot`, `register_task`, `register_brain` and `register_arena`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from typing import TYPE_CHECKING, Any
 
 from lerobot.robots.config import RobotConfig
@@ -16,13 +16,13 @@ import bhd_lerobot.tasks.avoid
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
-from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.body import PARTS, Body
 from bhd_lerobot.bodies.registry import BODIES
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.registry import Registry, with_article
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, ConfiguredBrain
+from bhd_lerobot.policies.brain import Brain, BrainConfig, ConfiguredBrain
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig, check_drivers
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.learned.brain import LearnedBrain
@@ -53,19 +53,13 @@ class _Dagger(DaggerBrain):
 
     @staticmethod
     def robot_of(config: DaggerConfig) -> str:
-        """Return the robot that both drive.
+        """Return the type of robot that one of them is for.
 
         Raises:
-            ConfigError: they drive different ones, or one of them gives goals.
+            ConfigError: one of them gives goals.
         """
         check_drivers(BRAINS.of(config.learner), BRAINS.of(config.expert))
-        learner, expert = robot_of_brain(config.learner), robot_of_brain(config.expert)
-        for one, other in ((learner, expert), (expert, learner)):
-            if is_for(one, other) or not other:
-                return other or one or ANY_ROBOT
-        raise ConfigError(
-            f"brain.learner drives {with_article(learner)}, but brain.expert drives {with_article(expert)}."
-        )
+        return robot_of_brain(config.learner) or robot_of_brain(config.expert)
 
 
 class _Blanked(BlankedBrain):
@@ -76,7 +70,7 @@ class _Blanked(BlankedBrain):
 
     @staticmethod
     def robot_of(config: BlankedConfig) -> str:
-        """Return the robot that the brain drives."""
+        """Return the type of robot that the brain is for."""
         return robot_of_brain(config.brain)
 
 
@@ -115,7 +109,7 @@ def register_task[T](name: str, config: type[TaskConfig]) -> Callable[[type[T]],
     """Return a decorator that registers a task's class under a name, with its configuration.
 
     Raises:
-        ConfigError: another task has this name.
+        ConfigError: another task has this name, or `needs` names what is no part.
     """
     return _decorator(TASKS, name, config)
 
@@ -124,7 +118,8 @@ def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]
     """Return a decorator that registers a brain's class under a name, with its configuration.
 
     Raises:
-        ConfigError: another brain has this name, or the class is not derived from `ConfiguredBrain`.
+        ConfigError: another brain has this name, `needs` names what is no part, or the class is not derived from
+            `ConfiguredBrain`.
     """
 
     def register(made: type[T]) -> type[T]:
@@ -140,6 +135,14 @@ def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]
 
 def _decorator[T](registry: Registry[Any], name: str, config: type) -> Callable[[type[T]], type[T]]:
     def register(made: type[T]) -> type[T]:
+        kind, needs = getattr(made, "robot_kind", None), getattr(made, "needs", None)
+        if kind is not None or not isinstance(needs, tuple) or not set(needs) <= set(PARTS):
+            given = f"needs = {needs!r}" if kind is None else f"robot_kind = {kind!r}"
+            raise ConfigError(
+                f"The class of {name!r}, {made.__name__}, has {given}. In place of robot_kind it says what parts its "
+                "robot needs, a tuple of types: needs = (bhd.Drive, bhd.LidarSpec) or (bhd.Arm, bhd.GripperSpec), for "
+                "example, or () for every robot."
+            )
         made.name = name  # type: ignore[attr-defined]
         registry.register(name, made, config)
         return made
@@ -155,39 +158,41 @@ def robot_configs() -> dict[str, type[RobotConfig]]:
     return {name: RobotConfig.get_choice_class(name) for name in ROBOTS}
 
 
-def kind_of_robot(robot_type: str) -> str:
-    """Return the kind of a robot that can be simulated: ``"base"`` or ``"arm"``; nothing if it is not known."""
-    return str(ROBOTS[robot_type].robot_kind) if robot_type in ROBOTS else ""
+def parts_of(robot_type: str) -> Set[type]:
+    """Return the parts of a robot that can be simulated, as `Body.parts`; none if it is not known."""
+    return BODIES[robot_type]().parts.keys() if robot_type in ROBOTS else frozenset()
 
 
-def robots_of(wanted: str) -> list[str]:
-    """Return the types of the robots that are of a kind, or of a type."""
-    return sorted(name for name in ROBOTS if wanted in ("", name, kind_of_robot(name)))
+def robots_with(needs: Set[type]) -> list[str]:
+    """Return the types of the robots that have some parts."""
+    return sorted(name for name in ROBOTS if needs <= parts_of(name))
 
 
 def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
     """Refuse a robot that cannot be simulated, one whose rates do not divide each other, and another robot's task."""
-    kind = robot_of_task(task)
     if isinstance(task, FreeConfig) and not task.instruction.strip():
         raise ConfigError(
             "task.type is 'free', and task.instruction does not say what the robot is to do. Set "
             f"--task.instruction='…', or another --task.type: {', '.join(name for name in TASKS if name != 'free')}."
         )
-    if not is_ours(robot.type):
-        if kind:
-            raise ConfigError(
-                f"robot.type is {robot.type!r} and task.type is {task.get_choice_name(type(task))!r}, which {program} "
-                f"simulates with {', '.join(robots_of(kind))} only. With another robot use --task.type=free: a person "
-                "says how an episode ends."
-            )
-        return
-    if robot.type not in (valid := robots_of(kind)):
-        fitting = " or ".join(map(repr, valid))
+    if is_ours(robot.type):
+        check_task(task, robot.type)
+        _ = robot.rates
+    elif needs := needs_of_task(task):
         raise ConfigError(
-            f"task.type is {task.get_choice_name(type(task))!r}, which is for robot.type = {fitting}; robot.type is "
-            f"{robot.type!r}."
+            f"robot.type is {robot.type!r} and task.type is {task.get_choice_name(type(task))!r}, which {program} "
+            f"simulates with {', '.join(robots_with(needs))} only. With another robot use --task.type=free: a person "
+            "says how an episode ends."
         )
-    _ = robot.rates
+
+
+def check_task(task: TaskConfig, robot_type: str) -> None:
+    """Refuse a task that needs a part that a robot does not have."""
+    if missing := needs_of_task(task) - parts_of(robot_type):
+        raise ConfigError(
+            f"task.type is {task.get_choice_name(type(task))!r}, which needs {_listed(missing)}; robot.type is "
+            f"{robot_type!r}, which has none. Valid: {', '.join(robots_with(needs_of_task(task)))}."
+        )
 
 
 def is_ours(robot_type: str) -> bool:
@@ -196,53 +201,68 @@ def is_ours(robot_type: str) -> bool:
 
 
 def check_brain(key: str, brain: BrainConfig, robot: RobotConfig) -> None:
-    """Refuse a brain that is for another robot; `key` is the option that it comes from."""
+    """Refuse a brain that is for another robot, or is made of one; `key` is the option that it comes from."""
     try:
-        driven = robot_of_brain(brain)
+        robot_type = robot_of_brain(brain)
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from error
-    robot_type = robot.type
-    if not is_for(driven, robot_type) and driven not in names_of_robot(robot):
-        path = getattr(brain, "path", None)
-        name = f"{key}.path is {str(path)!r}" if path else f"{key}.type is {brain.get_choice_name(type(brain))!r}"
-        raise ConfigError(
-            f"{name}, which drives {with_article(driven)}; robot.type is {robot_type!r}. Brains for it: "
-            f"{', '.join(brains_for(robot_type))}."
-        )
+    for name, part in _composed_of(brain).items():
+        check_brain(f"{key}.{name}", part, robot)
+    is_trained_on = robot_type in ("", robot.type, *names_of_robot(robot))
+    if is_trained_on and not (missing := needs_of_brain(brain) - parts_of(robot.type)):
+        return
+    path = getattr(brain, "path", None)
+    name = f"{key}.path is {str(path)!r}" if path else f"{key}.type is {brain.get_choice_name(type(brain))!r}"
+    wanted = f"needs {_listed(missing)}" if is_trained_on else f"drives {with_article(robot_type)}"
+    has = ("which has none" if is_ours(robot.type) else "whose parts are not known") if is_trained_on else ""
+    raise ConfigError(
+        f"{name}, which {wanted}; robot.type is {robot.type!r}{', ' * is_trained_on}{has}. Brains for it: "
+        f"{', '.join(brains_for(robot.type))}."
+    )
 
 
-def is_for(wanted: str, robot_type: str) -> bool:
-    """Return whether a robot is of the kind or type that a task or a brain is for; nothing is every robot."""
-    return wanted in ("", robot_type, kind_of_robot(robot_type))
+def drives(brain: BrainConfig, robot_type: str) -> bool:
+    """Return whether a brain is for a robot: it has the parts, and it is the one that it was trained on, if any."""
+    return robot_of_brain(brain) in ("", robot_type) and needs_of_brain(brain) <= parts_of(robot_type)
 
 
-def robot_of_task(config: TaskConfig) -> str:
-    """Return the kind of robot that a task is for."""
-    return str(TASKS.of(config).robot_kind)
+def needs_of_task(config: TaskConfig) -> Set[type]:
+    """Return the parts that a robot needs for a task."""
+    return frozenset(TASKS.of(config).needs)
+
+
+def needs_of_brain(config: BrainConfig) -> Set[type]:
+    """Return the parts that a robot needs for a brain, and for those that it is made of."""
+    return frozenset(BRAINS.of(config).needs).union(*map(needs_of_brain, _composed_of(config).values()))
 
 
 def robot_of_brain(config: BrainConfig) -> str:
-    """Return the kind or type of robot that a brain is for, empty if it is for every robot."""
-    robot = str(BRAINS.of(config).robot_of(config))
-    return "" if robot == ANY_ROBOT else robot
+    """Return the type of robot that a brain is for; empty if it drives every robot with the parts that it needs."""
+    return str(BRAINS.of(config).robot_of(config))
+
+
+def _composed_of(config: BrainConfig) -> dict[str, BrainConfig]:
+    return {name: value for name, value in vars(config).items() if isinstance(value, BrainConfig)}
+
+
+def _listed(parts: Set[type]) -> str:
+    return " and ".join(with_article(name) for part, name in PARTS.items() if part in parts)
 
 
 def brains_for(robot_type: str) -> tuple[str, ...]:
     """Return the names of the brains for a type of robot."""
-    kinds = (kind_of_robot(robot_type), ANY_ROBOT)
-    return tuple(sorted(name for name, brain in BRAINS.items() if brain.robot_kind in kinds))
+    return tuple(sorted(name for name, brain in BRAINS.items() if set(brain.needs) <= parts_of(robot_type)))
 
 
 def tasks_for(robot_type: str) -> tuple[str, ...]:
     """Return the names of the tasks for a type of robot."""
-    return tuple(sorted(name for name, task in TASKS.items() if is_for(task.robot_kind, robot_type)))
+    return tuple(sorted(name for name, task in TASKS.items() if set(task.needs) <= parts_of(robot_type)))
 
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:
     """Return the names of the actions of the robots that a brain is for; none if it is for every robot."""
-    wanted = robot_of_brain(config)
-    robots = robots_of(wanted) if wanted else []
-    return tuple(ROBOTS[robots[0]].action_names) if robots else ()
+    robots = [name for name in sorted(ROBOTS) if drives(config, name)]
+    return tuple(ROBOTS[robots[0]].action_names) if 0 < len(robots) < len(ROBOTS) else ()
 
 
 # --- making ----------------------------------------------------------------------------------------------------------

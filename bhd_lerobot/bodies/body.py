@@ -5,8 +5,9 @@ it from a `Body`, so that a simulated and a real robot are limited by the same f
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -445,15 +446,21 @@ class Body:
         wheels = self.drive.joints if self.drive is not None else ()
         return (*wheels, *self.arm.chain.joints, "gripper") if self.arm is not None else wheels
 
-    def need[P: (Drive, Arm, LidarSpec)](self, part: type[P]) -> P:
+    @property
+    def parts(self) -> Mapping[type, Any]:
+        """What it is made of, by the types that tasks and brains name in `needs`."""
+        found = (self.drive, self.arm, self.arm and self.arm.gripper, self.lidar)
+        return {type(part): part for part in found if part is not None}
+
+    def need[P](self, part: type[P]) -> P:
         """Return a part.
 
         Raises:
             ConfigError: it does not have it.
         """
-        found = {Drive: self.drive, Arm: self.arm, LidarSpec: self.lidar}[part]
-        if not isinstance(found, part):
-            raise ConfigError(f"The robot {self.name!r} has no {_PARTS[part]}, which is needed here.")
+        if part not in self.parts:
+            raise ConfigError(f"The robot {self.name!r} has no {PARTS[part]}, which is needed here.")
+        found: P = self.parts[part]
         return found
 
     def check_rates(self, rates: Rates, *, is_simulated: bool = True) -> None:
@@ -476,7 +483,8 @@ class Body:
         )
 
 
-_PARTS: dict[type, str] = {Drive: "drive", Arm: "arm", LidarSpec: "lidar"}
+PARTS: Mapping[type, str] = {Drive: "drive", Arm: "arm", GripperSpec: "gripper", LidarSpec: "lidar"}
+"""The parts that a task or a brain may need, and what messages call them."""
 
 
 def without_jerk_limits(body: Body) -> Body:

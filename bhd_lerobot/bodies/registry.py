@@ -15,6 +15,11 @@ BODIES = Registry("body", _OWN)
 _unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
 
 
+def body_with(part: type) -> Body:
+    """Return the first body that has a part: the one that stands for a robot that is not known."""
+    return next(body for body in (make() for make in BODIES.values()) if part in body.parts)
+
+
 def body_of(robot_type: str | None) -> Body | None:
     """Return the body of a robot as a dataset names it; None if it names none, or there is no such robot."""
     if robot_type is None:

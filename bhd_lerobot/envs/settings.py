@@ -9,7 +9,7 @@ from typing import Any
 from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.options.parse import decode
-from bhd_lerobot.registry import is_for, robot_configs, robot_of_task
+from bhd_lerobot.registry import check_task, robot_configs
 from bhd_lerobot.tasks.task import TaskConfig
 
 OBS_TYPES: dict[str, tuple[str, ...]] = {
@@ -47,8 +47,7 @@ def make_settings(
     robot_type, task_type = ENVIRONMENTS[name]
     made_robot = _configuration(robot_configs()[robot_type], robot, "robot", robot_type)
     made_task = _configuration(TaskConfig.get_choice_class(task_type), task, "task", task_type)
-    if not is_for(robot_of_task(made_task), robot_type):
-        raise ConfigError(f"The task {task_type!r} is for {robot_of_task(made_task)!r}, not for {robot_type!r}.")
+    check_task(made_task, robot_type)
     if made_robot.clock != "lockstep":
         raise ConfigError(
             f"robot.clock is {made_robot.clock!r}; an environment's time goes by when it is stepped: leave it "

@@ -179,6 +179,8 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
     for key, value in values.items():
         if key not in fields and (ours := getattr(config_class, "of_lerobot", {}).get(key)):
             raise ConfigError(f"{prefix}{key} is an option of LeRobot's command. Here: {ours}.")
+        if key not in fields and (why := getattr(config_class, "removed", {}).get(key)):
+            raise ConfigError(f"The option {prefix}{key} was removed: {why}. Leave it out.")
         if key not in fields:
             valid = [f"{prefix}{name}" for name in (*others, *fields)] + ([] if prefix else [CONFIG_PATH])
             inner = [

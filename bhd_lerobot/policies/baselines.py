@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Range
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
 
@@ -40,7 +40,6 @@ class NoopBrain(ConfiguredBrain):
     """Holds: speeds are 0, and positions are those that the episode began with."""
 
     name = "noop"
-    robot_kind = ANY_ROBOT
     uses_privileged_state = False
     attempts = False
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import (
-    ANY_ROBOT,
     Brain,
     BrainConfig,
     ConfiguredBrain,
@@ -59,7 +58,6 @@ class BlankedBrain(ConfiguredBrain):
     """Passes everything on to a brain but its instruction or its images."""
 
     name = "blanked"
-    robot_kind = ANY_ROBOT
 
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         super().__init__(config)

@@ -8,8 +8,7 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.body import PARTS, Body
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError, brief
 from bhd_lerobot.options.declared import Options
@@ -51,10 +50,6 @@ else:
         def get_choice_name(cls, subcls: type) -> str:
             """Return the name of the brain that a configuration is of."""
             return BrainConfig.get_choice_name(subcls)
-
-
-ANY_ROBOT = "any"
-"""What a brain for every robot has as its `robot_kind`."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +97,15 @@ class RobotFeatures:
     robot_type: str = ""
     robot: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def arm(self) -> Arm:
-        """The robot's arm; a UR5 where the body is not known."""
-        return (self.body or ur5()).need(Arm)
+    def need[P](self, part: type[P]) -> P:
+        """Return a part of the robot.
+
+        Raises:
+            ConfigError: it does not have it, or its hardware is not known.
+        """
+        if self.body is None:
+            raise ConfigError(f"The robot's hardware is not known, and its {PARTS[part]} is needed here.")
+        return self.body.need(part)
 
 
 class Brain(Protocol):
@@ -116,14 +116,14 @@ class Brain(Protocol):
     """
 
     name: str
-    robot_kind: str
-    """The robots that it is for: ``"base"``, ``"arm"``, or `ANY_ROBOT` if it finds out when it is bound."""
+    needs: tuple[type, ...]
+    """The parts that a robot needs for it, types of `bhd_lerobot.bodies.body`; empty if every robot may do."""
     has_plan: bool
     """Whether it works step by step, and `subtasks` and `plan` say what it does."""
 
     @classmethod
     def robot_of(cls, config: Any) -> str:
-        """Return the kind or the type of robot that a brain of this configuration is for, before the brain is made."""
+        """Return the type of robot that a brain of this configuration is for; empty if every one with the parts."""
 
     @property
     def uses_images(self) -> bool:
@@ -193,15 +193,15 @@ def is_privileged(brain: Brain, environment_names: Sequence[str]) -> bool:
 class ConfiguredBrain:
     """Base class of brains: one that uses no images, has no plan and no expert, and depends on the observation alone.
 
-    A subclass sets `robot_kind` and defines `bind` and `act`.
+    A subclass sets `needs` and defines `bind` and `act`.
 
     Attributes:
         config: the parameters.
-        robot_kind: the robots that it is for: ``"base"``, ``"arm"`` or ``"any"``.
+        needs: the parts that a robot needs for it, such as ``(Drive, LidarSpec)``; empty if every robot may do.
     """
 
     name: str
-    robot_kind: str
+    needs: tuple[type, ...] = ()
     uses_images = False
     uses_privileged_state: bool = True
     """Of a brain that does not say, it is taken for granted that it uses what the task reports, if that is anything."""
@@ -214,8 +214,8 @@ class ConfiguredBrain:
 
     @classmethod
     def robot_of(cls, config: Any) -> str:
-        """Return the kind of robot that the brain is for, whatever its configuration."""
-        return cls.robot_kind
+        """Return no type: every robot with the parts."""
+        return ""
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget nothing: what it does depends on the observation alone."""

@@ -8,7 +8,6 @@ __all__ = [
     "loop",
     "mailbox",
     "planning_link",
-    "plant_link",
     "privileges",
     "recorder_process",
     "requests",

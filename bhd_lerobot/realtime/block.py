@@ -45,8 +45,6 @@ class Word(IntEnum):
     """The same of the cerebellum's process."""
     RECORDER_ALIVE = 10
     """The same of the recorder's process."""
-    PLANT_ALIVE = 11
-    """The same of the plant's process."""
     PLANT_LOST = 12
     """Not 0: what drives the robot has ended, and a reset cannot help. Written by the cerebellum."""
     EXECUTED = 16

@@ -24,7 +24,7 @@ class LoopLimits:
         brain_timeout_s: after so long without a sign of life of the brain's process a robot that moves decelerates and
             holds [s].
         recorder_timeout_s: the same for the recorder's process, if there is one [s].
-        plant_timeout_s: after so long without a sign of life of the plant's process, if there is one, FAULT [s].
+        plant_timeout_s: a reading of a plant that is older than this is a FAULT [s]; at least three ticks.
         most_misses: after so many starts in a row that came a period or more too late, FAULT.
         most_catch_up: so many periods at the most are caught up by one tick; what is beyond is lost to the simulation,
             which then is behind, and counted.
@@ -91,7 +91,6 @@ class RealtimeLoop:
                 Watchdog.RECORDER,
                 Mode.STOPPING,
             ),
-            (int(Word.PLANT_ALIVE), round(limits.plant_timeout_s * NANOSECONDS), Watchdog.PLANT, Mode.FAULT),
         ]
 
     def run(self, start_ns: int | None = None) -> TickGrid:

@@ -45,7 +45,7 @@ class Onlooker:
 
     def __init__(self, mirror: Host, idle_s: float, ending: Callable[[], Event | None]) -> None:
         self.mirror, self.config, self.rates, self.body = mirror, mirror.config, mirror.rates, mirror.body
-        self.robot_kind, self.knows, self.columns = mirror.robot_kind, mirror.knows, mirror.columns
+        self.knows, self.columns = mirror.knows, mirror.columns
         self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
         self.camera_shapes = mirror.camera_shapes
         self.track, self.start_rendering, self.render_later = mirror.track, mirror.start_rendering, mirror.render_later

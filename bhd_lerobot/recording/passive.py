@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, as_text
 from bhd_lerobot.options.declared import Options, Positive
-from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.recording.onlooker import Onlooker
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import LiveHost
@@ -67,7 +67,6 @@ class _Others(ConfiguredBrain):
     """Those who command the robot."""
 
     name = "bridge"
-    robot_kind = ANY_ROBOT
     uses_privileged_state = False
 
     def bind(self, robot: RobotFeatures) -> None:

@@ -86,7 +86,6 @@ class ArmHost(Host):
         options: those of `Host`.
     """
 
-    robot_kind = "arm"
     action_names = JOINT_ACTIONS
     knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
 

@@ -36,7 +36,6 @@ class BaseHost(Host):
         options: those of `Host`.
     """
 
-    robot_kind = "base"
     action_names = ("x.vel", "theta.vel")
     knows: frozenset[str] | None = frozenset({"base_pose_in_world"})
 

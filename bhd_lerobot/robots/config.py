@@ -88,11 +88,6 @@ class BhdRobotConfig(RobotConfig):
             raise ConfigError(f"robot.plant is {self.plant!r}; name a class as package.module:Class, or ros2.")
         if self.clock != "realtime":
             raise ConfigError("robot.plant names a robot that goes on by itself: use --robot.clock=realtime with it.")
-        if self.realtime.plant_process:
-            raise ConfigError(
-                "robot.realtime.plant_process is of simulated robots; with robot.plant leave it false. The plant is "
-                "opened in the cerebellum's process."
-            )
         if self.camera:
             raise ConfigError("robot.camera is of simulated robots; with robot.plant leave it false.")
 

@@ -75,7 +75,7 @@ class AvoidTask(BaseTask):
 
     name = "avoid"
     never = (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE)
-    needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
+    judged_by: frozenset[str] | None = frozenset({"base_pose_in_world"})
     lasts = True
 
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:

@@ -32,8 +32,8 @@ class FreeTask(BaseTask):
     """An episode ends when a person says how, or when its time is over; there is no reward."""
 
     name = "free"
-    robot_kind = ""  # every robot
-    needs: frozenset[str] | None = frozenset()
+    needs: tuple[type, ...] = ()
+    judged_by: frozenset[str] | None = frozenset()
     config: FreeConfig
 
     def sample(self, seed: int) -> Any:

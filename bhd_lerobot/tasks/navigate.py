@@ -94,7 +94,7 @@ class NavigateTask(BaseTask):
 
     name = "navigate"
     never = (Event.WRONG_OBJECT, Event.DROPPED)
-    needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
+    judged_by: frozenset[str] | None = frozenset({"base_pose_in_world"})
     environment_names: tuple[str, ...] = ENVIRONMENT
 
     def __init__(self, config: NavigateConfig, n: int, fps: int, body: Body | None = None) -> None:

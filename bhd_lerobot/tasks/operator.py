@@ -20,11 +20,11 @@ class OperatorTask(ConfiguredTask):
         fps: frames a second [Hz].
     """
 
-    needs: frozenset[str] | None = frozenset()
+    judged_by: frozenset[str] | None = frozenset()
 
     def __init__(self, task: Task, n: int, fps: int) -> None:
         super().__init__(task, n, fps)
-        self._task, self.name, self.robot_kind = task, task.name, task.robot_kind
+        self._task, self.name, self.needs = task, task.name, task.needs
 
     def sample(self, seed: int) -> Any:
         """Return the scene of the episode with this seed, which a person is to set up."""
@@ -61,6 +61,6 @@ def judged(task: Task, knows: frozenset[str] | None, n: int, fps: int) -> Task:
         n: number of robots.
         fps: frames a second [Hz].
     """
-    if knows is None or (task.needs is not None and task.needs <= knows):
+    if knows is None or (task.judged_by is not None and task.judged_by <= knows):
         return task
     return OperatorTask(task, n, fps)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.errors import ConfigError
@@ -119,6 +119,7 @@ class PickTask(ArmTask):
     """
 
     name = "pick"
+    needs = (Arm, GripperSpec)
     never = (Event.STUCK,)
     environment_names = ENVIRONMENT
 

@@ -66,7 +66,7 @@ class ReachTask(ArmTask):
     name = "reach"
     never = (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK)
     environment_names = ENVIRONMENT
-    needs: frozenset[str] | None = frozenset({"tool_pose"})
+    judged_by: frozenset[str] | None = frozenset({"tool_pose"})
 
     def __init__(self, config: ReachConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)

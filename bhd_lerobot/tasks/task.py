@@ -9,9 +9,9 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import BURGER_RADIUS, Arena, make_arena
-from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.arenas import Arena, make_arena
+from bhd_lerobot.bodies.body import Arm, Body, Drive
+from bhd_lerobot.bodies.registry import body_with
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Options
 from bhd_lerobot.options.registry import Registry
@@ -119,19 +119,19 @@ class Task(Protocol):
 
     Attributes:
         name: its name.
-        robot_kind: the kind of robot that it is for: ``"base"`` or ``"arm"``.
+        needs: the parts that a robot needs for it, types of `bhd_lerobot.bodies.body`; empty if every robot can do it.
         duration_s: longest duration of an episode [s].
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
         lasts: whether success is to have lasted until the time is over; an episode is then truncated, not terminated.
-        needs: the fields of the truth without which it cannot be judged; None if it needs a simulator's.
+        judged_by: the fields of the truth without which it cannot be judged; None if it takes a simulator's.
     """
 
     name: str
-    robot_kind: str
+    needs: tuple[type, ...]
     duration_s: float
     environment_names: tuple[str, ...]
     lasts: bool
-    needs: frozenset[str] | None
+    judged_by: frozenset[str] | None
 
     def sample(self, seed: int) -> Any:
         """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
@@ -180,13 +180,14 @@ class ConfiguredTask:
         config: the parameters, with a `duration_s`.
         n: number of simulations.
         fps: frames a second [Hz].
-        body: the robot's hardware; that which its tasks were made for if None.
+        body: the robot's hardware; if None, that of the first robot that has the parts.
     """
 
     name: str
     environment_names: tuple[str, ...] = ()
     lasts = False
-    needs: frozenset[str] | None = None
+    needs: tuple[type, ...] = ()
+    judged_by: frozenset[str] | None = None
     notes: tuple[str, ...] = ()
     never: ClassVar[tuple[Event, ...]] = ()
     """Events that cannot happen in this task."""
@@ -232,23 +233,23 @@ class ConfiguredTask:
 class BaseTask(ConfiguredTask):
     """What the tasks of bases have in common: arenas with room for the robot."""
 
-    robot_kind = "base"
+    needs: tuple[type, ...] = (Drive,)
 
     def arena(self, name: str, seed: int, random_start: bool = False) -> Arena:
         """Return an arena that this robot can get through."""
-        radius = self.body.drive.radius if self.body and self.body.drive else BURGER_RADIUS
+        radius = (self.body or body_with(Drive)).need(Drive).radius
         return make_arena(name, seed, random_start, robot_radius=radius)
 
 
 class ArmTask(ConfiguredTask):
     """What the tasks of arms have in common; their scenes are `TableScene`."""
 
-    robot_kind = "arm"
+    needs: tuple[type, ...] = (Arm,)
 
     @property
     def arm(self) -> Arm:
-        """The robot's arm; a UR5 where the robot is not known."""
-        return (self.body or ur5()).need(Arm)
+        """The robot's arm."""
+        return (self.body or body_with(Arm)).need(Arm)
 
 
 class PathLengths:

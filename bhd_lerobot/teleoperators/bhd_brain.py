@@ -15,7 +15,7 @@ from bhd_lerobot.control.kernels import never_compiled
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
-from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
+from bhd_lerobot.registry import ROBOTS, action_names_of, brains_for, drives, make_brain
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
@@ -93,7 +93,7 @@ class BhdBrain(Teleoperator):
         """The actions that it gives: those of the robot that it drives, if that is connected already."""
         names = action_names_of(self.config.brain)
         robots = connected_robots()
-        if len(robots) == 1 and is_for(robot_of_brain(self.config.brain), robots[0].name):
+        if len(robots) == 1 and drives(self.config.brain, robots[0].name):
             names = robots[0].action_names
         return dict.fromkeys(names, float)
 
@@ -146,7 +146,7 @@ class BhdBrain(Teleoperator):
     def _next_action(self) -> dict[str, Any]:
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
-            if not is_for(robot_of_brain(self.config.brain), robot.name):
+            if not drives(self.config.brain, robot.name):
                 is_arm = robot.host.body.arm is not None
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
@@ -217,6 +217,6 @@ class BhdBrain(Teleoperator):
             found = ", ".join(str(robot) for robot in robots) or "none"
             raise ConfigError(
                 f"bhd_brain drives one simulated robot of its own process; connected are: {found}. Use --robot.type="
-                f"{' or '.join(robots_of(''))}, and --teleop.robot_id if there are several."
+                f"{' or '.join(sorted(ROBOTS))}, and --teleop.robot_id if there are several."
             )
         return robots[0]

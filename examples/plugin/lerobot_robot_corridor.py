@@ -95,7 +95,7 @@ class WallFollowerConfig(bhd.BrainConfig):
 class WallFollower(bhd.ConfiguredBrain):
     """Steers by the distance to the wall on the right and by the angle to it, a line through the beams there."""
 
-    robot_kind = "base"
+    needs = (bhd.Drive, bhd.LidarSpec)
 
     def bind(self, robot: bhd.RobotFeatures) -> None:
         """Choose the beams within 45 degrees of the right."""

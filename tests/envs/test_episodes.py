@@ -24,7 +24,7 @@ ONE = np.zeros(1, np.intp)
 class Script(ConfiguredBrain):
     """Plays rows of actions, the same in every simulation, from each episode's start."""
 
-    name, robot_kind = "script", "any"
+    name = "script"
 
     def __init__(self, rows: np.ndarray) -> None:
         self.rows = rows

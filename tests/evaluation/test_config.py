@@ -66,8 +66,11 @@ def test_one_brain_has_a_short_form():
         ([*BASE, "--brains.a.forward_speed=1"], "brains.a.type is missing"),
         ([*BASE, "--brains=avoidance"], "such as brains.NAME.type"),
         ([*BASE, "--brains.my-brain.type=avoidance"], "'my-brain' is not a valid name"),
-        ([*BASE, "--brains.a.type=reach"], "brains.a.type is 'reach', which drives an arm"),
-        (["--robot.type=ur5", "--task.type=avoid", "--brains.a.type=avoidance"], "which is for robot.type"),
+        ([*BASE, "--brains.a.type=reach"], "brains.a.type is 'reach', which needs an arm; robot.type is 'turtlebot3'"),
+        (
+            ["--robot.type=ur5", "--task.type=avoid", "--brains.a.type=avoidance"],
+            "which needs a drive; robot.type is 'ur5', which has none. Valid: turtlebot3",
+        ),
         ([*TWO, "--baseline=older"], "Did you mean 'old'"),
         ([*TWO, "--only=[never]"], "Unknown brain in only 'never'"),
         ([*TWO, "--only=[]"], "only is empty"),

@@ -1,12 +1,15 @@
 """Plug-ins that are wrong: each is named, and the rest goes on."""
 
 import importlib
+import re
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import bhd_lerobot as bhd
 from bhd_lerobot import registry
 from bhd_lerobot.bodies import registry as bodies
 from bhd_lerobot.errors import ConfigError
@@ -15,6 +18,7 @@ from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.tasks.task import TaskConfig
+from tests.cases import each_case
 from tests.recording.support import options
 
 BRAIN = """
@@ -27,7 +31,7 @@ class Config(bhd.BrainConfig):
 
 @bhd.register_brain("{name}", Config)
 class Mine(bhd.ConfiguredBrain):
-    robot_kind = "base"
+    needs = (bhd.Drive,)
 """
 
 
@@ -101,6 +105,17 @@ def test_a_brain_that_is_not_derived_from_the_base_class_is_refused(installer) -
     assert "brain 'plain', Mine, is not derived from bhd_lerobot.ConfiguredBrain" in text
     assert "write class Mine(bhd.ConfiguredBrain)" in text
     assert "plain" not in registry.brains_for("turtlebot3")
+
+
+@each_case(
+    ("attribute", "value"), [("robot_kind", "base"), ("needs", bhd.Drive), ("needs", ("base",)), ("needs", None)]
+)
+@each_case("register", [registry.register_brain, registry.register_task])
+def test_needs_are_parts_of_a_robot_and_an_old_robot_kind_is_named(register: Any, attribute: str, value: Any) -> None:
+    made = type("Mine", (bhd.ConfiguredBrain,), {attribute: value})
+    given = re.escape(f"{attribute} = {value!r}")
+    with pytest.raises(ConfigError, match=rf"class of 'mine', Mine, has {given}\. .*needs = \(bhd\.Drive"):
+        register("mine", bhd.BrainConfig)(made)
 
 
 def test_a_configuration_without_its_class_is_refused(installer, tmp_path) -> None:

@@ -40,7 +40,7 @@ class Bench:
         self.given: list[list[BrainCommand]] = [[] for _ in range(self.n)]
 
     def begin(self, instructions: Sequence[str] = ()) -> None:
-        self.brain.bind(RobotFeatures(self.observed, self.observed, 25, self.names))
+        self.brain.bind(RobotFeatures(self.observed, self.observed, 25, self.names, body=ur5()))
         self.brain.reset(np.arange(self.n), [0] * self.n, self.n, instructions or [""] * self.n)
 
     def look(

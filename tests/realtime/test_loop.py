@@ -232,23 +232,10 @@ def test_a_sign_of_life_from_the_future_is_none(word):
 
 def test_absent_processes_are_not_watched():
     """A word that was never written belongs to a process that there is not."""
-    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01, plant_timeout_s=0.01))
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01))
     loop.drive(0, 100)
     loop.run(100)
     assert set(loop.modes) == {Mode.TRACKING}
-
-
-@pytest.mark.law
-@settings(max_examples=30)
-@given(timeout_ms=st.integers(1, 100))
-def test_a_silent_plant_is_a_fault_at_its_time_out(timeout_ms):
-    loop = VirtualLoop(LoopLimits(plant_timeout_s=timeout_ms / 1e3), alive=(Word.PLANT_ALIVE,))
-    loop.script[10] = loop.alive.clear  # its last sign of life was when tick 9 ended
-    loop.run(60)
-    fault = loop.modes.index(Mode.FAULT)
-    assert (fault - 9) * TICK_NS > timeout_ms * MS >= (fault - 10) * TICK_NS
-    assert loop.watchdogs[fault] == Watchdog.PLANT
-    assert set(loop.modes[fault:]) == {Mode.FAULT}
 
 
 @settings(max_examples=20)

@@ -278,7 +278,10 @@ def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
         ({"robot__fps": 20, "dataset__fps": 10}, "leave robot.fps out"),
         ({"dataset__fps": 7}, "valid values of fps"),
         ({"task__duration_s": 12}, "task.duration_s is 12.* and dataset.episode_time_s is 3"),
-        ({**ARM, "task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
+        (
+            {**ARM, "task__type": "avoid", "brain__type": "avoidance"},
+            "needs a drive; robot.type is 'ur5', which has none. Valid: turtlebot3",
+        ),
         (
             {**ARM, "brain__type": "gap_follower"},
             "Brains for it: blanked, dagger, language, learned, noop, pick, pick_servo, random, reach, reach_servo",

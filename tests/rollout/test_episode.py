@@ -27,7 +27,7 @@ FRAMES = 20
 class Script(ConfiguredBrain):
     """Plays the rows of a script: one by one, or `length` of them at a time, every `every` frames."""
 
-    name, robot_kind = "script", "any"
+    name = "script"
 
     def __init__(self, rows: np.ndarray, length: int = 0, every: int = 1) -> None:
         self.rows, self.length, self.every = rows, length, every

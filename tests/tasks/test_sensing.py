@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
@@ -35,7 +36,7 @@ def make(name: str, n: int = 1, **sensing: float) -> Any:
 
 def truth(task: Any, frame: int, n: int = 1) -> Any:
     """Return what is true in a frame: everything that can move moves on by a centimetre along x."""
-    if task.robot_kind == "base":
+    if Drive in task.needs:
         pose = np.tile([-2.0 + 0.01 * frame, -0.5, 0.0], (n, 1))
         return BaseTruth(pose, np.zeros(n, np.bool_))
     poses, no = np.zeros((n, MAX_OBJECTS, 7)), np.zeros(n, np.bool_)

@@ -14,7 +14,7 @@ from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.registry import is_for, robot_of_task
+from bhd_lerobot.registry import check_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.host import describe
@@ -116,7 +116,7 @@ def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robo
     said, command = how_to_evaluate(PolicyContract(robot_type=robot.type), "c")
     assert "does not record its task" in said
     config = parse(EvalConfig, [*shlex.split(command)[1:], "--brain.type=learned"])
-    assert is_for(robot_of_task(config.task), robot.type)
+    check_task(config.task, robot.type)
 
 
 def test_the_command_names_the_module_of_a_policy_that_nothing_else_imports() -> None:

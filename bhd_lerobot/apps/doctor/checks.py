@@ -281,7 +281,7 @@ def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) ->
         share = worst * rate
         found = f"{robot}, {rate} Hz: at worst {worst * 1e6:.0f} µs late, {100 * share:.1f} % of {1e3 / rate:g} ms"
         values = {"rate": rate, "share": f"{100 * share:.0f} %", "timeout": f"{1e3 * timeout_s:g} ms"}
-        # The last command was written a period before the one that is late.
+        # The newest reading came a period before the tick that is late.
         if worst + 1 / rate >= timeout_s:
             findings.append(wrong("latency.stopped", found, **values))
         elif share >= LATE_SHARE:

@@ -23,7 +23,6 @@ HEARTBEATS = {
     "brain": Word.BRAIN_ALIVE,
     "cerebellum": Word.CEREBELLUM_ALIVE,
     "recorder": Word.RECORDER_ALIVE,
-    "plant": Word.PLANT_ALIVE,
 }
 POSE = ("x", "y", "yaw")
 

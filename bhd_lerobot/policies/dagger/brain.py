@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.options.declared import Positive
 from bhd_lerobot.policies.brain import (
-    ANY_ROBOT,
     Brain,
     BrainConfig,
     ConfiguredBrain,
@@ -78,7 +77,6 @@ class DaggerBrain(ConfiguredBrain):
     """
 
     name = "dagger"
-    robot_kind = ANY_ROBOT
 
     def __init__(self, config: DaggerConfig, learner: Brain, expert: Brain) -> None:
         super().__init__(config)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError, NothingFitsError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
@@ -100,7 +101,7 @@ class LanguageBrain(PickBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the gripper, and the objects or the camera that shows them."""
         super().bind(robot)
-        self._home = robot.arm.home
+        self._home = robot.need(Arm).home
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.options.declared import Count
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 
@@ -65,7 +65,6 @@ class LearnedBrain(ConfiguredBrain):
     """
 
     name = "learned"
-    robot_kind = ANY_ROBOT
 
     def __init__(self, config: LearnedBrainConfig) -> None:
         from bhd_lerobot.policies.learned.inference import expected_frames, make_inference
@@ -96,12 +95,12 @@ class LearnedBrain(ConfiguredBrain):
     def robot_of(config: LearnedBrainConfig) -> str:
         """Return the robot that a configuration's policy was trained on, without loading the policy.
 
-        Where there is no such folder, it says `ANY_ROBOT`: a configuration may be read before its policy is trained,
+        Where there is no such folder, it returns no name: a configuration may be read before its policy is trained,
         and reading it asks nobody on the network. Making the brain then fails, or fetches the policy.
         """
         if not Path(config.path).expanduser().is_dir():
-            return ANY_ROBOT
-        return PolicyContract.load(config.path).robot_type or ANY_ROBOT
+            return ""
+        return PolicyContract.load(config.path).robot_type or ""
 
     def bind(self, robot: RobotFeatures) -> None:
         """Check that these are the features, the rate and the cameras that the policy was trained on."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
@@ -50,7 +51,7 @@ class GoalBrain(ConfiguredBrain, ABC):
         config: the parameters.
     """
 
-    robot_kind = "arm"
+    needs: tuple[type, ...] = (Arm,)
     has_plan = True
 
     def __init__(self, config: Any = None) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm, GripperSpec
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError, PerceptionError
@@ -65,6 +66,7 @@ class PickBrain(GoalBrain):
     """Carries out a plan of skills with goals; its plan is to pick up the object that the task marks."""
 
     name = "pick"
+    needs = (Arm, GripperSpec)
 
     def __init__(self, config: PickBrainConfig | None = None) -> None:
         super().__init__(config or PickBrainConfig())
@@ -75,7 +77,7 @@ class PickBrain(GoalBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
         self._find_objects(robot)
-        self._max_opening = robot.arm.gripper.max_opening
+        self._max_opening = robot.need(GripperSpec).max_opening
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
 
     def _find_objects(self, robot: RobotFeatures) -> None:

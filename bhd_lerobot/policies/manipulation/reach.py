@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
@@ -33,7 +34,7 @@ class ReachBrain(GoalBrain):
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the target, and home."""
-        self._home = robot.arm.home
+        self._home = robot.need(Arm).home
         self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm, GripperSpec
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.errors import ConfigError
@@ -88,7 +89,7 @@ class PickServoConfig(ServoConfig):
 class _ServoBrain(ConfiguredBrain):
     """Finds its inputs, and makes a tool pose of where the tool is to go."""
 
-    robot_kind = "arm"
+    needs = (Arm, GripperSpec)
 
     def __init__(self, config: ServoConfig) -> None:
         super().__init__(config)
@@ -104,7 +105,7 @@ class _ServoBrain(ConfiguredBrain):
                 f"The brain {self.name!r} sees and gives tool poses; this robot has the actions "
                 f"{', '.join(robot.action_names[:3])}, …. Set --robot.action_space=tool --robot.tool_pose=true."
             )
-        self._max_opening = robot.arm.gripper.max_opening
+        self._max_opening = robot.need(GripperSpec).max_opening
         if (wider := getattr(self.config, "wider_m", 0.0)) > self._max_opening:
             raise ConfigError(f"brain.wider_m is {wider}; the gripper opens by {self._max_opening} m at the most.")
         self._tool = find_columns(robot.observation_names, _TOOL, self.name, "observation")

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.options.declared import Finite, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns, find_scan
 
@@ -46,7 +47,7 @@ class AvoidanceBrain(ConfiguredBrain):
     """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop."""
 
     name = "avoidance"
-    robot_kind = "base"
+    needs = (Drive, LidarSpec)
     uses_privileged_state = False
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:

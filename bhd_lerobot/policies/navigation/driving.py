@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Positive, Range, Share
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
@@ -60,7 +61,7 @@ class DrivingConfig(BrainConfig):
 class DrivingBrain(ConfiguredBrain):
     """Reads a scan and the measured twist, and commands a twist along one of `_paths`, for `_n` robots."""
 
-    robot_kind = "base"
+    needs = (Drive, LidarSpec)
     has_narrow = True
     """Whether it drives through places with less room than usual, which needs a table of its own."""
     config: Any

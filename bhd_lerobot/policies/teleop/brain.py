@@ -15,7 +15,7 @@ from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_t
 from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.options.parse import types_of
 from bhd_lerobot.options.units import other_units
-from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.calls import Calls
 from bhd_lerobot.policies.teleop.config import TeleopConfig
@@ -32,7 +32,6 @@ class TeleopBrain(ConfiguredBrain):
     """
 
     name = "teleop"
-    robot_kind = ANY_ROBOT
     uses_privileged_state = False
     config: TeleopConfig
 

@@ -32,7 +32,7 @@ class TakeoverBrain(ConfiguredBrain):
             )
         super().__init__(None)
         self._brain, self._person, self._is_taken = brain, person, is_taken
-        self.name, self.robot_kind, self.has_plan = brain.name, brain.robot_kind, brain.has_plan
+        self.name, self.needs, self.has_plan = brain.name, brain.needs, brain.has_plan
         self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
         self._was_taken = self._is_settled = False
         self._start: tuple[Any, ...] = ()

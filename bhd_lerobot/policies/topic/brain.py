@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import BrainStoppedError, ConfigError, RealtimeError, unknown_name
-from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
@@ -27,7 +27,6 @@ class TopicBrain(ConfiguredBrain):
     """Drives one robot with what another node sends."""
 
     name = "topic"
-    robot_kind = ANY_ROBOT
     uses_privileged_state = False
     config: TopicConfig
 

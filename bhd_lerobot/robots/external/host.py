@@ -56,7 +56,6 @@ class LeRobotHost:
         lock: let go of when it is closed.
     """
 
-    robot_kind = "any"
     n = 1
     body = None
     world = None

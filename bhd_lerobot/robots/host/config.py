@@ -1,6 +1,7 @@
 """Options of a robot on the wall clock."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from bhd_lerobot.options.declared import Count, Options, Positive
 from bhd_lerobot.realtime.loop import LoopLimits
@@ -24,12 +25,14 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
         recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
-        plant_process: run the simulated world in a process of its own, which stops the robot by itself when it gets
-            no commands of the cerebellum, as a motor controller would.
-        plant_timeout_s: it does that after so long without a command, and the cerebellum goes to FAULT after so long
-            without a sign of life of it [s]; at least two control ticks.
+        plant_timeout_s: with `robot.plant`, a reading that is older than this, and than three control ticks, is a
+            FAULT [s].
         buffer_s: so long may the recorder fall behind before a state is lost, and counted [s].
     """
+
+    removed: ClassVar[dict[str, str]] = {
+        "plant_process": "a simulated world ticks in the cerebellum's process, and ends with it",
+    }
 
     priority: int = 80
     lock_memory: bool = True
@@ -40,7 +43,6 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
     recorder_timeout_s: Positive = 1.0
     most_misses: Count = 10
     most_catch_up: Count = 10
-    plant_process: bool = False
     plant_timeout_s: Positive = 0.02
     buffer_s: Positive = 8.0
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import draccus
 import numpy as np
@@ -37,7 +37,6 @@ class Host(ABC):
         bridge: how commands get to the cerebellum; a `LockstepBridge` that advances this host if None.
 
     Attributes:
-        robot_kind: what tasks and brains are for: ``"base"`` or ``"arm"``.
         n: how many robots.
         rates: the rates.
         body: the robot's hardware.
@@ -50,7 +49,6 @@ class Host(ABC):
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
     """
 
-    robot_kind: ClassVar[str]
     action_names: tuple[str, ...]
     world: Any = None
     clock: Clock | None = None

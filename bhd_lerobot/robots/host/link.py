@@ -9,29 +9,25 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import LiveLayout, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.sections import BrainSide, section_sizes
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec
-from bhd_lerobot.robots.host.remote_plant import plant_shape
-from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import state_dtype
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
 _ANSWER_S = 30.0  # that it may take to place a scene
 _HEAD_START_S = 0.02  # from the order to run to the first tick
-_SILENCE_S = 2.0  # so long without a sign of life a plant is stopped, or gets no processor time
 _END_S = 5.0  # that a process has to end in order before it is killed
 _FIFO = 256
 
@@ -52,12 +48,6 @@ class LiveLink:
         rates = mirror.rates
         dtype = state_dtype(mirror)
         frames = max(64, round(realtime.buffer_s * rates.fps * 4))
-        shape = plant_shape(mirror) if realtime.plant_process and isinstance(mirror, Simulation) else None
-        if shape is not None and realtime.plant_timeout_s * rates.control_hz < 2:
-            raise ConfigError(
-                f"robot.realtime.plant_timeout_s is {realtime.plant_timeout_s:g}; at control_hz = {rates.control_hz} "
-                f"it must be at least {2 / rates.control_hz:g} s, two ticks."
-            )
         layout = LiveLayout(
             mirror.cerebellum.width,
             dtype,
@@ -67,7 +57,6 @@ class LiveLink:
                 **section_sizes(mirror.cerebellum),
                 "statistics": TimingStatistics.nbytes,
                 "frames": FrameLog.nbytes(dtype, frames),
-                **({} if shape is None else shape.sections()),
             },
         )
         about = {
@@ -79,35 +68,32 @@ class LiveLink:
             "commands": list(mirror.body.limits.names),
             "observations": list(mirror.observation_names),
             "brain_pid": os.getpid(),
-            **({} if shape is None else {"plant": shape.as_dict()}),
         }
         self.grants: list[dict[str, Any]] = []
         self._plant: str = config.plant
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._pipes: dict[str, Connection] = {}
+        self._pipe: Connection | None = None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
         self.log = FrameLog(dtype, frames, self.block.section("frames"))
         self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
         try:
-            self._start(mirror, realtime)
+            self._start(mirror)
         except BaseException:
             self.close()
             raise
 
-    def _start(self, mirror: Host, realtime: RealtimeConfig) -> None:
+    def _start(self, mirror: Host) -> None:
         spec = LiveSpec.of(mirror, self.block.name)
         pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
-        self._spawn_piped("cerebellum", "bhd_lerobot.robots.host.process")
-        if realtime.plant_process:
-            self._spawn_piped("plant", "bhd_lerobot.robots.host.plant_process")
+        ours, theirs = socket.socketpair()
+        with theirs:
+            arguments = ["-m", "bhd_lerobot.robots.host.process", str(theirs.fileno())]
+            self._spawn("cerebellum", arguments, (theirs.fileno(),))
+        self._pipe = Connection(ours.detach())
         self._spawn("recorder", ["-m", "bhd_lerobot.realtime.recorder_process", self.block.name])
-        self._pipes["cerebellum"].send(spec)
-        if realtime.plant_process:
-            # One above the cerebellum: no command that fails to come, for whatever reason, keeps it from noticing.
-            privileges = replace(spec.privileges, priority=min(spec.privileges.priority + 1, 99))
-            self._pipes["plant"].send(replace(spec, privileges=privileges))
+        self._pipe.send(spec)
         self.block.show_life(Word.BRAIN_ALIVE)
         self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
         serve = self.bridge_side.serve
@@ -117,9 +103,6 @@ class LiveLink:
             thread.start()
         self.about = self._answer("ready", _START_S)
         self.grants = self.about["grants"]
-        if realtime.plant_process:
-            grants = self._answer("ready", _START_S, "plant")["grants"]
-            self.grants = self.grants + [{**grant, "name": f"plant: {grant['name']}"} for grant in grants]
         self._until(lambda: self.block.words[Word.RECORDER_ALIVE] != 0, _START_S, "The recorder did not start")
 
     def _spawn(self, name: str, arguments: list[str], descriptors: tuple[int, ...] = ()) -> None:
@@ -127,12 +110,6 @@ class LiveLink:
         self._processes[name] = subprocess.Popen(
             [sys.executable, *arguments], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
         )
-
-    def _spawn_piped(self, name: str, module: str) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._spawn(name, ["-m", module, str(theirs.fileno())], (theirs.fileno(),))
-        self._pipes[name] = Connection(ours.detach())
 
     @property
     def pids(self) -> dict[str, int]:
@@ -142,9 +119,6 @@ class LiveLink:
     def place(self, scene: Any, seed: int) -> None:
         """Put the robot into a scene, at rest; its loop stands."""
         self.pause()
-        if "plant" in self._pipes:  # first: the cerebellum starts from where the robot is
-            self._ask("place", scene, seed, to="plant")
-            self._answer("place", _ANSWER_S, "plant")
         self._ask("place", scene, seed)
         self._answer("place", _ANSWER_S)
         self.block.publish_scene(scene_to_json(scene))
@@ -154,14 +128,7 @@ class LiveLink:
         words = self.block.words
         words[Word.PAUSE] = 0
         segment = int(words[Word.SEGMENT])
-        has_plant = "plant" in self._pipes
-        start = time.monotonic_ns() + round(_HEAD_START_S * (1 + has_plant) * NANOSECONDS)
-        if has_plant:
-            self._ask("run", start, to="plant")
-            self._answer("run", _ANSWER_S, "plant")
-            answered = time.monotonic_ns()
-            # The first frame's observation is to be of now.
-            self._until(lambda: words[Word.PLANT_ALIVE] > answered, _ANSWER_S, "The plant did not start")
+        start = time.monotonic_ns() + round(_HEAD_START_S * NANOSECONDS)
         self._ask("run", start)
         self._running = True
         self._until(lambda: words[Word.SEGMENT] > segment, _ANSWER_S, "The loop did not start")
@@ -174,30 +141,22 @@ class LiveLink:
         if self._running:
             self.block.words[Word.PAUSE] = 1
             self._answer("run", _ANSWER_S)
-            if "plant" in self._pipes:
-                self._answer("stood", _ANSWER_S, "plant")
             self._running = False
 
     def check(self) -> None:
-        """Raise if a process has ended, or the plant's is stopped."""
+        """Raise if a process has ended."""
         for name, process in self._processes.items():
             status = process.poll()
             if status is not None:
                 how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
                 self._complain(name, how)
-        if self._running and "plant" in self._pipes:
-            silence = abs(time.monotonic_ns() - int(self.block.words[Word.PLANT_ALIVE]))
-            if silence > _SILENCE_S * NANOSECONDS:
-                self._complain(
-                    "plant", f"({self.pids['plant']}) has shown no sign of life for {silence / NANOSECONDS:.1f} s"
-                )
 
     def _complain(self, name: str, how: str) -> NoReturn:
-        simulated = not self._plant and "plant" not in self._pipes
         what = {
-            "cerebellum": "The simulated robot ended with it." if simulated else "The plant stops the robot by itself.",
+            "cerebellum": "The plant stops the robot by itself."
+            if self._plant
+            else "The simulated robot ended with it.",
             "recorder": "The robot decelerates and holds.",
-            "plant": "The cerebellum is in FAULT; the simulated robot stands still.",
         }[name]
         raise RealtimeError(f"The {name}'s process {how}. {what} Episodes that were saved are intact.")
 
@@ -207,9 +166,9 @@ class LiveLink:
             return
         words = self.block.words
         words[Word.PAUSE] = words[Word.END] = 1
-        for pipe in self._pipes.values():
+        if self._pipe is not None:
             with contextlib.suppress(OSError):
-                pipe.send(("end",))
+                self._pipe.send(("end",))
         for process in self._processes.values():
             try:
                 process.wait(_END_S)
@@ -220,8 +179,8 @@ class LiveLink:
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(5.0)
-        for pipe in self._pipes.values():
-            pipe.close()
+        if self._pipe is not None:
+            self._pipe.close()
         self.block.close()
 
     # --- waiting -----------------------------------------------------------------------------------------------------
@@ -242,33 +201,33 @@ class LiveLink:
                 raise RealtimeError(f"{message} within {seconds:g} s.")
             self.wait()
 
-    def _ask(self, kind: str, *arguments: Any, to: str = "cerebellum") -> None:
+    def _ask(self, kind: str, *arguments: Any) -> None:
         try:
-            self._pipe(to).send((kind, *arguments))
+            self._connection().send((kind, *arguments))
         except OSError:
             self.check()
             raise
 
-    def _pipe(self, name: str) -> Connection:
-        if self._stop.is_set():
+    def _connection(self) -> Connection:
+        if self._stop.is_set() or self._pipe is None:
             raise RealtimeError("The robot's processes have ended.")
-        return self._pipes[name]
+        return self._pipe
 
-    def _answer(self, wanted: str, seconds: float, name: str = "cerebellum") -> Any:
-        connection = self._pipe(name)
+    def _answer(self, wanted: str, seconds: float) -> Any:
+        connection = self._connection()
         end = time.monotonic() + seconds
         while not connection.poll(0.01):
             self.check()
             if time.monotonic() > end:
-                raise RealtimeError(f"The {name}'s process did not answer ({wanted}) within {seconds:g} s.")
+                raise RealtimeError(f"The cerebellum's process did not answer ({wanted}) within {seconds:g} s.")
         try:
             kind, value = connection.recv()
         except (EOFError, OSError):
-            self._processes[name].wait(5.0)
+            self._processes["cerebellum"].wait(5.0)
             self.check()
-            raise RealtimeError(f"The {name}'s process closed its pipe.") from None
+            raise RealtimeError("The cerebellum's process closed its pipe.") from None
         if kind in ("failed", "refused"):
-            raise RealtimeError(f"The {name}'s process refused the request: {value}")
+            raise RealtimeError(f"The cerebellum's process refused the request: {value}")
         if kind != wanted:
-            raise RealtimeError(f"The {name}'s process answered {kind!r} where {wanted!r} was expected.")
+            raise RealtimeError(f"The cerebellum's process answered {kind!r} where {wanted!r} was expected.")
         return value

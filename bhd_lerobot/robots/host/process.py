@@ -1,7 +1,6 @@
 """The real-time process: the cerebellum of one robot, and its plant, ticking on the wall clock.
 
-The plant is a simulated world or, with `robot.plant`, another package's class, which talks to a robot. With a simulated
-world in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
+The plant is a simulated world or, with `robot.plant`, another package's class, which talks to a robot.
 
 Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.host.process``, never forked and not by
 `multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot, and
@@ -21,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -33,7 +32,6 @@ from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
-from bhd_lerobot.realtime.plant_link import PlantLink
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
@@ -98,10 +96,10 @@ class LiveSpec:
         """Return the plant; it is not opened yet."""
         return CheckedPlant.made(self.plant, self._config, self.body, self.oldest_ns)
 
-    def make_host(self, *plant: CheckedPlant, planning: "Planning | None" = None) -> Any:
+    def make_host(self, plant: CheckedPlant | None = None, planning: "Planning | None" = None) -> Any:
         """Return the host of a plant, or without one a simulation of one robot."""
         planned = () if planning is None else (planning,)
-        return pkgutil.resolve_name(self.host)(self._config, *(plant or (1, 1)), *planned)
+        return pkgutil.resolve_name(self.host)(self._config, *((plant,) if plant else (1, 1)), *planned)
 
 
 class LiveProcess:
@@ -114,23 +112,15 @@ class LiveProcess:
         dof = len(spec.body.arm.chain.joints) if spec.body.arm else 0
         planning = planning_link(self._block, dof, spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
-        self._host: Host
-        link, sensed_ns, age_ns = PlantLink.of(self._block), time.monotonic_ns, None
         if self._plant is not None:
             self._plant.open()
-            self._host = spec.make_host(self._plant, planning=planning)
-            age_ns = self._age_ns
-        elif link is not None:
-            from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
-
-            self._host = remote = RemoteSimulation(spec.make_host(planning=planning), link)
-            sensed_ns = remote.sensed_ns
-        else:
-            self._host = spec.make_host(planning=planning)
+        self._host: Host = spec.make_host(self._plant, planning=planning)
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
-        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns, age_ns, self._problem)
+        self._publisher = StatePublisher(
+            self._host, self._block.ring, age_ns=self._age_ns if self._plant else None, problem=self._problem
+        )
         # A tick is for the time that it was due at. How far stamps are ahead of now is checked where they are read.
         cerebellum.readings.accept_until(spec.oldest_ns, spec.oldest_ns)
         period = NANOSECONDS // spec.rates.control_hz
@@ -264,18 +254,8 @@ class LiveProcess:
         self._block.close()
 
 
-class Worker(Protocol):
-    """What one of the robot's real-time processes does."""
-
-    def work(self) -> None:
-        """Take messages until the brain's process says end, or is gone."""
-
-    def close(self) -> None:
-        """Free everything."""
-
-
-def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
-    """Run a real-time process; the program's one argument is the descriptor of its pipe."""
+def main() -> int:
+    """Run the process; its one argument is the descriptor of its pipe."""
     connection = Connection(int(sys.argv[1]))
     # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -283,7 +263,7 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
     compile_at_once()
     try:
         with Privileges() as privileges:
-            process = make(spec, connection)
+            process = LiveProcess(spec, connection)
             try:
                 grants = [grant.as_dict() for grant in privileges.acquire(spec.privileges)]
                 heavy = sorted({"torch", "lerobot", "mujoco"} & set(sys.modules))
@@ -306,4 +286,4 @@ def _send_failure(connection: Connection, message: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_worker(LiveProcess))
+    sys.exit(main())

@@ -70,7 +70,7 @@ class LiveHost:
     def __init__(self, mirror: Host, name: str) -> None:
         self.mirror = mirror
         self.config, self.rates, self.body, self.world = mirror.config, mirror.rates, mirror.body, mirror.world
-        self.robot_kind, self.knows, self.camera_shapes = mirror.robot_kind, mirror.knows, mirror.camera_shapes
+        self.knows, self.camera_shapes = mirror.knows, mirror.camera_shapes
         self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
         self.columns = mirror.columns
         self.running = np.ones(1, np.bool_)

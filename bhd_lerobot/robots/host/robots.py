@@ -123,10 +123,6 @@ class Robots(Protocol):
     """n robots of one kind, each in an episode of its own."""
 
     @property
-    def robot_kind(self) -> str:
-        """What tasks and brains are for: ``"base"``, ``"arm"``, or ``"any"`` if it is not known."""
-
-    @property
     def config(self) -> Any:
         """The robot's configuration."""
 

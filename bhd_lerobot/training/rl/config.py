@@ -14,8 +14,8 @@ from bhd_lerobot.options.declared import Count, Finite, NotNegative, OneOf, Opti
 from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
-from bhd_lerobot.registry import is_for, kind_of_robot, robot_of_task, robots_of
-from bhd_lerobot.tasks.task import Event, TaskConfig
+from bhd_lerobot.registry import check_task
+from bhd_lerobot.tasks.task import TASKS, Event, TaskConfig
 
 # Not among them: that an expert drives ends nothing, and of a failure without a cause only a person says so.
 _EVENTS = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION, Event.FAILURE))
@@ -202,8 +202,7 @@ class RlConfig(Options):
         super().__post_init__()
         self._check_reward()
         _ = self.policy.actor()
-        if not is_for(wanted := robot_of_task(self.task), self.robot.type):
-            raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {' or '.join(robots_of(wanted))}.")
+        check_task(self.task, self.robot.type)
         if self.validation.seed == self.seed:
             raise ConfigError(
                 f"validation.seed and seed are both {self.seed}; the policy would be evaluated on its training "
@@ -233,7 +232,7 @@ class RlConfig(Options):
         for event in self.reward.events:
             if event not in _EVENTS:
                 raise ConfigError(unknown_name("event in reward.events", event, _EVENTS))
-        if self.reward.potential == "pose" and kind_of_robot(self.robot.type) != "arm":
+        if self.reward.potential == "pose" and "target_qw" not in TASKS.of(self.task).environment_names:
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
 
 

@@ -236,7 +236,7 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     assert shown.episode_time == pytest.approx(2.01)
     assert shown.command_age == pytest.approx(0.04)
     assert shown.observation_age == pytest.approx(0.16)
-    assert shown.alive == {**dict.fromkeys(("brain", "cerebellum", "recorder"), pytest.approx(0.01)), "plant": None}
+    assert shown.alive == dict.fromkeys(("brain", "cerebellum", "recorder"), pytest.approx(0.01))
     assert [(d.name, d.requested, d.applied, d.measured) for d in shown.dimensions] == [
         ("x.vel", 0.2, 0.1, 0.09),
         ("theta.vel", 1.0, 0.5, 0.4),

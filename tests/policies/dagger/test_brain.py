@@ -27,7 +27,9 @@ from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.policies.manipulation.servo import PickServoConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
-from bhd_lerobot.registry import make_brain, robot_of_brain
+from bhd_lerobot.registry import check_brain, drives, make_brain, robot_of_brain
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from tests.cases import each_case
 
 BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
@@ -43,8 +45,6 @@ NO_ADVICE = np.zeros((1, 2))
 
 class Fake(ConfiguredBrain):
     """Always wants the same, and remembers what it received."""
-
-    robot_kind = "any"
 
     def __init__(self, name: str, value: float) -> None:
         self.name, self.value = name, value
@@ -144,9 +144,16 @@ def test_what_does_not_fit_together_is_refused() -> None:
         DaggerConfig(config(), GapFollowerConfig())
     with pytest.raises(ConfigError, match=r"brain\.learner\.stream is true"):
         DaggerConfig(LearnedBrainConfig("x", stream=True), GapFollowerConfig())
-    with pytest.raises(ConfigError, match=r"brain\.learner drives a base, but brain\.expert drives an arm"):
-        robot_of_brain(DaggerConfig(AvoidanceConfig(), PickServoConfig()))
-    assert robot_of_brain(DaggerConfig(NoopConfig(), PickServoConfig())) == "arm"
+    both = DaggerConfig(AvoidanceConfig(), PickServoConfig())
+    for robot, message in (
+        (UR5Config(), r"brain\.learner\.type is 'avoidance', which needs a drive and a lidar; robot\.type is 'ur5'"),
+        (TurtleBot3Config(), r"brain\.expert\.type is 'pick_servo', which needs an arm and a gripper; robot"),
+    ):
+        assert not drives(both, robot.type)
+        with pytest.raises(ConfigError, match=message):
+            check_brain("brain", both, robot)
+    one = DaggerConfig(NoopConfig(), PickServoConfig())
+    assert [name for name in ("turtlebot3", "ur5") if drives(one, name)] == ["ur5"]
 
 
 @each_case(

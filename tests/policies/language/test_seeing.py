@@ -72,7 +72,7 @@ class Table:
         self.brain = LanguageBrain(config)
         self.eyes = Eyes(*looks)
         self.brain.perceiver = self.eyes  # type: ignore[assignment]
-        self.brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
+        self.brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, (), body=ur5()))
         assert self.brain.uses_images
         assert not self.brain.uses_privileged_state
         self.brain.reset(np.array([0]), [0], 1, [instruction])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import TableObject
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -176,7 +176,7 @@ def test_a_target_that_vanishes_is_given_up(column: int) -> None:
 
 def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     with pytest.raises(ConfigError, match="'pick' needs the environment feature"):
-        PickBrain().bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
+        PickBrain().bind(RobotFeatures(OBSERVED, OBSERVED, 25, (), body=ur5()))
     desk = Desk(PickBrain(), [scene(TableObject("box", "green", 0.05, 0.05, 0.1, 0.5, 0.0))])
     assert desk.look() == {}
     assert "green box does not fit" in desk.brain.plan(0)["problem"]

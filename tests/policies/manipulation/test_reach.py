@@ -122,7 +122,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
 
 def test_a_task_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
-        ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, ()))
+        ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, (), body=ur5()))
 
 
 @pytest.mark.parametrize("randomised", [False, True])

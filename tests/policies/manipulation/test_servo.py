@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -31,7 +31,7 @@ TOOL = {"action_space": "tool", "tool_pose": True}
 
 
 def features(environment: tuple[str, ...]) -> RobotFeatures:
-    return RobotFeatures(TOOL_NAMES, TOOL_NAMES, 25, environment)
+    return RobotFeatures(TOOL_NAMES, TOOL_NAMES, 25, environment, body=ur5())
 
 
 def tools(n: int, rng: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,7 @@ import pytest
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
 from bhd_lerobot.registry import make_task
@@ -30,7 +30,6 @@ SEEN = Observation(("a.pos",), np.zeros((1, 1)))
 class Counting(ConfiguredBrain):
     """Says which action it is, since its last reset; looks in the first alone."""
 
-    robot_kind = ANY_ROBOT
     uses_images = True
 
     def __init__(self, name: str, value: float) -> None:

@@ -12,9 +12,10 @@ from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import CommandRefusedError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.shared_memory import names
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from tests.robots.host.support import drive, is_alive, is_gone, mode, turtlebot, unique
+from tests.robots.host.support import drive, is_alive, is_gone, mode, relaxed, turtlebot, unique
 from tests.waiting import until
 
 NAME = unique("shared")
@@ -189,3 +190,21 @@ def test_it_keeps_lerobots_contract(robot):
     assert check_robot(lambda: turtlebot(unique("contract")), adversarial=True) == ()
     assert is_gone(unique("contract"))
     assert mode(robot) in (Mode.HOLD, Mode.TRACKING)
+
+
+@pytest.mark.thorough
+def test_a_base_on_the_wall_clock_stops_before_a_wall():
+    config = TurtleBot3Config(
+        id=unique("wall"), clock="realtime", collision_monitor=True, command_timeout_s=20.0, realtime=relaxed()
+    )
+    speeds: list[float] = []
+
+    def stands() -> bool:
+        speeds.append(robot.send_action({"x.vel": -0.22, "theta.vel": 0.0})["x.vel"])
+        return min(speeds) < -0.2 and speeds[-1] > -0.01
+
+    with TurtleBot3(config) as robot:
+        until(stands, "it stands before a wall")
+        assert not robot.host.truth().touched.any()
+        assert mode(robot) == Mode.TRACKING
+        assert robot.get_observation()["scan_180.pos"] < 0.25

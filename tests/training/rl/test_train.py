@@ -295,7 +295,10 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"algorithm": "sac"}, "Valid: ppo"),
     ({"validation__seed": 0}, "evaluated on its training episodes"),
     ({"critic_warmup": 10}, "needs --start_from"),
-    ({"robot__type": "ur5", "robot__beams": None}, "this task is for turtlebot3"),
+    (
+        {"robot__type": "ur5", "robot__beams": None},
+        "needs a drive; robot.type is 'ur5', which has none. Valid: turtlebot3",
+    ),
     ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
     ({"resume": "true"}, "resume needs --output_dir"),
     ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
