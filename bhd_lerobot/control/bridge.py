@@ -117,13 +117,21 @@ class LockstepBridge(Bridge):
         cerebellum: the controller.
         rates: the rates; `control_hz` is the cerebellum's.
         advance: moves the plant on by one tick; called after every tick.
+        run: runs up to so many ticks from a number on, of cerebellum and plant; returns how many it ran, none if
+            they are to be run one by one.
 
     Raises:
         ConfigError: a frame lasts longer than the command time-out, so that every command would time out; or the
             cerebellum was made for another rate.
     """
 
-    def __init__(self, cerebellum: Cerebellum, rates: Rates, advance: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        cerebellum: Cerebellum,
+        rates: Rates,
+        advance: Callable[[], None],
+        run: Callable[[int, int], int] = lambda *_: 0,
+    ) -> None:
         timeout = cerebellum.body.limits.command_timeout_s
         if 1.0 / rates.fps > timeout:
             raise ConfigError(
@@ -137,7 +145,7 @@ class LockstepBridge(Bridge):
         self.cerebellum = cerebellum
         self.rates = rates
         self.timing = TimingStatistics(NANOSECONDS // rates.control_hz)
-        self._advance = advance
+        self._advance, self._run = advance, run
         self._sequence = 0
         self._tick = 0
 
@@ -199,7 +207,11 @@ class LockstepBridge(Bridge):
 
     def advance_ticks(self, ticks: int) -> None:
         """Let some control ticks go by."""
-        for _ in range(ticks):
+        end = self._tick + ticks
+        while self._tick < end:
+            if done := self._run(self._tick, end - self._tick):
+                self._tick += done
+                continue
             self.cerebellum.tick(self.now_ns)
             self._tick += 1
             self._advance()

@@ -86,10 +86,10 @@ class Kernel[**P, R]:
         left, is_checked = _values, False
         python: Callable[..., R] = self.function
         machine: Callable[..., R] | None = None
-        plain = [as_objects(value) for value in bound]
+        plain: list[Any] = []
 
         def call(*arguments: Any) -> R:
-            nonlocal left, is_checked, machine
+            nonlocal left, is_checked, machine, plain
             if machine is not None:
                 return machine(*arguments)
             left -= _work(bound[0] if bound else arguments[0])
@@ -98,7 +98,7 @@ class Kernel[**P, R]:
                 return machine(*arguments)
             if not is_checked:
                 self._check(len(bound), arguments)
-                is_checked = True
+                is_checked, plain = True, [as_objects(value) for value in bound]
             return python(*plain, *arguments)
 
         return call
@@ -165,6 +165,17 @@ def _object_type(dtype: np.dtype[Any]) -> Callable[[NDArray], Any]:
     slots = [f"_{name}" if name in numbers else name for name in fields]
     body = {"__slots__": slots, "__init__": __init__, **{name: number(name) for name in numbers}}
     return type("Record", (), body)
+
+
+def is_worth_compiling(one: Kernel[..., Any], handled: int) -> bool:
+    """Return whether a loop that has handled so many values in Python should be compiled, or is already."""
+    if "compiled" in vars(one) and _values < math.inf:
+        return True
+    if handled < _values:
+        return False
+    import numba
+
+    return not numba.config.DISABLE_JIT
 
 
 def compile_at_once() -> None:

@@ -13,6 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.sim.frames import Frames
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
@@ -58,6 +59,16 @@ class BaseSimulation(BaseHost, Simulation):
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
+        self._frames = Frames(
+            world,
+            self.cerebellum,
+            drive.joints,
+            drive.actuators,
+            touch=drive.touch_sensor,
+            touched=self._touched,
+            gyro="imu_gyro" if config.imu else None,
+            beams=config.beams,
+        )
 
     def truth(self) -> BaseTruth:
         """Return where the bases are, and whether they touched the scene since the start of the last frame."""
@@ -127,6 +138,20 @@ class BaseSimulation(BaseHost, Simulation):
         if self.tick >= self._next_scan:
             due = self.running & (self.tick - self._scanned_tick >= self._scan_ticks)
             self._scan(np.flatnonzero(due))
+
+    def run_ticks(self, number: int, most: int) -> int:
+        """Run ticks up to the next scan, see `LockstepBridge`."""
+        ticks = max(1, min(most, self._next_scan - self.tick))
+        if not self._frames.run(self._active, number, ticks):
+            return 0
+        self.tick += ticks
+        self._after_tick()
+        return ticks
+
+    def close(self) -> None:
+        """Free renderers and threads. May be called twice."""
+        self._frames.close()
+        super().close()
 
     def _scan(self, ids: NDArray[np.intp]) -> None:
         if len(ids):

@@ -1,6 +1,6 @@
 """The torques of a world's actuators, averaged over the physics steps of a control tick."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ class MeanEfforts:
     not at the end of its range. Of a UR5's shoulder that is 1.6 N m for each rad/s^2 with steps of 2 ms.
 
     Attributes:
+        is_exact: whether what acted is averaged.
         mean: what acted on average over the last steps [N m; N for a slide], shape (n, nv), live.
 
     Args:
@@ -26,7 +27,7 @@ class MeanEfforts:
     """
 
     def __init__(self, model: mujoco.MjModel, bind: Callable[[str], Array], *, exact: bool) -> None:
-        self._bind, self._exact = bind, exact
+        self._bind, self.is_exact = bind, exact
         self._reported = bind("qfrc_actuator")
         self.mean: Array = self._reported.copy()
         self._servos = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
@@ -40,9 +41,16 @@ class MeanEfforts:
         counts = model.jnt_actfrclimited[joints] & (mujoco.mj_version() >= 4_000_000)
         self._most_torque = np.where(counts, model.jnt_actfrcrange[joints, 1], np.inf)
 
+    def numbers(self, actuators: Sequence[int]) -> dict[str, Array]:
+        """Return gear, damping, largest force and largest torque of some servos by their numbers in the model."""
+        places = np.searchsorted(self._servos, actuators)
+        values = {"gear": self._gear, "damping": self._damping}
+        values |= {"most_force": self._most_force, "most_torque": self._most_torque}
+        return {name: value[places] for name, value in values.items()}
+
     def note(self, rows: Rows, step: int, steps: int) -> None:
         """Take one of the steps of a tick into account, of the simulations in `rows`."""
-        values = self._acted() if self._exact or steps > 1 else self._reported
+        values = self._acted() if self.is_exact or steps > 1 else self._reported
         self.mean[rows] = values[rows] if step == 0 else self.mean[rows] + values[rows]
         if step == steps - 1 > 0:
             self.mean[rows] /= steps

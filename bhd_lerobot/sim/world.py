@@ -1,5 +1,6 @@
 """n simulations of one model, stepped together."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -59,6 +60,7 @@ Ids = NDArray[np.intp] | NDArray[np.bool_] | Sequence[int] | None
 _SCENE_GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 _POOL_FIELDS = ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group")
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{field}")) for field in ("QPOS", "QVEL", "QACC")]
+_STATE_FIELDS = ("qpos", "qvel", "ctrl", "time")
 _WARNING_COUNT = 1  # the last axis of Batch.warning: last info, count
 
 
@@ -108,6 +110,12 @@ class World:
     they change with `step`, and what is written to them is the state at the next step. Results do not depend on the
     number of threads, nor on how many other simulations there are.
 
+    Attributes:
+        outputs: the fields that derive from the state and are copied out after every step, by name, each of shape
+            (n, ...).
+        fields: the model fields of which each simulation has its own values, by name, live, each of shape (n, ...).
+        threads: threads that step the simulations.
+
     Args:
         body: the robot.
         n: number of simulations.
@@ -139,19 +147,21 @@ class World:
         self.pool_size = pool_size = pool_size if body.drive else 0
         self.model = build_model(body, self.physics_hz, pool_size, fixtures)
         # One simulation is stepped by the calling thread; more threads would only add hand-overs.
+        self.threads = min(n, threads or os.cpu_count() or 1)
         self._batch = mujoco_batch.Batch(self.model, n, nthread=1 if n == 1 else threads or 0)
+        self.outputs: dict[str, NDArray] = {}
         self.qpos: NDArray[np.float64] = self._batch.bind("qpos")
         self.qvel: NDArray[np.float64] = self._batch.bind("qvel")
         self.ctrl: NDArray[np.float64] = self._batch.bind("ctrl")
         self.time: NDArray[np.float64] = self._batch.bind("time")
-        self._sensordata: NDArray[np.float64] = self._batch.bind("sensordata")
+        self._sensordata: NDArray[np.float64] = self._output("sensordata")
         self._warnings = self._batch.warning[:, :, _WARNING_COUNT]
         self._root = self.model.body(body.root).id
         self._pool = slice(
             self.model.geom("obstacle_000").id if pool_size else 0,
             (self.model.geom("obstacle_000").id if pool_size else 0) + pool_size,
         )
-        self._fields: dict[str, NDArray] = {}
+        self.fields: dict[str, NDArray] = {}
         self._efforts: MeanEfforts | None = None
         self._constants = False
         if pool_size:
@@ -192,8 +202,8 @@ class World:
         self.forward(ids)
 
     def _reset_arm(self, ids: NDArray[np.intp]) -> None:
-        if "body_gravcomp" in self._fields:  # what is taken off the table is without weight, or it would fall for ever
-            self._fields["body_gravcomp"][ids] = self._model_value("body_gravcomp")
+        if "body_gravcomp" in self.fields:  # what is taken off the table is without weight, or it would fall for ever
+            self.fields["body_gravcomp"][ids] = self._model_value("body_gravcomp")
         self._batch.reset(ids, keyframe=0, stage=0)
         self.hold(ids)
 
@@ -268,7 +278,7 @@ class World:
     def snapshot(self, ids: Ids = None) -> Snapshot:
         """Return a copy of everything that decides how simulations continue."""
         ids = self.selected(ids)
-        fields = {name: values[ids].copy() for name, values in self._fields.items()}
+        fields = {name: values[ids].copy() for name, values in self.fields.items()}
         return Snapshot(self._batch.state[ids].copy(), fields, self._constants)
 
     def restore(self, snapshot: Snapshot, ids: Ids = None) -> None:
@@ -287,8 +297,8 @@ class World:
             raise SimulationError(f"The snapshot's state has shape {snapshot.state.shape}; {expected} is needed.")
         for name, values in snapshot.fields.items():
             self.model_field(name)[ids] = values
-        for name in self._fields.keys() - snapshot.fields.keys():  # fields that were the model's own at that time
-            self._fields[name][ids] = self._model_value(name)
+        for name in self.fields.keys() - snapshot.fields.keys():  # fields that were the model's own at that time
+            self.fields[name][ids] = self._model_value(name)
         if snapshot.constants or self._constants:
             self.update_constants(ids)
         self._batch.state[ids] = snapshot.state
@@ -343,7 +353,14 @@ class World:
         """
         if name not in mujoco_batch.DATA_FIELDS:
             raise SimulationError(unknown_name("field", name, mujoco_batch.DATA_FIELDS))
-        return self._batch.bind(name)
+        return self._output(name)
+
+    def _output(self, name: str) -> NDArray[np.float64]:
+        """Return a live field that derives from the state, which is copied out after every step from now on."""
+        field = self._batch.bind(name)
+        if name not in _STATE_FIELDS:
+            self.outputs[name] = field
+        return field
 
     @property
     def efforts(self) -> NDArray[np.float64]:
@@ -352,10 +369,15 @@ class World:
         Computed from now on. After a single step, at the body's own physics rate or a higher one, it is what MuJoCo
         reports, `qfrc_actuator`; otherwise it is what acted: see `MeanEfforts`.
         """
+        return self.servos.mean
+
+    @property
+    def servos(self) -> MeanEfforts:
+        """What averages the efforts of the actuators."""
         if self._efforts is None:
             slow = self.physics_hz < self.body.physics_hz
-            self._efforts = MeanEfforts(self.model, self._batch.bind, exact=slow)
-        return self._efforts.mean
+            self._efforts = MeanEfforts(self.model, self._output, exact=slow)
+        return self._efforts
 
     def site(self, name: str) -> "Site":
         """Return a named site, whose pose is valid like a `derived` field.
@@ -463,20 +485,35 @@ class World:
         Raises:
             SimulationError: there is no such field.
         """
-        if name not in self._fields:
+        if name not in self.fields:
             if name not in mujoco_batch.MODEL_FIELDS:
                 raise SimulationError(unknown_name("model field", name, mujoco_batch.MODEL_FIELDS))
-            self._fields[name] = self._batch.expand(name)
-        return self._fields[name]
+            self.fields[name] = self._batch.expand(name)
+        return self.fields[name]
 
     def update_constants(self, ids: Ids = None) -> None:
         """Recompute what MuJoCo derives from the model fields."""
         self._constants = True
         self._batch.set_const(None if ids is None else self.selected(ids))
 
-    def copy_model(self, sim: int) -> mujoco.MjModel:
-        """Return a copy of one simulation's model, with its own values of the per-simulation fields."""
-        return self._batch.get_model(sim)
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """MuJoCo's integration states, live, shape (n, nstate)."""
+        return self._batch.state
+
+    @property
+    def warnings(self) -> NDArray[np.int32]:
+        """Last information and number of each of MuJoCo's warnings since the last reset, live, shape (n, kinds, 2)."""
+        return self._batch.warning
+
+    def copy_model(self, sim: int, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
+        """Return a copy of one simulation's model, with its own values of the per-simulation fields.
+
+        Args:
+            sim: the simulation.
+            model: where it goes, a result of this method; a new one if None.
+        """
+        return self._batch.get_model(sim, model)
 
     def copy_into(self, sim: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Copy one simulation's model fields and state; nothing that derives from the state is computed.

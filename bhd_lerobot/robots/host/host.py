@@ -68,7 +68,7 @@ class Host(ABC):
         n = cerebellum.n
         self.config, self.n, self.rates, self.body = config, n, config.rates, cerebellum.body
         self.cerebellum = cerebellum
-        self.bridge = bridge or LockstepBridge(cerebellum, self.rates, self.advance)
+        self.bridge = bridge or LockstepBridge(cerebellum, self.rates, self.advance, self.run_ticks)
         self.action_names, self.observation_names = tuple(action_names), tuple(observation_names)
         self.camera_names = tuple(camera_names)
         self.running = np.ones(n, np.bool_)
@@ -305,6 +305,10 @@ class Host(ABC):
     def advance(self) -> None:
         """Let one control tick go by."""
         self.tick += 1
+
+    def run_ticks(self, number: int, most: int) -> int:
+        """Run ticks of control and world at once, see `LockstepBridge`; none here."""
+        return 0
 
     def close(self) -> None:
         """Free everything. May be called twice."""
