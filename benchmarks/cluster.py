@@ -23,13 +23,13 @@ from benchmarks._turns import in_turns, shown, spread
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.cluster.pool import WorkerPool
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_brain, make_robot, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.recorder import Recording, open_recorder, save_episode
+from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
@@ -26,6 +25,7 @@ from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
 from bhd_lerobot.policies.perception.perceiver import PerceptionOptions
 from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 
 _PROBE_FRAMES = 20

@@ -12,12 +12,12 @@ from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
 from bhd_lerobot.cluster.pool import CONTINUE, WorkerPool
 from bhd_lerobot.cluster.pool import Task as ClusterTask
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task
 

@@ -10,7 +10,6 @@ from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import HORIZON_NS, NANOSECONDS, CerebellumState, Reason, Request, SendResult, Setpoint
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
 
 
@@ -144,7 +143,6 @@ class LockstepBridge(Bridge):
             )
         self.cerebellum = cerebellum
         self.rates = rates
-        self.timing = TimingStatistics(NANOSECONDS // rates.control_hz)
         self._advance, self._run = advance, run
         self._sequence = 0
         self._tick = 0
@@ -215,7 +213,6 @@ class LockstepBridge(Bridge):
             self.cerebellum.tick(self.now_ns)
             self._tick += 1
             self._advance()
-        self.timing.add_punctual(ticks)
 
     def state(self) -> CerebellumState:
         """Return a copy of the present state."""

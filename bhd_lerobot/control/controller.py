@@ -33,7 +33,6 @@ class Controller(ABC):
         actuators: what goes to the plant, shape (n, joints).
         busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
             nothing about it.
-        cause: why the last stop of its own was, as text.
         protective_stop: the `Watchdog` flag of each robot that has just begun a stop of its own, shape (n,); 0 for the
             others.
         contact_wrench: what the surroundings put on the tools, estimated from the motors' efforts, in the base frame:
@@ -46,7 +45,6 @@ class Controller(ABC):
     command: NDArray[np.float64]
     actuators: NDArray[np.float64]
     busy: NDArray[np.bool_]
-    cause: str = ""
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
@@ -71,6 +69,11 @@ class Controller(ABC):
     @abstractmethod
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about robots that were put somewhere else."""
+
+    @property
+    def cause(self) -> str:
+        """Why the last stop of its own was, as text."""
+        return ""
 
     def pressed(self) -> NDArray[np.float64]:
         """Return the force with which each robot and something press on each other [N], shape (n,).

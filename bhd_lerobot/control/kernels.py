@@ -67,7 +67,7 @@ class Kernel[**P, R]:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         names = {name: numba.from_dtype(dtype) for name, dtype in RECORDS.items()}
         signature = eval(self.signature, {}, {**vars(numba.types), **names})  # as numba does
-        options = {"error_model": "numpy", "nogil": True}
+        options: Any = {"error_model": "numpy", "nogil": True}
         try:
             return numba.njit(signature, cache=folder is not None, **options)(self.function)
         except Exception:  # a full disk, or a damaged file: compiled at every start
@@ -150,7 +150,7 @@ def _object_type(dtype: np.dtype[Any]) -> Callable[[NDArray], Any]:
     fields = {name: kind for name, (kind, *_) in (dtype.fields or {}).items()}
     numbers = [name for name, kind in fields.items() if not kind.shape]
 
-    def __init__(self: Any, row: NDArray) -> None:
+    def __init__(self: Any, row: NDArray) -> None:  # noqa: N807
         for name in numbers:
             setattr(self, f"_{name}", row[name])
         for name in fields.keys() - set(numbers):
@@ -175,7 +175,8 @@ def is_worth_compiling(one: Kernel[..., Any], handled: int) -> bool:
         return False
     import numba
 
-    return not numba.config.DISABLE_JIT
+    config: Any = numba.config
+    return not config.DISABLE_JIT
 
 
 def compile_at_once() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.base.drive import drive, drive_back, drives_not
+from bhd_lerobot.control.drive import drive, drive_back, drives_not
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
@@ -57,7 +57,9 @@ def tick(  # noqa: PLR0917
 
 
 @kernel()
-def begin_tick(state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int) -> None:
+def begin_tick(  # noqa: PLR0917
+    state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int
+) -> None:
     """Do what comes before the controller: judge the reading, supervise, take what is due."""
     supervise(state, queue, estop, limits, sensors_ns, now_ns)
     take_command(state, queue, estop, limits, now_ns)
@@ -89,7 +91,9 @@ def set_mode(state: Any, mode: int) -> None:
 
 
 @kernel()
-def supervise(state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int) -> None:
+def supervise(  # noqa: PLR0917
+    state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int
+) -> None:
     """Change the mode for what nobody requested: emergency stop, plant faults, watchdogs, the end of a stop."""
     press = estop[0]
     if press != estop[1]:
@@ -235,7 +239,9 @@ def tick_all(  # noqa: PLR0917
 
 
 @kernel("void(state[::1], queue[::1], i8[:,:], limits[::1], i8[:], i8)")
-def begin_all(states: Any, queues: Any, estop: Counts, limits: Any, sensors_ns: Counts, now_ns: int) -> None:
+def begin_all(  # noqa: PLR0917
+    states: Any, queues: Any, estop: Counts, limits: Any, sensors_ns: Counts, now_ns: int
+) -> None:
     """Do what comes before the controller of n robots."""
     for sim in range(len(states)):
         begin_tick(states[sim], queues[sim], estop[:, sim], limits[0], sensors_ns[sim], now_ns)

@@ -4,9 +4,9 @@ import json
 from dataclasses import asdict, replace
 from typing import Any
 
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format.summary import EpisodeSummary
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.realtime.timing import TimingSummary
 
 _GRANT = {"name", "wanted", "granted", "detail", "remedy"}
 _MOST = 1e18  # of counts and seconds: beyond it is no measurement

@@ -17,7 +17,6 @@ from rich.progress import Progress
 from rich.table import Table
 
 from bhd_lerobot.cluster.loop import open_pool
-from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError, counted
 from bhd_lerobot.evaluation.config import YARDSTICKS, Comparison, EvalConfig
 from bhd_lerobot.evaluation.operator import Operator, drawn_orders
@@ -33,6 +32,7 @@ from bhd_lerobot.evaluation.results import (
 from bhd_lerobot.evaluation.run import BrainRun, jerk_of, open_dataset, prepare, run_episodes, specs_of
 from bhd_lerobot.evaluation.text import number, percent, perception_sentence, sequential_sentence
 from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
+from bhd_lerobot.realtime.estop import EstopInputs, estop_signal
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots

@@ -3,8 +3,10 @@
 __all__ = [
     "block",
     "bridge",
+    "estop",
     "frame_log",
     "grid",
+    "keys",
     "loop",
     "mailbox",
     "planning_link",
@@ -13,4 +15,5 @@ __all__ = [
     "requests",
     "sections",
     "shared_memory",
+    "timing",
 ]

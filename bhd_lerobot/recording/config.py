@@ -6,18 +6,18 @@ from typing import Annotated, Any, ClassVar, cast
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.cluster.config import ENGINES, RayConfig, check_engine
-from bhd_lerobot.control.estop import estop_signal
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Range, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.teleop.config import PersonConfig, TeleopConfig
 from bhd_lerobot.policies.topic.config import TopicConfig
+from bhd_lerobot.realtime.estop import estop_signal
 from bhd_lerobot.recording.live_view import PACKAGES, check_display
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
 from bhd_lerobot.robots.viewer.viewer import check_view
+from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 from bhd_lerobot.teleoperators import (  # noqa: F401  registers them

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport

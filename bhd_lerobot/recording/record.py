@@ -13,8 +13,6 @@ from rich.markup import escape
 
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.cluster.pool import WorkerPool
-from bhd_lerobot.control.estop import EstopInputs, estop_signal
-from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.datasets.format.features import (
     LANGUAGE,
     PHYSICS_STATE,
@@ -27,6 +25,7 @@ from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError, count
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.teleop.config import TeleopConfig
+from bhd_lerobot.realtime.estop import EstopInputs, estop_signal
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.driver import mark_keys, open_driver
 from bhd_lerobot.recording.live_view import live_view
@@ -52,6 +51,7 @@ from bhd_lerobot.rollout.recorder import (
 )
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
+from bhd_lerobot.rollout.tolerance import verdict
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of

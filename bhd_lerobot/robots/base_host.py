@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive, LidarSpec, without_jerk_limits
 from bhd_lerobot.bodies.truth import BaseTruth
-from bhd_lerobot.control.base.collision_monitor import new_monitors
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.collision_monitor import new_monitors
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import Plant
 from bhd_lerobot.robots.host.host import Host
@@ -48,7 +48,13 @@ class BaseHost(Host):
             monitors = new_monitors(drive, lidar, plant.n, config.control_hz, config.beams)
         gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
         self._controller = BaseController(
-            drive, plant.n, config.control_hz, monitors=monitors, gyro=gyro, takes=plant.takes, latency_s=plant.latency_s
+            drive,
+            plant.n,
+            config.control_hz,
+            monitors=monitors,
+            gyro=gyro,
+            takes=plant.takes,
+            latency_s=plant.latency_s,
         )
         super().__init__(
             config,

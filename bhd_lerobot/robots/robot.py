@@ -13,9 +13,9 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import CommandResult
-from bhd_lerobot.control.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
+from bhd_lerobot.realtime.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation

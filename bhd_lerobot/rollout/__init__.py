@@ -14,5 +14,6 @@ __all__ = [
     "replay_robot",
     "run_folder",
     "signals",
+    "tolerance",
     "types",
 ]

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
-from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
-from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import BrainStoppedError, RealtimeError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
+from bhd_lerobot.realtime.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import FrameReport, Robots
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
 from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.faults import add_faults
 from bhd_lerobot.tasks.task import ConfiguredTask, Event, Task, outcomes_of

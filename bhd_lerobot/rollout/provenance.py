@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from bhd_lerobot import __version__
 from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json, tuples
 from bhd_lerobot.control.commands import BrainCommand, Pose
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.realtime.timing import TimingSummary
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Outcome
 

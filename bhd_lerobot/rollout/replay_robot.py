@@ -9,7 +9,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
@@ -17,6 +16,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, RealtimeError
 from bhd_lerobot.options.units import other_units
+from bhd_lerobot.realtime.estop import EstopInputs, estop_signal
 from bhd_lerobot.registry import is_ours, make_robot
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.host import describe

@@ -6,8 +6,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.realtime.timing import TimingSummary
 from bhd_lerobot.rollout.drivers import Intervention
 from bhd_lerobot.tasks.task import Outcome
 

@@ -6,6 +6,7 @@ __all__ = [
     "description",
     "efforts",
     "engine",
+    "frames",
     "lidar",
     "plant",
     "render_thread",

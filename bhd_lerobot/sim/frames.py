@@ -67,7 +67,7 @@ _copy: Any = _missing
 
 def _load() -> bool:
     """Find the C library's functions; return whether there are any that machine code can call."""
-    global _step, _set_state, _get_state, _copy  # noqa: PLW0603
+    global _step, _set_state, _get_state, _copy
     if _step is not _missing:
         return True
     ending = {"darwin": "libmujoco.*.dylib", "win32": "mujoco.dll"}.get(sys.platform, "libmujoco.so.*")
@@ -99,7 +99,7 @@ def _load() -> bool:
     "i4[:,:,:], state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], b1[:], f8[:,:], "
     "layout[::1], i8, i8)"
 )
-def run_frames(  # noqa: PLR0917
+def run_frames(  # noqa: PLR0912, PLR0917
     ids: Counts,
     models: Counts,
     data: int,

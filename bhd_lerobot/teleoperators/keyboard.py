@@ -9,7 +9,7 @@ from typing import Any
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from bhd_lerobot.control.keys import KeySource, key_source
+from bhd_lerobot.realtime.keys import KeySource, key_source
 from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 

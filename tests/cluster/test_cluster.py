@@ -23,11 +23,11 @@ from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job
 from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.cluster.pool import Task
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import count_frames
 from bhd_lerobot.errors import ActionError, ClusterError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.rollout.tolerance import TimingTolerance
 from tests.cluster import fakes
 from tests.evaluation.test_brains import checkpoint  # noqa: F401  (a fixture)
 from tests.evaluation.test_evaluate import FAILING, run_eval

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Mode, Reason, Watchdog
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.plant import SimulatedPlant
@@ -46,8 +46,6 @@ def test_a_frame_is_a_frame_without_drift(rates: Rates) -> None:
         bridge.advance_frame()
         assert bridge.now_ns == frame * rates.ticks_per_frame * 1_000_000_000 // rates.control_hz
     assert bridge.now_ns * rates.fps // 199 <= 1_000_000_000
-    summary = bridge.timing.summary()
-    assert (summary.ticks, summary.overruns, summary.lateness_max) == (199 * rates.ticks_per_frame, 0, 0)
 
 
 def test_frames_as_long_as_the_time_out_do_not_time_out() -> None:

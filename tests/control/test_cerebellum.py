@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.fifo import CommandFifo
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
 from bhd_lerobot.errors import ConfigError

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
-from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
 from tests.control.test_wire import arm, base_rig, twist_rig

@@ -12,11 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control import kernels, tick
-from bhd_lerobot.control.base.controller import BaseController, twist_from_wheels
+from bhd_lerobot.control import kernels
+from bhd_lerobot.control import tick as tick_module
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.drive import BaseController, twist_from_wheels
 from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Setpoint, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.record import NEVER
@@ -154,7 +155,7 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.TRACKING
         controller = rig.cerebellum.controller
         with pytest.MonkeyPatch.context() as patch, np.errstate(invalid="ignore"):  # infinity less infinity
-            owner, name_of_run = (tick, "drive") if name in ("base", "twist") else (controller, "run")
+            owner, name_of_run = (tick_module, "drive") if name in ("base", "twist") else (controller, "run")
             run, calls = getattr(owner, name_of_run), count()
 
             def broken(*arguments: Any, run: Any = run, controller: Any = controller, calls: Any = calls) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.evaluation.metrics import JerkMeasure, measure
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Outcome

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Mode, Reason, Request
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Word

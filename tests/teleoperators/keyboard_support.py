@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from bhd_lerobot.control import keys
-from bhd_lerobot.control.keys import KeyTerminal
+from bhd_lerobot.realtime import keys
+from bhd_lerobot.realtime.keys import KeyTerminal
 from bhd_lerobot.teleoperators import keyboard
 from bhd_lerobot.teleoperators.keyboard import KeyboardTeleoperator
 from tests.waiting import until

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
-from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
@@ -17,6 +16,7 @@ from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
+from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config

@@ -12,8 +12,8 @@ import pytest
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR
-from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.rollout.marks import TELEOP_KEYS
 from bhd_lerobot.teleoperators.bhd_keyboard_base import BhdKeyboardBase
 from bhd_lerobot.teleoperators.config_bhd_keyboard_base import BhdKeyboardBaseConfig

@@ -16,11 +16,11 @@ from rich.live import Live
 
 from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
 from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
-from bhd_lerobot.control.estop import KEYS as ESTOP_KEYS
-from bhd_lerobot.control.keys import KeySource, key_source
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.options.declared import Positive, check_option
 from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
+from bhd_lerobot.realtime.keys import KeySource, key_source
 from bhd_lerobot.realtime.shared_memory import names
 
 PORT = 8767

@@ -10,10 +10,10 @@ from typing import Any
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import decode_feedback
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.timing import TimingStatistics
 
 LIMITS = tuple(limit.name or "" for limit in Limit if limit)
 WATCHDOGS = tuple(watchdog.name or "" for watchdog in Watchdog if watchdog)

@@ -15,11 +15,11 @@ from rich.table import Table
 
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
 from bhd_lerobot.cli.data.episode_list import short as ranges
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
 from bhd_lerobot.datasets.timing import grants_of, ms, timing_of
 from bhd_lerobot.errors import DatasetError, counted
+from bhd_lerobot.realtime.timing import TimingSummary
 
 
 def add_to(commands: Commands) -> None:

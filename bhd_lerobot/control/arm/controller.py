@@ -85,8 +85,11 @@ class ArmController(SteppedController):
         planning: who plans goals; they are planned in the tick that they start in if None.
     """
 
-    def __init__(self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
+    def __init__(  # noqa: PLR0915
+        self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None
+    ) -> None:
         super().__init__(n)
+        self.cause = ""
         arm, limits = body.need(Arm), body.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)

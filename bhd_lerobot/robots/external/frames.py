@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import RealtimeError, as_text
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.device import Device, Reading
 from bhd_lerobot.robots.external.gate import Gate

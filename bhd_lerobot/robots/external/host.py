@@ -14,9 +14,9 @@ from rich.markup import escape
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.commands import Chunk, Command
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, SendResult
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, RealtimeError, as_text
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.device import Device
 from bhd_lerobot.robots.external.frames import DeviceFrame, FrameThread

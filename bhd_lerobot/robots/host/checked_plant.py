@@ -153,7 +153,10 @@ class CheckedPlant(Plant):
             return f"its newest reading is {age / 1e9:.2f} s old"
         if ahead := self._ahead_ns(reading):
             return ahead_of_time(ahead)
-        if not all(np.isfinite(values).all() for values in (reading.position, reading.velocity, reading.effort, reading.sensors)):
+        if not all(
+            np.isfinite(values).all()
+            for values in (reading.position, reading.velocity, reading.effort, reading.sensors)
+        ):
             return "it reads what is not a finite number"
         status = SafetyStatus(int(reading.safety[0]))
         return "" if status == SafetyStatus.NORMAL else f"its safety status is {status.name}"

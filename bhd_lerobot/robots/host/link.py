@@ -14,11 +14,11 @@ from typing import Any, NoReturn
 
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.messages import NANOSECONDS
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import LiveLayout, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.sections import BrainSide, section_sizes
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec

@@ -27,13 +27,13 @@ import numpy as np
 from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.state import StatePublisher

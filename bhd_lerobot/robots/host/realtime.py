@@ -20,10 +20,10 @@ from rich.markup import escape
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Watchdog
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.control.messages import Reason, SendResult
-from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.realtime.timing import TimingStatistics
 
 Deliver = Callable[[NDArray[np.uint8]], None]
 """Takes an image, shape (height, width, 3)."""

@@ -24,16 +24,16 @@ from bhd_lerobot.apps.monitor.monitor import Keys, find
 from bhd_lerobot.apps.monitor.state import Count, Sampler
 from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
-from bhd_lerobot.control.keys import KeySource, KeyTerminal
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import write_feedback
-from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime import shared_memory
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.keys import KeySource, KeyTerminal
 from bhd_lerobot.realtime.shared_memory import SharedBlock, names
+from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype

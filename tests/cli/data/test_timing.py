@@ -8,10 +8,10 @@ import pytest
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.realtime.timing import TimingStatistics
+from bhd_lerobot.rollout.tolerance import FrameTiming, TimingTolerance, late_frames
 from tests.recording.support import data_columns, run_record
 
 RATES = Rates(500, 500, 25)

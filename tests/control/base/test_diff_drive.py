@@ -2,12 +2,12 @@ import math
 
 import numpy as np
 import pytest
+from bhd_lerobot.control.base.diff_drive import DiffDrive
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.base.diff_drive import DiffDrive
 from tests.cases import each_case
 from tests.control.support import wheel_speeds
 

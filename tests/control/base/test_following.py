@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from tests.cases import each_case

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.options.declared import Options, Positive, Share, Whole
+from bhd_lerobot.realtime.timing import TimingSummary
 
 
 @dataclass

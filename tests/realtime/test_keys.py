@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from bhd_lerobot.control import keys
-from bhd_lerobot.control.estop import EstopInputs
-from bhd_lerobot.control.keys import KeySource, KeyTerminal, key_source
+from bhd_lerobot.realtime import keys
+from bhd_lerobot.realtime.estop import EstopInputs
+from bhd_lerobot.realtime.keys import KeySource, KeyTerminal, key_source
 from tests.waiting import until
 
 Terminal = tuple[int, int]

@@ -15,9 +15,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.estop import SIGNALS, EstopInputs, estop_signal
 from tests.control.support import Rig
 from tests.waiting import until
 
@@ -238,7 +238,7 @@ def test_after_close_nothing_presses_and_no_thread_is_left(button, wire):
 
 _CHILD = """
 import fcntl, os, signal, sys, termios, time
-from bhd_lerobot.control.estop import EstopInputs
+from bhd_lerobot.realtime.estop import EstopInputs
 
 def press():
     print("pressed", flush=True)

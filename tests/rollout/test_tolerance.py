@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
+from bhd_lerobot.rollout.tolerance import FrameTiming, TimingTolerance, late_frames
 
 RATES = Rates(500, 500, 25)
 PERIOD_S, FRAME_S = 1 / 500, 1 / 25

@@ -178,7 +178,10 @@ def see(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stam
         if is_unknown or monitor.range_min < ranges[beam] < most:
             ahead = ranges[beam] * monitor.directions[beam, 0] + monitor.ahead
             left = ranges[beam] * monitor.directions[beam, 1]
-            monitor.points[kept, 0], monitor.points[kept, 1] = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+            monitor.points[kept, 0], monitor.points[kept, 1] = (
+                x + ahead * cos - left * sin,
+                y + ahead * sin + left * cos,
+            )
             monitor.is_too_near[kept] = is_unknown
             kept += 1
     monitor.count = kept

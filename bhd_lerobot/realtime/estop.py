@@ -11,8 +11,8 @@ from functools import partial
 from types import FrameType, TracebackType
 from typing import Any, Protocol, Self
 
-from bhd_lerobot.control.keys import KeySource, key_source
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.keys import KeySource, key_source
 
 SIGNALS = ("SIGUSR1", "SIGUSR2", "SIGQUIT")
 """Signals that may stand for an emergency stop: those that mean nothing else to a run."""

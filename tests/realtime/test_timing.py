@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.timing import TimingStatistics, TimingSummary
 
 PERIOD = 5_000_000
 BIN = 10 ** (1 / 20)  # 20 bins a decade

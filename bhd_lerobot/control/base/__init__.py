@@ -1,3 +1,0 @@
-"""The controllers of a base on wheels."""
-
-__all__ = ["collision_monitor", "controller", "drive"]
