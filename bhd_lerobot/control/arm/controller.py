@@ -89,7 +89,7 @@ class ArmController(SteppedController):
         self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None
     ) -> None:
         super().__init__(n)
-        self.cause = ""
+        self._cause = ""
         arm, limits = body.need(Arm), body.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
@@ -335,7 +335,7 @@ class ArmController(SteppedController):
         if not mask.any():
             return
         self.protective_stop[mask] = int(cause)
-        self._any_stopped, self.cause = True, message
+        self._any_stopped, self._cause = True, message
         self._off_ticks[mask] = 0
         self._stopped |= mask
         self._leave_setpoints(mask)
@@ -435,6 +435,11 @@ class ArmController(SteppedController):
             self.held.restart(ids)
 
     # --- reports -----------------------------------------------------------------------------------------------------
+
+    @property
+    def cause(self) -> str:
+        """Why the last stop of its own was, as text."""
+        return self._cause
 
     @property
     def following(self) -> NDArray[np.bool_]:
