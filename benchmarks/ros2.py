@@ -40,7 +40,6 @@ LIMIT_S = 0.7  # to standstill: 0.5 s and the plant's time-out, 0.2 s
 KILLED = {  # a part of its command line; the brain's is the process that the others belong to
     "brain": "",
     "cerebellum": "robots.host.process",
-    "recorder": "realtime.recorder_process",
     "node": "ros2.live.process node",
     "guard": "ros2.live.process guard",
 }

@@ -262,7 +262,7 @@ def tasks_for(robot_type: str) -> tuple[str, ...]:
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:
     """Return the names of the actions of the robots that a brain is for; none if it is for every robot."""
     robots = [name for name in sorted(ROBOTS) if drives(config, name)]
-    return tuple(ROBOTS[robots[0]].action_names) if 0 < len(robots) < len(ROBOTS) else ()
+    return BODIES[robots[0]]().limits.names if 0 < len(robots) < len(ROBOTS) else ()
 
 
 # --- making ----------------------------------------------------------------------------------------------------------

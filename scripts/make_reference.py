@@ -30,10 +30,10 @@ from bhd_lerobot.options.declared import declaration_of
 from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.ros2.serve.bridge import BridgeConfig
 from bhd_lerobot.ros2.serve.serve import ServeConfig
@@ -284,7 +284,10 @@ def _columns() -> str:
     # Six joints and two fingers, and five free bodies.
     physics = {keys.PHYSICS_STATE: [str(i) for i in range(8 + 5 * 7 + 8 + 5 * 6)]}
     cameras = {"scene": image, "wrist": image}
-    arm = keys.dataset_features(OBSERVED, JOINT_ACTIONS, cameras, physics, pick.ENVIRONMENT, subtask=True)
+    robot = UR5(arm_config)
+    arm = keys.dataset_features(
+        robot.observation_names, robot.action_names, cameras, physics, pick.ENVIRONMENT, subtask=True
+    )
     environment = (
         "What a task gives to the brain, in `observation.environment_state`.\n\n"
         f"`reach`, {len(reach.ENVIRONMENT)} numbers: {_names(reach.ENVIRONMENT)}: the target pose of the tool in the "

@@ -339,11 +339,30 @@ class GripperSpec:
         joints: joint names, left then right; each moves by half the opening.
         actuator: name of the actuator; its command is the opening [m].
         max_opening: largest opening [m].
+        widest: narrow side of the widest object that it is given to grasp [m].
     """
 
     joints: tuple[str, str]
     actuator: str
     max_opening: float
+    widest: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workspace:
+    """Where tasks put targets and objects, in an arm's base frame: before the arm, over its table.
+
+    Attributes:
+        tool: two corners of the box that targets of the tool lie in [m].
+        around_home: a posture of a target turns each joint from home by at most this [rad].
+        table: two corners of the rectangle that objects stand in [m].
+        reach: horizontal distance from the base beyond which a tool that points down does not get [m].
+    """
+
+    tool: tuple[tuple[float, float, float], tuple[float, float, float]]
+    around_home: tuple[float, ...]
+    table: tuple[tuple[float, float], tuple[float, float]]
+    reach: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -366,6 +385,7 @@ class Arm:
             motors needs them: no sensor that is wrong moves it while they are closed.
         brake_slip: with which torque a joint slips whose brake has been closed for a while [N m].
         home: the posture that it starts in [rad], and the gripper's opening [m].
+        workspace: where tasks put targets and objects.
         payload: largest mass in the gripper [kg].
         load: mass that the gripper is declared to carry, at the tool centre point [kg]: motions are planned with it.
         latency_s: time until a command acts [s]; the reference is led by it, as by the servos' own lag.
@@ -382,6 +402,7 @@ class Arm:
     actuators: tuple[str, ...]
     actuation: Literal["position", "torque"]
     home: tuple[float, ...]
+    workspace: Workspace
     payload: float
     load: float = 0.0
     brake_damping: tuple[float, ...] = ()

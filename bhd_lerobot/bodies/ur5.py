@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Literal
 
-from bhd_lerobot.bodies.body import Arm, ArmChain, Body, CameraSpec, Capsule, GripperSpec, Limits
+from bhd_lerobot.bodies.body import Arm, ArmChain, Body, CameraSpec, Capsule, GripperSpec, Limits, Workspace
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -124,7 +124,9 @@ def ur5(
                 min_distance=0.005,
                 min_manipulability=0.003,
             ),
-            gripper=GripperSpec(joints=("finger_left", "finger_right"), actuator="gripper", max_opening=MAX_OPENING),
+            gripper=GripperSpec(
+                joints=("finger_left", "finger_right"), actuator="gripper", max_opening=MAX_OPENING, widest=0.076
+            ),
             servo_stiffness=(40_000.0, 40_000.0, 40_000.0, 8_000.0, 8_000.0, 8_000.0, 8_000.0),
             servo_damping=(800.0, 800.0, 450.0, 80.0, 80.0, 80.0, 150.0),
             actuators=(*JOINTS, "gripper"),
@@ -133,6 +135,13 @@ def ur5(
             brake_slip=tuple(_SLIP * most for most in effort) if torque else (),
             # The tool points down, 0.49 m before the base and 0.11 m to its left, 0.28 m above the table.
             home=(math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, MAX_OPENING),
+            workspace=Workspace(
+                tool=((0.20, -0.45, 0.10), (0.70, 0.45, 0.60)),
+                # Elbow up and the tool somewhere before the arm: a random posture is nearly always behind it.
+                around_home=(1.0, 0.9, 0.9, 1.2, 1.2, math.pi),
+                table=((0.35, -0.30), (0.65, 0.30)),
+                reach=0.80,
+            ),
             payload=_PAYLOAD,
             load=load,
         ),

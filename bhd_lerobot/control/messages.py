@@ -126,7 +126,7 @@ class Watchdog(IntFlag):
     BRAIN = 4
     """The brain's process showed no sign of life for its time-out; the robot decelerates and holds."""
     RECORDER = 8
-    """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
+    """In recordings of versions before 0.4: the recorder's process was silent; the robot decelerated and held."""
     PLANT = 16
     """The plant showed no sign of life for its time-out, reported a stop of its own, or its readings were no
     measurements of the present (not finite, too old, from the future, faster than a joint can turn) or contradicted

@@ -126,7 +126,10 @@ class Parser(argparse.ArgumentParser):
 
         Of a command whose default `entries_of` is the name of an option, what begins with ``--NAME.`` is in `entries`.
         """
-        options, unknown = self.parse_known_args(arguments)
+        given = sys.argv[1:] if arguments is None else arguments
+        entries = [one for one in given if re.match(r"--\w+\.", one)]  # argparse takes one with a space for positional
+        options, unknown = self.parse_known_args([one for one in given if one not in entries])
+        unknown += entries
         if entries_of := getattr(options, "entries_of", ""):
             options.entries = [argument for argument in unknown if argument.startswith(f"--{entries_of}.")]
             unknown = [argument for argument in unknown if argument not in options.entries]

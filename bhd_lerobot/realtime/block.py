@@ -1,4 +1,4 @@
-"""What brain, cerebellum, recorder and monitor of one running robot share: words, queues, states.
+"""What brain, cerebellum and monitor of one running robot share: words, queues, states.
 
 The words are 64-bit integers, each written by one process (those that any may write are marked), and read by all.
 """
@@ -43,8 +43,6 @@ class Word(IntEnum):
     """When the brain's process last showed that it lives, monotonic [ns]; 0: it is not watched."""
     CEREBELLUM_ALIVE = 9
     """The same of the cerebellum's process."""
-    RECORDER_ALIVE = 10
-    """The same of the recorder's process."""
     PLANT_LOST = 12
     """Not 0: what drives the robot has ended, and a reset cannot help. Written by the cerebellum."""
     EXECUTED = 16
@@ -55,8 +53,10 @@ class Word(IntEnum):
     """Ticks of it that ended after their successor was due."""
     CATCH_UP_LOST = 19
     """Ticks of it by which the simulation fell behind, beyond what it may catch up at once."""
-    RECORDER_DROPS = 24
-    """States that the recorder did not get before they were overwritten, in the present segment."""
+    RECORDER_FRAMES = 24
+    """Frames of it that the brain's process has read. Written by the brain's process, as is the next."""
+    RECORDER_DROPS = 25
+    """States of it that were overwritten before the brain's process read them."""
 
 
 class Phase(IntEnum):

@@ -1,4 +1,4 @@
-"""The loop of the cerebellum in real time: ticks on an absolute grid, and watchdogs on the other processes.
+"""The loop of the cerebellum in real time: ticks on an absolute grid, and a watchdog on the brain's process.
 
 The clock and the sleep are given, so that everything in here runs on a virtual clock in tests.
 """
@@ -23,7 +23,6 @@ class LoopLimits:
     Attributes:
         brain_timeout_s: after so long without a sign of life of the brain's process a robot that moves decelerates and
             holds [s].
-        recorder_timeout_s: the same for the recorder's process, if there is one [s].
         plant_timeout_s: a reading of a plant that is older than this is a FAULT [s]; at least three ticks.
         most_misses: after so many starts in a row that came a period or more too late, FAULT.
         most_catch_up: so many periods at the most are caught up by one tick; what is beyond is lost to the simulation,
@@ -31,11 +30,12 @@ class LoopLimits:
     """
 
     brain_timeout_s: float = 0.5
-    recorder_timeout_s: float = 1.0
     plant_timeout_s: float = 0.02
     most_misses: int = 10
     most_catch_up: int = 10
 
+
+_BRAIN_ALIVE = int(Word.BRAIN_ALIVE)  # a plain number: an index of an enumeration costs a call
 
 Advance = Callable[[int], None]
 """Lets the plant continue by a number of ticks."""
@@ -83,15 +83,7 @@ class RealtimeLoop:
         self._serve, self._advance, self._publish, self._count = serve, advance, publish, count
         self._may_stand = may_stand
         self._clock, self._sleep = clock, sleep
-        self._watched = [
-            (int(Word.BRAIN_ALIVE), round(limits.brain_timeout_s * NANOSECONDS), Watchdog.BRAIN, Mode.STOPPING),
-            (
-                int(Word.RECORDER_ALIVE),
-                round(limits.recorder_timeout_s * NANOSECONDS),
-                Watchdog.RECORDER,
-                Mode.STOPPING,
-            ),
-        ]
+        self._brain_timeout_ns = round(limits.brain_timeout_s * NANOSECONDS)
 
     def run(self, start_ns: int | None = None) -> TickGrid:
         """Run a segment of ticks, until `Word.PAUSE` or `Word.END` is set; return its grid.
@@ -140,9 +132,8 @@ class RealtimeLoop:
         self._publish(slot, started_ns, ended_ns, grid)
 
     def _watch(self, now_ns: int, grid: TickGrid) -> None:
-        for word, timeout, watchdog, mode in self._watched:
-            seen = int(self.words[word])
-            if seen and abs(now_ns - seen) > timeout:  # what is from the future never grows old
-                self.cerebellum.interrupt(watchdog, mode)
+        seen = int(self.words[_BRAIN_ALIVE])
+        if seen and abs(now_ns - seen) > self._brain_timeout_ns:  # what is from the future never grows old
+            self.cerebellum.interrupt(Watchdog.BRAIN, Mode.STOPPING)
         if grid.too_many_misses:
             self.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Command, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.realtime.block import LiveBlock
-from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.frame_reader import FrameReader
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
@@ -19,7 +19,7 @@ from bhd_lerobot.robots.host.robots import Frame, FrameReport
 from bhd_lerobot.tasks.task import Event
 
 _SILENCE_S = 2.0  # so long without a frame the loop is stopped, or has ended
-_PAUSE_S = 0.01  # the log of frames holds seconds
+_PAUSE_S = 0.01  # the ring holds seconds
 _RESULTS = 256  # that are kept while nothing is recorded
 _EVENTS = {ResultCode.SUCCEEDED: Event.SUCCESS, ResultCode.TIMEOUT: Event.TIMEOUT}
 _EVENTS |= {ResultCode.ESTOP: Event.ESTOP, ResultCode.FAULT: Event.FAULT}
@@ -66,7 +66,7 @@ class Onlooker:
             grants: what its process was granted and refused.
         """
         self._block = block = LiveBlock.watch(name)
-        self._reader = FrameLog(block.state_dtype, block.about["frames"], block.section("frames")).reader()
+        self._reader = FrameReader(block.ring, self.rates.ticks_per_frame)
         self.clock = OnlookerClock(block.section("statistics"), self.mirror.sensor_period_s, grants)
 
     def close(self) -> None:
@@ -77,11 +77,11 @@ class Onlooker:
     def _read(self) -> Any:
         """Return the next boundary; None if none comes: all is over, or the robot is silent."""
         since = time.monotonic_ns()
-        while (entry := self._reader.read()) is None:
+        while (boundary := self._reader.read()) is None:
             if self._ending() is not None or time.monotonic_ns() - since > _SILENCE_S * NANOSECONDS:
                 return None
             time.sleep(_PAUSE_S)
-        return entry
+        return boundary
 
     def wait(self) -> bool:
         """Wait until a command is followed; return false if all is over before."""
@@ -94,7 +94,7 @@ class Onlooker:
                     return False
                 self._at = None  # of a robot that was silent, nothing is known of what came before
                 continue
-            if before is not None and self._is_followed(after["state"]):
+            if before is not None and self._is_followed(after.state):
                 self._ahead = after
                 return True
             self._at, self._ahead = after, None
@@ -110,9 +110,9 @@ class Onlooker:
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Begin an episode where the robot is; `wait` has found its first frame."""
-        self._first, self._followed_ns = self._at, int(self._ahead["state"]["sensed_ns"])
+        self._first, self._followed_ns = self._at, int(self._ahead.state["sensed_ns"])
         self.ended_by = None
-        self._take_results(int(self._at["state"]["sensed_ns"]))  # of goals before
+        self._take_results(int(self._at.state["sensed_ns"]))  # of goals before
         self.clock.restart()
         self.running[:] = True
         return np.zeros((1, 0))
@@ -123,14 +123,14 @@ class Onlooker:
 
     def observe(self) -> Frame:
         """Return the observation that the present frame began with, no older than when it was read."""
-        state = self._at["state"]
+        state = self._at.state
         return frame_of(self.mirror, state, int(state["sensed_ns"]), self._origin_ns)
 
     def step(self, command: Command) -> FrameReport:
         """Report the present frame, once the next is over or is known not to come."""
         before, after = self._at, self._ahead
         self._at, self._ahead = after, self._read()
-        state = after["state"]
+        state = after.state
         event = np.array([int(self._judge(state))])
         report = report_of(
             self.mirror,
@@ -141,12 +141,12 @@ class Onlooker:
             truth=lambda: event,
             origin_ns=self._origin_ns,
         )
-        report.number -= int(self._first["frame"])
+        report.number -= self._first.frame
         return report
 
     @property
     def _origin_ns(self) -> int:
-        return int(self._first["state"]["sensed_ns"])
+        return int(self._first.state["sensed_ns"])
 
     def _judge(self, state: Any) -> Event:
         """Return how the episode ends with a frame, by the state at its end."""

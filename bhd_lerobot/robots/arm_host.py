@@ -1,4 +1,4 @@
-"""n UR5s under one cerebellum, whatever is below it: what they observe, and how their actions become setpoints."""
+"""n arms under one cerebellum, whatever is below it: what they observe, and how their actions become setpoints."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, without_jerk_limits
+from bhd_lerobot.bodies.body import Arm, Body, without_jerk_limits
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.impedance import ImpedanceController
@@ -55,8 +54,6 @@ def pose_matrices(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     return Pose((x, y, z), (quaternion[0], quaternion[1], quaternion[2], quaternion[3])).matrix(), None
 
 
-JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
-OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
 _TO_START = 0.5  # [rad/s] so fast does a joint turn at the most on the way to the start of an episode
 _LARGEST_TURN = 1.0  # [rad] of a joint from one tool pose to the next: a second at a third of the largest speed
 _JUMP = (
@@ -86,7 +83,6 @@ class ArmHost(Host):
         options: those of `Host`.
     """
 
-    action_names = JOINT_ACTIONS
     knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
 
     def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
@@ -94,6 +90,7 @@ class ArmHost(Host):
         arm = body.need(Arm)
         self.plant = plant
         self.kinematics = ArmKinematics(arm.chain, arm.limits)
+        self._joints = len(arm.chain.joints)
         ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":
@@ -117,8 +114,8 @@ class ArmHost(Host):
         super().__init__(
             config,
             Cerebellum(body, plant, config.control_hz, controller=self.controller),
-            action_names=TOOL_NAMES if config.action_space == "tool" else JOINT_ACTIONS,
-            observation_names=observation_names(config),
+            action_names=TOOL_NAMES if config.action_space == "tool" else body.limits.names,
+            observation_names=observation_names(body, tool_pose=config.tool_pose),
             **options,
         )
 
@@ -135,7 +132,7 @@ class ArmHost(Host):
         """Return observations of positions and speeds, shape (n, 2 joints): with the tool's pose if asked for."""
         if not self.config.tool_pose:
             return state
-        return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : len(JOINTS)]))], axis=1)
+        return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : self._joints]))], axis=1)
 
     def truth(self) -> ArmTruth:
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""
@@ -158,7 +155,7 @@ class ArmHost(Host):
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the tool in recorded observations, shape (frames, 7)."""
-        return pose_vectors(self.kinematics.tool(np.asarray(states, np.float64)[:, : len(JOINTS)]))
+        return pose_vectors(self.kinematics.tool(np.asarray(states, np.float64)[:, : self._joints]))
 
     def start_goal(self, scene: TableScene | None) -> BrainCommand | None:
         """Return the goal that brings an arm to the start of a scene; it stays where it is if there is none."""
@@ -215,7 +212,7 @@ class ArmHost(Host):
         posture = result.postures[0]
         turn = np.abs(posture - before)
         if turn.max() > _LARGEST_TURN:
-            return before, _JUMP.format(JOINTS[int(turn.argmax())], turn.max(), _LARGEST_TURN)
+            return before, _JUMP.format(self.kinematics.chain.joints[int(turn.argmax())], turn.max(), _LARGEST_TURN)
         if self._refused[sim]:
             # In a fast stream the arm is far behind: a single refusal must not end it.
             follows = self.cerebellum.mode[sim] == Mode.TRACKING
@@ -226,6 +223,7 @@ class ArmHost(Host):
         return posture, None
 
 
-def observation_names(config: "UR5Config") -> tuple[str, ...]:
+def observation_names(body: Body, *, tool_pose: bool) -> tuple[str, ...]:
     """Return the names of the observation's floats, in order."""
-    return OBSERVED + TOOL_NAMES[:-1] * config.tool_pose
+    positions = body.limits.names
+    return (*positions, *(f"{name.removesuffix('.pos')}.vel" for name in positions), *TOOL_NAMES[:-1] * tool_pose)

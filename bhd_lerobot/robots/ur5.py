@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES, observation_names
+from bhd_lerobot.robots.arm_host import TOOL_NAMES, observation_names
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -32,11 +32,12 @@ class UR5(BhdRobot):
 
     def __init__(self, config: UR5Config) -> None:
         super().__init__(config)
+        self._body = config.body()
         self._task: Any = None
         if config.scene == "reach":
-            self._task = ReachTask(ReachConfig(), 1, config.fps)
+            self._task = ReachTask(ReachConfig(), 1, config.fps, self._body)
         elif config.scene == "pick":
-            self._task = PickTask(PickConfig(), 1, config.fps)
+            self._task = PickTask(PickConfig(), 1, config.fps, self._body)
         self._scene: TableScene | None = None
 
     def make_scene(self) -> TableScene:
@@ -62,12 +63,12 @@ class UR5(BhdRobot):
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
-        return observation_names(self.config)
+        return observation_names(self._body, tool_pose=self.config.tool_pose)
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the action's floats, in order."""
-        return TOOL_NAMES if self.config.action_space == "tool" else JOINT_ACTIONS
+        return TOOL_NAMES if self.config.action_space == "tool" else self._body.limits.names
 
     @property
     def camera_shapes(self) -> dict[str, tuple[int, int, int]]:

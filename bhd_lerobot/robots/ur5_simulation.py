@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planning import Planning
@@ -78,9 +77,9 @@ class UR5Simulation(ArmHost, Simulation):
         from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 
         if config.scene == "reach":
-            return ReachTask(ReachConfig(), 1, config.fps).sample(config.seed)
+            return ReachTask(ReachConfig(), 1, config.fps, config.body()).sample(config.seed)
         if config.scene == "pick":
-            return PickTask(PickConfig(), 1, config.fps).sample(config.seed)
+            return PickTask(PickConfig(), 1, config.fps, config.body()).sample(config.seed)
         return TableScene("empty", (), config.body().need(Arm).home)
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
@@ -101,7 +100,7 @@ class UR5Simulation(ArmHost, Simulation):
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the tool in recorded states, shape (frames, 7)."""
-        joints, _ = self.world.joint_slice(JOINTS)
+        joints, _ = self.world.joint_slice(self.kinematics.chain.joints)
         return pose_vectors(self.kinematics.tool(states[:, joints]))
 
     def truth(self) -> ArmTruth:
@@ -121,7 +120,7 @@ class UR5Simulation(ArmHost, Simulation):
         reading = self._newest()
         state = np.concatenate([reading.position, reading.velocity], axis=1)
         if np.count_nonzero(self._noise):
-            joints = len(JOINTS)
+            joints = self._joints
             for sim in np.flatnonzero((self._noise > 0) & self.running):
                 noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, joints))
                 state[sim, :joints] += noise[0]

@@ -25,6 +25,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.external.names import name_of_robot
+from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.types import Episode
@@ -73,6 +74,7 @@ def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain
     if is_continued and (info := info_of(root)) is not None:
         if EFFORT not in info.features:
             features.pop(EFFORT, None)  # the dataset is older than this column
+        about["robot"] = _as_read_then(about["robot"], info.recording.get("robot"))
         about["task"] = _without_new(about["task"], info.recording.get("task"), type(recording.task))
         about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
@@ -168,6 +170,18 @@ def _without_new(asked: dict[str, Any], recorded: Any, kind: type) -> dict[str, 
         elif name in recorded and is_dataclass(made):
             kept[name] = _without_new(kept[name], recorded[name], type(made))
     return kept
+
+
+def _as_read_then(asked: dict[str, Any], recorded: Any) -> dict[str, Any]:
+    """Return the description of a robot with those options of a dataset's that say how its frames were read, as then.
+
+    They changed nothing in the frames; some are gone.
+    """
+    then = recorded.get("realtime") if isinstance(recorded, Mapping) else None
+    if "realtime" not in asked or not isinstance(then, Mapping):
+        return asked
+    names = {"buffer_s", *RealtimeConfig.removed} - ({"plant_process"} if then.get("plant_process") else set())
+    return {**asked, "realtime": asked["realtime"] | {name: then[name] for name in names & then.keys()}}
 
 
 def _as_named_then(asked: Any, recorded: Any) -> Any:

@@ -18,12 +18,9 @@ from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
-_AREA = np.array([[0.35, -0.30], [0.65, 0.30]])
 _APART = 0.05  # [m] free space between the circles around two objects: an open finger fits between them
 _LIFTED, _FALLEN = 0.05, 0.015  # [m] above and below which an object counts as in the gripper, and as back on the table
 _STRAY = 0.03  # [m] another object than the target that is lifted this far was picked up, not brushed
-_REACH = 0.80  # [m] horizontal distance from the base beyond which a tool that points down does not get
-_WIDEST = 0.076  # [m] the narrow side of an object fits between the fingers, however it is randomised
 _TRIES = 1000
 
 ENVIRONMENT = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
@@ -145,7 +142,7 @@ class PickTask(ArmTask):
         chosen = _draw_names(config.names, count, rng)
         objects: list[TableObject] = []
         while len(objects) < count:
-            objects = _draw_objects(config, chosen, rng)
+            objects = _draw_objects(config, self.arm, chosen, rng)
         target = 0 if config.names == "held_out" else int(rng.integers(count))
         objects = _target_first(objects, (target + config.swap) % count)
         languages = tuple(INSTRUCTIONS) if config.language == "any" else (config.language,)
@@ -227,7 +224,7 @@ class PickTask(ArmTask):
         event = self.count_frame(running)
         # What must not happen counts also in the last frame of a success: the later of these takes the earlier's place.
         for name, happened in (
-            (Event.UNREACHABLE, np.hypot(at[:, 0], at[:, 1]) > _REACH),
+            (Event.UNREACHABLE, np.hypot(at[:, 0], at[:, 1]) > self.arm.workspace.reach),
             (Event.DROPPED, (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped),
             (Event.SUCCESS, self._held >= self._hold),
             (Event.WRONG_OBJECT, (lift > _STRAY).any(axis=1)),
@@ -290,7 +287,9 @@ _UNSEEN = {
 _OTHER_SHADE = 0.11  # added to or taken from red, green and blue; more than the randomisation's `colour`
 
 
-def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.random.Generator) -> list[TableObject]:
+def _draw_objects(
+    task: PickConfig, arm: Arm, names: Sequence[tuple[str, str]], rng: np.random.Generator
+) -> list[TableObject]:
     """Return objects of these colours and kinds that stand apart; fewer if the last found no place."""
     objects: list[TableObject] = []
     unseen = task.objects == "unseen"
@@ -304,9 +303,10 @@ def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.ra
         width = length if kind == "cup" else rng.uniform(*ranges[1])
         height = rng.uniform(*ranges[2])
         factor = change["size"]
-        size_x, size_y = length / 2 * factor[0], min(width / 2 * factor[0 if kind == "cup" else 1], _WIDEST / 2)
+        size_x = length / 2 * factor[0]
+        size_y = min(width / 2 * factor[0 if kind == "cup" else 1], arm.gripper.widest / 2)
         size_x = size_y if kind == "cup" else size_x
-        place = _draw_place(math.hypot(size_x, size_y) if kind == "box" else size_x, objects, rng)
+        place = _draw_place(math.hypot(size_x, size_y) if kind == "box" else size_x, arm, objects, rng)
         if place is None:
             break
         objects.append(
@@ -339,10 +339,12 @@ def _other_shade(colour: str, rng: np.random.Generator) -> tuple[float, ...]:
             return tuple(shade.tolist())
 
 
-def _draw_place(radius: float, objects: Sequence[TableObject], rng: np.random.Generator) -> NDArray[np.float64] | None:
+def _draw_place(
+    radius: float, arm: Arm, objects: Sequence[TableObject], rng: np.random.Generator
+) -> NDArray[np.float64] | None:
     """Return a place for an object of this radius, apart from the others; None if there seems to be none."""
     for _ in range(_TRIES):
-        place = rng.uniform(_AREA[0], _AREA[1])
+        place = rng.uniform(*arm.workspace.table)
         for item in objects:
             other = math.hypot(item.size_x, item.size_y) if item.kind == "box" else item.size_x
             if math.hypot(place[0] - item.x, place[1] - item.y) < radius + other + _APART:

@@ -3,15 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -21,8 +20,6 @@ from bhd_lerobot.tasks.sensing import Sensing, SensingConfig
 from bhd_lerobot.tasks.task import ArmTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
-# Where targets are, in the base frame [m]: before the arm, over the table.
-_BOX = np.array([[0.20, -0.45, 0.10], [0.70, 0.45, 0.60]])
 # A target is reached in a posture at least this many times better than one that counts as singular: a brain that comes
 # to the pose by another branch of the inverse kinematics shall find it reachable, too.
 _AWAY_FROM_SINGULAR = 3.0
@@ -82,12 +79,11 @@ class ReachTask(ArmTask):
     def sample(self, seed: int) -> TableScene:
         """Return the start posture and the target of the episode with this seed."""
         rng = np.random.default_rng(seed)
-        kinematics, home = _kinematics()
         return TableScene(
             name="reach",
             objects=(),
-            posture=(*self._draw_start(rng, kinematics, home), home[-1]),
-            target_pose=_draw_target(rng, kinematics),
+            posture=(*self._draw_start(rng), self.arm.home[-1]),
+            target_pose=self._draw_target(rng),
             instruction=self.instruction(None),
             variation=draw_variation(self.config.randomisation, rng),
             report_seed=self.config.sensing.draw_seed(rng),
@@ -154,33 +150,31 @@ class ReachTask(ArmTask):
         cosine = np.abs((truth.tool_pose[:, 3:] * self._target[:, 3:]).sum(axis=1))
         return distance, 2 * np.arccos(np.minimum(cosine, 1.0))
 
-    def _draw_start(
-        self, rng: np.random.Generator, kinematics: ArmKinematics, home: tuple[float, ...]
-    ) -> tuple[float, ...]:
-        spread = self.config.start_spread_rad
+    @cached_property
+    def _kinematics(self) -> ArmKinematics:
+        return ArmKinematics(self.arm.chain, self.arm.limits)
+
+    def _draw_posture(self, rng: np.random.Generator, spread: float | Sequence[float]) -> NDArray[np.float64]:
+        """Return a posture around home; each joint is turned by at most `spread` [rad]."""
+        home, most = np.array(self.arm.home[:-1]), np.asarray(spread, np.float64)
+        return home + rng.uniform(-most, most, len(home))
+
+    def _draw_start(self, rng: np.random.Generator) -> tuple[float, ...]:
         for _ in range(_TRIES):
-            posture = np.array(home[:-1]) + rng.uniform(-spread, spread, len(home) - 1)
-            if kinematics.check(posture) == ResultCode.SUCCEEDED:
+            posture = self._draw_posture(rng, self.config.start_spread_rad)
+            if self._kinematics.check(posture) == ResultCode.SUCCEEDED:
                 return tuple(posture.tolist())
         raise AssertionError("No start posture is free; home is.")
 
-
-def _draw_target(rng: np.random.Generator, kinematics: ArmKinematics) -> tuple[float, ...]:
-    """Return a pose that an admissible posture has: reachable by construction."""
-    least = _AWAY_FROM_SINGULAR * kinematics.chain.min_manipulability
-    for _ in range(_TRIES):
-        # Elbow up and the tool somewhere before the arm: a random posture of all six is nearly always behind it.
-        posture = np.array([math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0]) + rng.uniform(
-            [-1.0, -0.9, -0.9, -1.2, -1.2, -math.pi], [1.0, 0.9, 0.9, 1.2, 1.2, math.pi]
-        )
-        tool = kinematics.tool(posture)
-        inside = ((tool[:3, 3] >= _BOX[0]) & (tool[:3, 3] <= _BOX[1])).all()
-        if inside and kinematics.manipulability(posture) >= least and kinematics.check(posture) == ResultCode.SUCCEEDED:
-            return tuple(pose_vectors(tool).tolist())
-    raise AssertionError("No target was found; the box before the arm is full of them.")
-
-
-@cache
-def _kinematics() -> tuple[ArmKinematics, tuple[float, ...]]:
-    arm = ur5().need(Arm)
-    return ArmKinematics(arm.chain, arm.limits), arm.home
+    def _draw_target(self, rng: np.random.Generator) -> tuple[float, ...]:
+        """Return a pose that an admissible posture has: reachable by construction."""
+        kinematics, workspace = self._kinematics, self.arm.workspace
+        least, (low, high) = _AWAY_FROM_SINGULAR * kinematics.chain.min_manipulability, np.array(workspace.tool)
+        for _ in range(_TRIES):
+            posture = self._draw_posture(rng, workspace.around_home)
+            tool = kinematics.tool(posture)
+            if not ((tool[:3, 3] >= low) & (tool[:3, 3] <= high)).all() or kinematics.manipulability(posture) < least:
+                continue
+            if kinematics.check(posture) == ResultCode.SUCCEEDED:
+                return tuple(pose_vectors(tool).tolist())
+        raise AssertionError("No target was found; the box before the arm is full of them.")

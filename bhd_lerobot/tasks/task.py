@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol
 
 import draccus
@@ -246,7 +247,7 @@ class ArmTask(ConfiguredTask):
 
     needs: tuple[type, ...] = (Arm,)
 
-    @property
+    @cached_property
     def arm(self) -> Arm:
         """The robot's arm."""
         return (self.body or body_with(Arm)).need(Arm)

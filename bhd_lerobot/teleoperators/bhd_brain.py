@@ -186,7 +186,8 @@ class BhdBrain(Teleoperator):
         body, rates = robot.host.body, robot.host.rates
         if body.arm is None or body.arm.actuation != "position":
             raise ConfigError(
-                f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5 with robot.control = servo."
+                f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use an arm with "
+                "robot.control = servo."
             )
         if self._streamer is None:
             self._streamer = GoalStreamer(body, rates, robot.host.bridge.state().command[0])

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.registry import body_with
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import MAX_SPEED, MAX_TURN_SPEED, BhdKeyboardArmConfig
 from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
-from bhd_lerobot.teleoperators.targets import JOINT_NAMES, POSE_NAMES, JointTarget, Target, ToolTarget
+from bhd_lerobot.teleoperators.targets import POSE_NAMES, JointTarget, Target, ToolTarget, joint_names
 
 GRIPPER = "gripper.pos"
-_GRIPPER_SPEED = 0.1  # [m/s] of the opening; an estimate, slow enough for the UR5's gripper to follow
+_GRIPPER_SPEED = 0.1  # [m/s] of the opening; an estimate, slow enough for a gripper of 0.15 m/s to follow
 _GRIP_M = 0.01  # [m] that a gripper is closed further than what it may hold is wide
 _LONGEST_STEP_S = 0.1  # [s] that one action moves the target for: a program that was held up does not catch up
 
@@ -56,6 +56,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         super().__init__(config, _TOOL_KEYS if config.action_space == "tool" else _JOINT_KEYS, clock)
         self._speed, self._turn_speed = config.speed, config.turn_speed
         self._robot: BhdRobot | None = None
+        self._arm = body_with(Arm).need(Arm)  # until it is known
         self._observation: Mapping[str, Any] | None = None  # that someone has passed
         self._target: Target | None = None
         self._opening, self._opening_target = 0.0, 0.0
@@ -72,16 +73,19 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         return f"Now {moves}{self._turn_speed:.3f} rad/s."
 
     @property
+    def _widest(self) -> float:
+        return self._arm.gripper.max_opening if self.config.opening is None else self.config.opening
+
+    @property
     def action_features(self) -> dict[str, type]:
         """A pose of the tool, or joint positions, and the gripper's opening."""
-        names = POSE_NAMES if self.config.action_space == "tool" else JOINT_NAMES
+        names = POSE_NAMES if self.config.action_space == "tool" else joint_names(self._arm)
         return dict.fromkeys((*names, GRIPPER), float)
 
     def adjust(self, key: str) -> bool:
         """Apply a key of the gripper or of the speeds."""
         if key == "g":
-            half = self.config.opening / 2
-            self._opening_target = 0.0 if self._opening_target > half else self.config.opening
+            self._opening_target = 0.0 if self._opening_target > self._widest / 2 else self._widest
         elif key in "+=-":
             factor = SLOWER if key == "-" else FASTER
             self._speed = min(self._speed * factor, MAX_SPEED)
@@ -95,28 +99,30 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         """Begin where the robot is.
 
         Args:
-            observation: the gripper's opening, and the tool's pose or a UR5's joint positions, by feature name.
-            body: the arm; the UR5 if it is not known.
+            observation: the gripper's opening, and the tool's pose or the joint positions, by feature name.
+            body: the robot; if None, the first type of robot that has an arm.
 
         Raises:
             ConfigError: the observation lacks them.
         """
         self._observation = observation
-        self._begin(observation, body)
+        if body is not None:
+            self._arm = body.need(Arm)
+        self._begin(observation)
 
     def observe(self, observation: Mapping[str, Any]) -> None:
         """Take the newest observation: the target stays near to it."""
         self._observation = observation
 
-    def _begin(self, observation: Mapping[str, Any], body: Body | None = None) -> None:
+    def _begin(self, observation: Mapping[str, Any]) -> None:
         if GRIPPER not in observation:
             raise ConfigError(f"The observation has {', '.join(observation)}; bhd_keyboard_arm needs {GRIPPER}, too.")
         if self.config.action_space == "tool":
-            self._target = ToolTarget(observation, (body or ur5()).need(Arm), say)
+            self._target = ToolTarget(observation, self._arm, say)
         else:
-            self._target = JointTarget(observation)
+            self._target = JointTarget(observation, self._arm)
         self._opening = self._opening_target = float(observation[GRIPPER])
-        if self._opening < self.config.opening - _GRIP_M:  # it may hold something, and is not to let it go
+        if self._opening < self._widest - _GRIP_M:  # it may hold something, and is not to let it go
             self._opening_target = max(0.0, self._opening - _GRIP_M)
         self._last = self._clock()
         self._held = ""
@@ -161,14 +167,15 @@ class BhdKeyboardArm(KeyboardTeleoperator):
             )
         (robot,) = robots
         if robot is not self._robot:
-            body = robot.host.body
-            if list(robot.action_names) != list(self.action_features) or body.arm is None:
+            arm = robot.host.body.arm
+            self._arm = arm or self._arm
+            if list(robot.action_names) != list(self.action_features) or arm is None:
                 raise ConfigError(
                     f"bhd_keyboard_arm gives {', '.join(self.action_features)}; the {robot.name} takes "
                     f"{', '.join(robot.action_names)}. An arm and its keys have one action space, tool or joint: give "
                     "--robot.action_space and --teleop.action_space. A base needs --teleop.type=bhd_keyboard_base."
                 )
-            self._begin(robot.last_observation, body)
+            self._begin(robot.last_observation)
             self._robot = robot
         return robot.last_observation
 

@@ -12,11 +12,11 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES
+from bhd_lerobot.robots.arm_host import TOOL_NAMES
 
 Array = NDArray[np.float64]
 
-POSE_NAMES, JOINT_NAMES = TOOL_NAMES[:-1], JOINT_ACTIONS[:-1]
+POSE_NAMES = TOOL_NAMES[:-1]
 LEASH_M, LEASH_RAD = 0.05, 0.2
 """The farthest that a target is from the measured pose: what an arm that is held up still moves by when it is free."""
 _LARGEST_TURN = 0.5  # [rad] of a joint in one step of the tool: beyond it the arm would take another posture
@@ -38,31 +38,36 @@ class Target(Protocol):
         """Move it by a change of shape (6,), and keep it near to what is observed."""
 
 
+def joint_names(arm: Arm) -> tuple[str, ...]:
+    """Return the features of an arm's joint positions."""
+    return tuple(f"{joint}.pos" for joint in arm.chain.joints)
+
+
 def _read(observation: Mapping[str, Any], names: Sequence[str]) -> Array | None:
     """Return values of an observation, or None where it has not all of them."""
     return np.array([float(observation[name]) for name in names]) if set(names) <= observation.keys() else None
 
 
 class JointTarget:
-    """Positions of a UR5's joints [rad].
+    """Positions of an arm's joints [rad].
 
     Args:
         observation: where they are.
+        arm: whose joints they are.
 
     Raises:
         ConfigError: the observation lacks them.
     """
 
-    names: tuple[str, ...] = JOINT_NAMES
-
-    def __init__(self, observation: Mapping[str, Any]) -> None:
+    def __init__(self, observation: Mapping[str, Any], arm: Arm) -> None:
+        self.names = joint_names(arm)
         self._joints = self._measured(observation)
 
     def _measured(self, observation: Mapping[str, Any]) -> Array:
-        joints = _read(observation, JOINT_NAMES)
+        joints = _read(observation, self.names)
         if joints is None:
             raise ConfigError(
-                f"The observation has {', '.join(observation)}; to turn joints it needs {', '.join(JOINT_NAMES)}."
+                f"The observation has {', '.join(observation)}; to turn joints it needs {', '.join(self.names)}."
             )
         return joints
 
@@ -84,7 +89,7 @@ class ToolTarget:
 
     Args:
         observation: where the tool is; if it lacks the tool's pose, that follows from the joints.
-        body: what the joints move.
+        arm: what the joints move.
         report: gets why the target stops, when it does.
 
     Raises:
@@ -96,7 +101,8 @@ class ToolTarget:
     def __init__(self, observation: Mapping[str, Any], arm: Arm, report: Callable[[str], None]) -> None:
         self._kinematics = ArmKinematics(arm.chain, arm.limits)
         self._report = report
-        self._posture = _read(observation, JOINT_NAMES)
+        self._joints = joint_names(arm)
+        self._posture = _read(observation, self._joints)
         self._position, self._rotation = self._measured(observation)
         self._is_stopped = False
 
@@ -104,11 +110,11 @@ class ToolTarget:
         pose = _read(observation, POSE_NAMES)
         if pose is not None:
             return pose[:3], Rotation.from_quat(pose[3:], scalar_first=True)
-        joints = _read(observation, JOINT_NAMES)
+        joints = _read(observation, self._joints)
         if joints is None:
             raise ConfigError(
                 f"The observation has {', '.join(observation)}; to move the tool it needs {', '.join(POSE_NAMES)}, or "
-                f"the joints of a UR5, {', '.join(JOINT_NAMES)}. A ur5 observes the tool with --robot.tool_pose=true."
+                f"the joints, {', '.join(self._joints)}. An arm observes the tool with --robot.tool_pose=true."
             )
         matrix = self._kinematics.tool(joints)
         return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3])

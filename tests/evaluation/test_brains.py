@@ -11,7 +11,6 @@ from tests.recording.support import save_lidar_policy
 LIVE = {
     "robot__clock": "realtime",
     "robot__realtime__brain_timeout_s": 20,
-    "robot__realtime__recorder_timeout_s": 20,
     "robot__realtime__most_misses": 10**6,
 }
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.evaluation.metrics import JerkMeasure, measure
 from bhd_lerobot.realtime.timing import TimingStatistics
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Outcome
 
@@ -59,7 +59,7 @@ def test_jerk_of_joints_is_the_length_of_the_third_derivative_without_the_grippe
     t = np.arange(40) / FPS
     cubic = t**3 / 6
     applied = np.stack([0.3 * cubic, 0.4 * cubic, *[0 * t] * 4, 5 * cubic], axis=1)
-    metrics = measured(episode(applied), names=JOINT_ACTIONS)
+    metrics = measured(episode(applied), names=ur5().limits.names)
     assert metrics.jerk_mean == pytest.approx(0.5, rel=1e-2)
 
 

@@ -144,6 +144,7 @@ def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
         ("--robot.type=UR5", "Did you mean 'ur5'"),
         ("--robot.type=SO101_Follower", "Did you mean 'so101_follower'"),
         ("--brain.type=Avoidence", "Did you mean 'avoidance'"),
+        ("--robot.realtime.recorder_timeout_s=2", "robot.realtime.recorder_timeout_s was removed: there is no"),
         ("--robot.realtime.plant_process=true", "robot.realtime.plant_process was removed: a simulated world"),
     ],
 )

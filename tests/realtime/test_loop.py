@@ -179,21 +179,17 @@ def test_so_many_misses_in_a_row_are_a_fault_and_one_less_is_not(misses):
         assert loop.modes[: misses + 1] == [Mode.HOLD] * (misses + 1)
 
 
-@pytest.mark.parametrize(
-    ("word", "watchdog"), [(Word.BRAIN_ALIVE, Watchdog.BRAIN), (Word.RECORDER_ALIVE, Watchdog.RECORDER)]
-)
 @settings(max_examples=15)
 @given(timeout_ms=st.integers(1, 400), dies=st.integers(1, 60), phase=st.integers(0, TICK_NS - 1))
-def test_silence_stops_the_robot_at_its_time_out(word, watchdog, timeout_ms, dies, phase):
+def test_silence_stops_the_robot_at_its_time_out(timeout_ms, dies, phase):
     """Counted in ticks: the first that starts more than the time-out after the last sign of life, and no other."""
-    other = Word.RECORDER_ALIVE if word == Word.BRAIN_ALIVE else Word.BRAIN_ALIVE
-    loop = VirtualLoop(LoopLimits(**{f"{watchdog.name.lower()}_timeout_s": timeout_ms / 1e3}), alive=(word, other))
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=timeout_ms / 1e3), alive=(Word.BRAIN_ALIVE,))
     ticks = dies + timeout_ms * MS // TICK_NS + STOPPING_TICKS
     start = loop.now
 
     def die() -> None:
-        loop.alive.discard(word)
-        loop.words[word] = start + (dies - 1) * TICK_NS + phase
+        loop.alive.clear()
+        loop.words[Word.BRAIN_ALIVE] = start + (dies - 1) * TICK_NS + phase
 
     loop.script[dies] = die
     loop.drive(0, ticks)  # the brain's other half goes on sending: that must not move the robot again
@@ -206,7 +202,7 @@ def test_silence_stops_the_robot_at_its_time_out(word, watchdog, timeout_ms, die
     assert loop.modes[stopped:] == [Mode.STOPPING] * (hold - stopped) + [Mode.HOLD] * (ticks - hold)
     assert loop.speeds[hold:] == [0.0] * (ticks - hold)
     assert np.all(np.diff(loop.speeds[stopped : hold + 1]) <= 0)
-    assert loop.watchdogs[stopped] == watchdog
+    assert loop.watchdogs[stopped] == Watchdog.BRAIN
     assert not any(loop.watchdogs[:stopped])
 
 
@@ -221,18 +217,17 @@ def test_a_sign_of_life_after_the_silence_and_a_new_setpoint_move_it_again():
     assert loop.modes[-1] == Mode.TRACKING
 
 
-@pytest.mark.parametrize("word", [Word.BRAIN_ALIVE, Word.RECORDER_ALIVE])
-def test_a_sign_of_life_from_the_future_is_none(word):
-    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.1, recorder_timeout_s=0.1))
-    loop.words[word] = loop.now + 3600 * NANOSECONDS
+def test_a_sign_of_life_from_the_future_is_none():
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.1))
+    loop.words[Word.BRAIN_ALIVE] = loop.now + 3600 * NANOSECONDS
     loop.drive(0, 30)
     loop.run(30)
     assert Mode.TRACKING not in loop.modes
 
 
-def test_absent_processes_are_not_watched():
+def test_an_absent_brain_is_not_watched():
     """A word that was never written belongs to a process that there is not."""
-    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01))
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01))
     loop.drive(0, 100)
     loop.run(100)
     assert set(loop.modes) == {Mode.TRACKING}

@@ -8,7 +8,6 @@ import pytest
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RenderingError
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.ur5 import UR5
@@ -159,7 +158,7 @@ def test_an_impedance_with_too_much_latency_is_refused():
 
 
 def test_a_goal_for_an_unknown_arm_is_refused(robot):
-    assert robot.host.body.limits.names == JOINT_ACTIONS
+    assert robot.host.body.limits.names == robot.action_names
     for sim in (-1, 1):
         with pytest.raises(ConfigError, match=f"sim is {sim}"):
             robot.host.bridge.submit(BrainCommand("a", gripper=0.05), sim)

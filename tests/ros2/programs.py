@@ -30,7 +30,6 @@ BOOL, STATE = "std_msgs/msg/Bool", "bhd_interfaces/msg/CerebellumState"
 
 RELAXED = (
     "--robot.realtime.brain_timeout_s=20",
-    "--robot.realtime.recorder_timeout_s=20",
     "--robot.realtime.most_misses=1000000",
 )
 

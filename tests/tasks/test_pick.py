@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
@@ -104,20 +106,35 @@ def corners(one: TableObject) -> np.ndarray:
 
 
 HUGE = RandomisationConfig(enabled=True, size=0.6)
+NARROW_TABLE = (0.2, -0.4, 0.7, 0.5)
+_ARM = ur5().arm
+NARROW = replace(
+    ur5(),
+    arm=replace(
+        _ARM,
+        gripper=replace(_ARM.gripper, widest=0.06),
+        workspace=replace(_ARM.workspace, table=(NARROW_TABLE[:2], NARROW_TABLE[2:])),
+    ),
+)
 
 
 @each_case("randomisation", [RandomisationConfig(), WILD, HUGE])
-def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(randomisation: RandomisationConfig) -> None:
-    task = PickTask(PickConfig(randomisation=randomisation), 1, FPS)
+@each_case(
+    ("body", "table", "fits"), [(ur5(), (0.35, -0.3, 0.65, 0.3), MAX_OPENING - 0.008), (NARROW, NARROW_TABLE, 0.06)]
+)
+def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(
+    body: Body, table: tuple[float, ...], fits: float, randomisation: RandomisationConfig
+) -> None:
+    task = PickTask(PickConfig(randomisation=randomisation), 1, FPS, body)
     counts = set()
     for seed in range(150):
         scene = task.sample(seed)
         counts.add(len(scene.objects))
         assert len({one.name for one in scene.objects}) == len(scene.objects)
         for one in scene.objects:
-            assert 0.35 <= one.x <= 0.65
-            assert -0.30 <= one.y <= 0.30
-            assert 2 * min(one.size_x, one.size_y) + 0.008 <= MAX_OPENING
+            assert table[0] <= one.x <= table[2]
+            assert table[1] <= one.y <= table[3]
+            assert 2 * min(one.size_x, one.size_y) <= fits
             if one.kind == "cup":
                 assert one.size_x == one.size_y
         for one, two in itertools.combinations(scene.objects, 2):

@@ -1,6 +1,7 @@
 """The tool and the joints of an arm moved from a terminal, alone and under LeRobot's command."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
-from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES
+from bhd_lerobot.robots.arm_host import TOOL_NAMES
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
@@ -33,6 +34,7 @@ from tests.waiting import until
 FRAME = 0.04  # [s]
 DOWN = (0.0, 1.0, 0.0, 0.0)
 POSE = dict(zip(TOOL_NAMES, (0.4, 0.1, 0.3, *DOWN, 0.085), strict=True))
+JOINT_ACTIONS = UR5Config().body().limits.names
 JOINTS = dict(zip(JOINT_ACTIONS, (*UR5Config().body().arm.home,), strict=True))
 TOOL_KEYS = ("w", "a", "r", "u", "i", "j"), ("s", "d", "f", "o", "k", "l")  # along and about x, y, z, and back
 JOINT_KEYS = "asdfhj", "zxcvnm"
@@ -88,6 +90,24 @@ def test_each_key_turns_its_joint(make: Any, clock: Clock, person: Person) -> No
             turned[JOINT_ACTIONS[joint]] += sign * FRAME * 0.3
             assert list(action) == list(teleop.action_features)
             assert action == pytest.approx(turned)
+
+
+def test_joints_and_opening_are_those_of_the_arm(make: Any, clock: Clock, person: Person) -> None:  # noqa: F811
+    arm = UR5Config().body().arm
+    names = tuple(f"j{number}" for number in range(6))
+    arm = replace(arm, chain=replace(arm.chain, joints=names), gripper=replace(arm.gripper, max_opening=0.05))
+    teleop = make(action_space="joint")
+    teleop.start_from(
+        {**dict(zip((f"{name}.pos" for name in names), arm.home, strict=False)), "gripper.pos": 0.0},
+        replace(UR5Config().body(), arm=arm),
+    )
+    person.press("g", teleop)
+    clock.now += FRAME
+    assert list(teleop.get_action()) == [*(f"{name}.pos" for name in names), "gripper.pos"]
+    for _ in range(30):
+        clock.now += FRAME
+        action = teleop.get_action()
+    assert action["gripper.pos"] == 0.05
 
 
 @each_case("space", ["tool", "joint"])

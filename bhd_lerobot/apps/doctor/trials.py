@@ -114,12 +114,14 @@ def encode() -> dict[str, Any]:
 
 def render() -> dict[str, Any]:
     """Render one image of a simulation; return the driver's name and how far apart its brightest and darkest are."""
-    from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+    from bhd_lerobot.bodies.body import Drive
+    from bhd_lerobot.bodies.registry import body_with
     from bhd_lerobot.sim.camera import Camera
     from bhd_lerobot.sim.world import World
 
-    camera = Camera(World(turtlebot3_burger()), 64, 48)
-    image = camera.render(0, "front")
+    body = body_with(Drive)
+    camera = Camera(World(body), 64, 48)
+    image = camera.render(0, next(iter(body.cameras)))
     gl = importlib.import_module("OpenGL.GL")
     name = gl.glGetString(gl.GL_RENDERER)
     camera.close()

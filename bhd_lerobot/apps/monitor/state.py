@@ -7,12 +7,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import decode_feedback
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
-from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.timing import TimingStatistics
 
 LIMITS = tuple(limit.name or "" for limit in Limit if limit)
@@ -22,7 +20,6 @@ REASONS = tuple(reason.name for reason in Reason)
 HEARTBEATS = {
     "brain": Word.BRAIN_ALIVE,
     "cerebellum": Word.CEREBELLUM_ALIVE,
-    "recorder": Word.RECORDER_ALIVE,
 }
 POSE = ("x", "y", "yaw")
 
@@ -72,14 +69,14 @@ class MonitorState:
     estop_latched: bool  # by the cerebellum
     control_rate: float | None  # measured over the last two seconds, as all rates
     control_hz: int  # wanted
-    frame_rate: float | None  # that the recorder takes
+    frame_rate: float | None  # that the brain's process reads; None if it reads none
     fps: int  # wanted
     command_rate: float | None  # setpoints that the cerebellum takes
     executed: int  # ticks of the episode
     skipped: int  # ticks that were left out
     overruns: int  # ticks that ended after the next was due
     catch_up_lost: int  # ticks by which the simulated world fell behind
-    recorder_drops: int  # states that the recorder lost
+    recorder_drops: int  # states that were overwritten before the brain's process read them
     lateness: Spread | None  # of the ticks' starts
     duration: Spread | None  # of the ticks
     fifo_fill: int  # commands that wait
@@ -115,10 +112,6 @@ class Sampler:
         self._block, self._clock = block, clock
         self._started = int(block.about["made_ns"])
         self._statistics = block.section("statistics") if block.has("statistics") else None
-        self._frames: StateRing | None = None
-        if block.has("frames"):
-            capacity, memory = block.about["frames"], block.section("frames")
-            self._frames = StateRing(FrameLog(block.state_dtype, capacity, memory).dtype, capacity, memory)
         self._past: deque[_Counts] = deque()
         self._spreads: tuple[Spread | None, Spread | None] = (None, None)
 
@@ -153,7 +146,7 @@ class Sampler:
             estop=bool(words[Word.ESTOP] != words[Word.ESTOP_ACKNOWLEDGED]),
             control_rate=rates.get("executed"),
             control_hz=int(about["control_hz"]),
-            frame_rate=rates.get("frames"),
+            frame_rate=rates.get("frames") if words[Word.RECORDER_FRAMES] else None,
             fps=int(about["fps"]),
             command_rate=rates.get("setpoints"),
             executed=int(words[Word.EXECUTED]),
@@ -207,11 +200,13 @@ class Sampler:
         if state is None or int(state["segment"]) != segment or words[Word.PHASE] != Phase.RUNNING:
             self._past.clear()
             return {}
-        counts = {"executed": int(state["executed"]), "setpoints": int(state["setpoints"])}
+        counts = {
+            "executed": int(state["executed"]),
+            "setpoints": int(state["setpoints"]),
+            "frames": int(words[Word.RECORDER_FRAMES]),
+        }
         for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS)):
             counts |= {f"{key}.{name}": int(n) for name, n in zip(names, state[key], strict=True)}
-        if self._frames is not None:
-            counts["frames"] = len(self._frames)
         newest = _Counts(segment, now, int(state["start_ns"]), counts)
         past = self._past
         while past and (past[0].segment != segment or (len(past) > 1 and now - past[1].now > _WINDOW_NS)):

@@ -1,9 +1,9 @@
 """`bhd-data import`: ROS 2 bags become a dataset."""
 
 import argparse
-import dataclasses
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,10 @@ from bhd_lerobot.ros2.messages.types import require_rosbags
 from bhd_lerobot.tasks.task import OUTCOMES
 
 ROBOTS = ("turtlebot3",)
-_STAMPS = ("auto", "header", "receive")
+_STAMPS = ("receive", "header", "auto")
 _TOPICS = {"scan": "/scan", "odom": "/odom", "cmd": "/cmd_vel"}
 _BASE = (*_TOPICS, "no_odom", "imu", "camera", "odometry", "beams", "odom_frame")  # options for a TurtleBot3's bags
+_RESAMPLE = ("fps", "stamps", "max_age", "max_gap", "command_timeout")  # of these one resamples an exported bag
 
 
 def add_to(commands: Commands) -> None:
@@ -38,17 +39,19 @@ def add_to(commands: Commands) -> None:
     command.add_argument("bags", nargs="+", type=Path, help="bags: folders, .mcap or .db3 files, or a folder of bags")
     command.add_argument("--repo_id", required=True, help="name of the dataset, user/name")
     command.add_argument("--root", type=Path, help="where to put it; LeRobot's default place if left out")
-    command.add_argument("--task", help="the instruction, a sentence")
+    command.add_argument("--task", help="the instruction, a sentence (default: that of an exported bag)")
     command.add_argument("--fps", type=int, help="frames a second (default: 10, or those of an exported bag)")
-    command.add_argument("--stamps", default="receive", help="source of timestamps: receive (default), header or auto")
+    command.add_argument("--stamps", help="source of timestamps: receive (default), header or auto")
     command.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
+    command.add_argument("--max_gap", type=float, metavar="S", help="silence that ends an episode (default: 1.0)")
     command.add_argument(
-        "--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (default: 1.0)"
-    )
+        "--min_episode_s", type=float, metavar="S",
+        help="shorter episodes are left out (default: 1.0; 0 of an exported bag)",
+    )  # fmt: skip
     command.add_argument(
-        "--min_episode_s", type=float, metavar="S", help="shorter episodes are left out (default: 1.0)"
+        "--outcome",
+        help=f"outcome of the episodes: {', '.join(OUTCOMES)} (default: that of an exported bag, none of others)",
     )
-    command.add_argument("--outcome", help=f"outcome of the episodes: {', '.join(OUTCOMES)}; nothing if left out")
     real = command.add_argument_group("the robot")
     real.add_argument(
         "--robot",
@@ -85,35 +88,26 @@ def _run(options: argparse.Namespace) -> int:
     mapping = _mapping(options)
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
-    stated_fps = None
-    found = exported(bags[0]) if mapping is None and options.robot is None else None
-    if found is not None:
-        stated_fps = found.fps if options.fps is None else 0
-        mapping, options.robot, options.fps = (
-            found.mapping,
-            found.robot_type,
-            found.fps if options.fps is None else options.fps,
-        )
+    as_stated, robot_is_stated = all(getattr(options, name) is None for name in _RESAMPLE), False
+    if (found := exported(bags[0])) is not None:
+        if mapping is None and all(getattr(options, name) is None for name in ("robot", *_BASE)):
+            mapping, options.robot, robot_is_stated = found.mapping, found.robot_type, found.mapping is not None
+        options.fps = found.fps if options.fps is None else options.fps
         options.min_episode_s = options.min_episode_s or 0.0  # what was an episode is one, however short
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    report = import_bags(bags, root, options.repo_id, _wanted(options, mapping, stated_fps=stated_fps))
+    common = _common(options) | {"as_stated": as_stated, "robot_is_stated": robot_is_stated}
+    wanted = _of_turtlebot3(options, common) if mapping is None else _of_mapping(options, mapping, common)
+    report = import_bags(bags, root, options.repo_id, wanted)
     _print(report, bags)
     return 0
 
 
-def _wanted(options: argparse.Namespace, mapping: MappingConfig | None, *, stated_fps: int | None) -> ImportOptions:
-    """Return how bags are to be read: by a mapping, or by that of a TurtleBot3 with the options for its topics."""
-    common = _common(options, stated_fps=stated_fps)
-    return _of_turtlebot3(options, common) if mapping is None else _of_mapping(options, mapping, common)
-
-
-def _common(options: argparse.Namespace, *, stated_fps: int | None) -> dict[str, Any]:
+def _common(options: argparse.Namespace) -> dict[str, Any]:
     """Return how bags are read whichever robot it is, by the names in `ImportOptions`."""
-    if not options.task and stated_fps is None:
-        raise ConfigError("Describe the robot's task: --task='Drive around without touching anything.'")
-    if options.stamps not in _STAMPS:
-        raise ConfigError(unknown_name("stamps", options.stamps, _STAMPS))
+    stamps, max_gap = options.stamps or _STAMPS[0], 1.0 if options.max_gap is None else options.max_gap
+    if stamps not in _STAMPS:
+        raise ConfigError(unknown_name("stamps", stamps, _STAMPS))
     if options.outcome is not None and options.outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", options.outcome, OUTCOMES))
     fps = 10 if options.fps is None else options.fps
@@ -128,7 +122,7 @@ def _common(options: argparse.Namespace, *, stated_fps: int | None) -> dict[str,
     assert lidar is not None
     # As `bhd-record` judges it: a frame, and a period of the slowest sensor.
     max_age = 1 / fps + 1 / lidar.rate_hz if options.max_age is None else options.max_age
-    for name, value, at_least in (("max_age", max_age, 0.0), ("max_gap", options.max_gap, max_age)):
+    for name, value, at_least in (("max_age", max_age, 0.0), ("max_gap", max_gap, max_age)):
         if not value > 0 or value < at_least or math.isinf(value):
             raise ConfigError(
                 f"--{name} is {value}; it must be positive" + (f", {at_least:g} at least." if at_least else ".")
@@ -139,15 +133,14 @@ def _common(options: argparse.Namespace, *, stated_fps: int | None) -> dict[str,
     default = turtlebot3_burger().limits.command_timeout_s
     return {
         "task": options.task or "",
-        "stated_fps": stated_fps,
         "fps": fps,
         "command_timeout_s": timeout,
         "timeouts": (math.inf, default) if options.command_timeout is None else (),
         "given": {name: getattr(options, name) for name in ("scan_frame", "scan_yaw", "odom_frame")},
         "max_age_s": max_age,
-        "max_gap_s": options.max_gap,
+        "max_gap_s": max_gap,
         "min_episode_s": min_episode_s,
-        "stamps": options.stamps,
+        "stamps": stamps,
         "outcome": options.outcome,
     }
 
@@ -230,7 +223,7 @@ def _of_mapping(options: argparse.Namespace, mapping: MappingConfig, common: dic
         action_names=actions,
         sources=tuple(mapped_sources(mapping, options.scan_frame, options.scan_yaw)),
         max_speed=None,
-        **common | {"given": common["given"] | {"mapping": dataclasses.asdict(mapping)}},
+        **common | {"given": common["given"] | {"mapping": asdict(mapping)}},
     )
 
 

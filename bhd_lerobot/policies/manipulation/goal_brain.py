@@ -3,17 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import check_camera_error
-from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
-from bhd_lerobot.options.declared import Count, Positive, Range
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.options.declared import Count, Positive
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures
 
 
 @dataclass
@@ -21,14 +21,14 @@ class GoalBrainConfig(BrainConfig):
     """Parameters of brains that give an arm goals.
 
     Attributes:
-        max_velocity: speed of the fastest joint on free motions [rad/s].
+        max_velocity: speed of the fastest joint on free motions [rad/s], at most the largest of the arm.
         max_acceleration: acceleration of the fastest joint on free motions [rad/s^2].
         attempts: how often it tries in all.
         camera_error_m: known error of the positions that the task reports, x, y, z in the base frame [m]; it is
             subtracted.
     """
 
-    max_velocity: Annotated[float, Range(f"(0, {MAX_JOINT_SPEED}]")] = 2.0
+    max_velocity: Positive = 2.0
     max_acceleration: Positive = 8.0
     attempts: Count = 3
     camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -60,6 +60,19 @@ class GoalBrain(ConfiguredBrain, ABC):
         self._numbers: list[int] = []
         self.doing: list[str] = []
         self._done: list[bool] = []
+
+    def bind(self, robot: RobotFeatures) -> None:
+        """Check the speed of free motions.
+
+        Raises:
+            ConfigError: no joint of the arm is so fast.
+        """
+        arm = robot.need(Arm)
+        most = max(arm.limits.velocity[: len(arm.chain.joints)])
+        if (speed := getattr(self.config, "max_velocity", 0.0)) > most:
+            raise ConfigError(
+                f"brain.max_velocity is {speed}; the arm's fastest joint turns at {most:.6g} rad/s at most."
+            )
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Start an episode in one simulation."""

@@ -76,6 +76,7 @@ class PickBrain(GoalBrain):
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
+        super().bind(robot)
         self._find_objects(robot)
         self._max_opening = robot.need(GripperSpec).max_opening
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])

@@ -34,6 +34,7 @@ class ReachBrain(GoalBrain):
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the target, and home."""
+        super().bind(robot)
         self._home = robot.need(Arm).home
         self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 

@@ -71,7 +71,8 @@ class TeleopBrain(ConfiguredBrain):
         is_ours = robot.body is not None, type(self.teleop).__module__.startswith(_OURS)
         if self._process is None:
             asked = flattened(self.config.map)
-            pair = Pair(teleop_type, robot.robot_type, is_ours[0] == is_ours[1])
+            drive = robot.body.drive if robot.body else None
+            pair = Pair(teleop_type, robot.robot_type, is_ours[0] == is_ours[1], drive)
             self._map = ActionMap(asked, pair, features, robot.action_names)
             if not asked:
                 self._check_units(robot)

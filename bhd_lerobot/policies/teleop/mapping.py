@@ -5,16 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.errors import ActionError, ConfigError, unknown_name
 
 UNITS = {"deg_to_rad": math.pi / 180, "rad_to_deg": 180 / math.pi}
 """Named scales."""
 
-_TURTLEBOT3 = {"x.vel": ("linear_velocity", 0.22), "theta.vel": ("angular_velocity", 2.84)}
-_KNOWN: dict[tuple[str, str], dict[str, tuple[str, float]]] = {("keyboard_rover", "turtlebot3"): _TURTLEBOT3}
-"""Pairs of teleoperator and robot that call the same differently: action, the teleoperator's name of it and a scale.
-
-`keyboard_rover` gives shares of the largest speeds; those of a TurtleBot3 Burger are 0.22 m/s and 2.84 rad/s."""
+_SHARES = {"keyboard_rover": {"x.vel": "linear_velocity", "theta.vel": "angular_velocity"}}
+"""Teleoperators that give shares of a base's largest speeds: action, and what they call it."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +33,13 @@ class Pair:
         robot: type of the robot; nothing if it is not known.
         same_project: whether both are of this package, or both of LeRobot and its plug-ins: then the same name means
             the same.
+        drive: that of the robot; None if it has none, or its hardware is not known.
     """
 
     teleop: str
     robot: str
     same_project: bool
+    drive: Drive | None = None
 
 
 class ActionMap:
@@ -58,13 +58,14 @@ class ActionMap:
     def __init__(self, asked: Mapping[str, Any], pair: Pair, features: Sequence[str], actions: Sequence[str]) -> None:
         if wrong := [name for name in asked if name not in actions]:
             raise ConfigError(unknown_name("action of --map", wrong[0], actions))
-        known = _KNOWN.get((pair.teleop, pair.robot), {})
+        shares = _SHARES.get(pair.teleop, {}) if pair.drive is not None else {}
+        largest = dict(zip(pair.drive.limits.names, pair.drive.limits.velocity, strict=True)) if pair.drive else {}
         self._sources: dict[str, Source] = {}
         for action in actions:
             if action in asked:
                 self._sources[action] = _source(action, asked[action], features)
-            elif action in known:
-                self._sources[action] = Source(*known[action])
+            elif action in shares:
+                self._sources[action] = Source(shares[action], largest[action])
             elif action in features and pair.same_project:
                 self._sources[action] = Source(action)
             else:

@@ -22,16 +22,17 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
         affinity: the processors that it may run on; all if empty.
         brain_timeout_s: after so long without a sign of life of the brain's process the robot decelerates and holds
             [s]; if not set 0.5 s, with `plant = "ros2"` `ros2.timeout_s`.
-        recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
         plant_timeout_s: with `robot.plant`, a reading that is older than this, and than three control ticks, is a
             FAULT [s].
-        buffer_s: so long may the recorder fall behind before a state is lost, and counted [s].
+        buffer_s: the states of so long are kept in shared memory: by so much may what records them, or watches, fall
+            behind before one is lost, and counted [s].
     """
 
     removed: ClassVar[dict[str, str]] = {
         "plant_process": "a simulated world ticks in the cerebellum's process, and ends with it",
+        "recorder_timeout_s": "there is no recorder's process to wait for, frames are read by the brain's process",
     }
 
     priority: int = 80
@@ -40,11 +41,10 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
     freeze_collector: bool = True
     affinity: list[int] = field(default_factory=list)
     brain_timeout_s: Positive | None = None
-    recorder_timeout_s: Positive = 1.0
     most_misses: Count = 10
     most_catch_up: Count = 10
     plant_timeout_s: Positive = 0.02
-    buffer_s: Positive = 8.0
+    buffer_s: Positive = 10.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,7 +65,6 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
         """Return when the loop stops the robot by itself."""
         return LoopLimits(
             brain_timeout_s=LoopLimits.brain_timeout_s if self.brain_timeout_s is None else self.brain_timeout_s,
-            recorder_timeout_s=self.recorder_timeout_s,
             plant_timeout_s=self.plant_timeout_s,
             most_misses=self.most_misses,
             most_catch_up=self.most_catch_up,

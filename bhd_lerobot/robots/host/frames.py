@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.realtime.frame_reader import Boundary
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport
 from bhd_lerobot.robots.host.state import raised
@@ -29,9 +30,15 @@ def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
 
 
 def report_of(
-    mirror: Host, before: Any, after: Any, *, requested: NDArray[np.float64], truth: Callable[[], Any], origin_ns: int
+    mirror: Host,
+    before: Boundary,
+    after: Boundary,
+    *,
+    requested: NDArray[np.float64],
+    truth: Callable[[], Any],
+    origin_ns: int,
 ) -> FrameReport:
-    """Return the report of the frame between two boundaries of a `FrameLog`.
+    """Return the report of the frame between two boundaries.
 
     Args:
         mirror: a host like the one that published them.
@@ -41,12 +48,12 @@ def report_of(
         truth: returns what a task judges by at its end.
         origin_ns: when the episode began, monotonic [ns].
     """
-    begun, end = before["state"], after["state"]
+    begun, end = before.state, after.state
     limits, watchdog = raised(begun, end)
     columns = {
         keys.COMMAND_AGE: np.array([int(end["command_age_ns"])]) / NANOSECONDS,
         keys.EFFORT: end["joint_efforts"].copy(),
-        keys.LATENESS: np.array([int(after["lateness_ns"]) / NANOSECONDS]),
+        keys.LATENESS: np.array([after.lateness_ns / NANOSECONDS]),
         keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),
         keys.SKIPPED: np.array([int(end["skipped"] - begun["skipped"])]),
     }
@@ -61,7 +68,7 @@ def report_of(
         mode=end["mode"].copy(),
         truth=truth,
         columns=columns,
-        number=int(before["frame"]),
+        number=before.frame,
         # A brain that did not observe it did not wait for it.
         seen=frame_of(mirror, begun, int(begun["sensed_ns"]), origin_ns),
     )

@@ -1,6 +1,7 @@
-"""Starts, feeds and ends the processes of one robot on the wall clock, from the brain's process."""
+"""Starts, feeds and ends the real-time process of one robot on the wall clock, from the brain's process."""
 
 import contextlib
+import math
 import os
 import pickle
 import socket
@@ -10,13 +11,12 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn
+from typing import Any
 
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import LiveLayout, Word
-from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.sections import BrainSide, section_sizes
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.config import RealtimeConfig
@@ -33,9 +33,10 @@ _FIFO = 256
 
 
 class LiveLink:
-    """The processes of one robot.
+    """The real-time process of one robot.
 
     Attributes:
+        block: what both processes share.
         bridge_side: this process's ends of the queues for requests and goals.
         grants: what the real-time process was granted or refused, as plain values.
 
@@ -46,24 +47,17 @@ class LiveLink:
     def __init__(self, mirror: Host, config: Any, name: str) -> None:
         realtime: RealtimeConfig = config.realtime
         rates = mirror.rates
-        dtype = state_dtype(mirror)
-        frames = max(64, round(realtime.buffer_s * rates.fps * 4))
         layout = LiveLayout(
             mirror.cerebellum.width,
-            dtype,
+            state_dtype(mirror),
             _FIFO,
-            max(64, round(realtime.buffer_s * rates.control_hz)),
-            {
-                **section_sizes(mirror.cerebellum),
-                "statistics": TimingStatistics.nbytes,
-                "frames": FrameLog.nbytes(dtype, frames),
-            },
+            max(64, math.ceil(realtime.buffer_s * rates.control_hz) + 2),
+            {**section_sizes(mirror.cerebellum), "statistics": TimingStatistics.nbytes},
         )
         about = {
             "robot": config.type,
             "fps": rates.fps,
             "control_hz": rates.control_hz,
-            "frames": frames,
             "actions": list(mirror.action_names),
             "commands": list(mirror.body.limits.names),
             "observations": list(mirror.observation_names),
@@ -71,28 +65,30 @@ class LiveLink:
         }
         self.grants: list[dict[str, Any]] = []
         self._plant: str = config.plant
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._pipe: Connection | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
-        self.log = FrameLog(dtype, frames, self.block.section("frames"))
         self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
+        ours, theirs = socket.socketpair()
+        self._pipe = Connection(ours.detach())
         try:
-            self._start(mirror)
+            with theirs:
+                self._start(mirror, theirs.fileno())
         except BaseException:
             self.close()
             raise
 
-    def _start(self, mirror: Host) -> None:
+    def _start(self, mirror: Host, descriptor: int) -> None:
         spec = LiveSpec.of(mirror, self.block.name)
         pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
-        ours, theirs = socket.socketpair()
-        with theirs:
-            arguments = ["-m", "bhd_lerobot.robots.host.process", str(theirs.fileno())]
-            self._spawn("cerebellum", arguments, (theirs.fileno(),))
-        self._pipe = Connection(ours.detach())
-        self._spawn("recorder", ["-m", "bhd_lerobot.realtime.recorder_process", self.block.name])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "bhd_lerobot.robots.host.process", str(descriptor)],
+            pass_fds=(descriptor,),
+            stdin=subprocess.DEVNULL,
+            # A session of its own: Ctrl-C in the terminal is for the brain's process, which ends this one in order.
+            start_new_session=True,
+        )
         self._pipe.send(spec)
         self.block.show_life(Word.BRAIN_ALIVE)
         self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
@@ -103,18 +99,11 @@ class LiveLink:
             thread.start()
         self.about = self._answer("ready", _START_S)
         self.grants = self.about["grants"]
-        self._until(lambda: self.block.words[Word.RECORDER_ALIVE] != 0, _START_S, "The recorder did not start")
-
-    def _spawn(self, name: str, arguments: list[str], descriptors: tuple[int, ...] = ()) -> None:
-        # A session of its own: Ctrl-C in the terminal is for the brain's process, which ends the others in order.
-        self._processes[name] = subprocess.Popen(
-            [sys.executable, *arguments], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
-        )
 
     @property
-    def pids(self) -> dict[str, int]:
-        """Process numbers by name."""
-        return {name: process.pid for name, process in self._processes.items()}
+    def pid(self) -> int:
+        """Number of the real-time process."""
+        return 0 if self._process is None else self._process.pid
 
     def place(self, scene: Any, seed: int) -> None:
         """Put the robot into a scene, at rest; its loop stands."""
@@ -144,32 +133,23 @@ class LiveLink:
             self._running = False
 
     def check(self) -> None:
-        """Raise if a process has ended."""
-        for name, process in self._processes.items():
-            status = process.poll()
-            if status is not None:
-                how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-                self._complain(name, how)
-
-    def _complain(self, name: str, how: str) -> NoReturn:
-        what = {
-            "cerebellum": "The plant stops the robot by itself."
-            if self._plant
-            else "The simulated robot ended with it.",
-            "recorder": "The robot decelerates and holds.",
-        }[name]
-        raise RealtimeError(f"The {name}'s process {how}. {what} Episodes that were saved are intact.")
+        """Raise if the process has ended."""
+        status = None if self._process is None else self._process.poll()
+        if status is None:
+            return
+        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        what = "The plant stops the robot by itself." if self._plant else "The simulated robot ended with it."
+        raise RealtimeError(f"The cerebellum's process {how}. {what} Episodes that were saved are intact.")
 
     def close(self) -> None:
-        """End all processes. May be called twice."""
+        """End the process. May be called twice."""
         if self._stop.is_set():
             return
         words = self.block.words
         words[Word.PAUSE] = words[Word.END] = 1
-        if self._pipe is not None:
-            with contextlib.suppress(OSError):
-                self._pipe.send(("end",))
-        for process in self._processes.values():
+        with contextlib.suppress(OSError):
+            self._pipe.send(("end",))
+        if (process := self._process) is not None:
             try:
                 process.wait(_END_S)
             except subprocess.TimeoutExpired:
@@ -179,8 +159,7 @@ class LiveLink:
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(5.0)
-        if self._pipe is not None:
-            self._pipe.close()
+        self._pipe.close()
         self.block.close()
 
     # --- waiting -----------------------------------------------------------------------------------------------------
@@ -203,18 +182,18 @@ class LiveLink:
 
     def _ask(self, kind: str, *arguments: Any) -> None:
         try:
-            self._connection().send((kind, *arguments))
+            self._open_pipe().send((kind, *arguments))
         except OSError:
             self.check()
             raise
 
-    def _connection(self) -> Connection:
-        if self._stop.is_set() or self._pipe is None:
-            raise RealtimeError("The robot's processes have ended.")
+    def _open_pipe(self) -> Connection:
+        if self._stop.is_set():
+            raise RealtimeError("The robot's process has ended.")
         return self._pipe
 
     def _answer(self, wanted: str, seconds: float) -> Any:
-        connection = self._connection()
+        connection = self._open_pipe()
         end = time.monotonic() + seconds
         while not connection.poll(0.01):
             self.check()
@@ -223,7 +202,8 @@ class LiveLink:
         try:
             kind, value = connection.recv()
         except (EOFError, OSError):
-            self._processes["cerebellum"].wait(5.0)
+            if self._process is not None:
+                self._process.wait(5.0)
             self.check()
             raise RealtimeError("The cerebellum's process closed its pipe.") from None
         if kind in ("failed", "refused"):

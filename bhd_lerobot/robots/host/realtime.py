@@ -1,6 +1,6 @@
 """A robot on the wall clock.
 
-Cerebellum, plant and recorder run in processes of their own. Here is a mirror: a host of the same kind that is put into
+Cerebellum and plant run in a process of their own. Here is a mirror: a host of the same kind that is put into
 published states, to compute the truth that tasks judge by and, if it is a simulation, to render images.
 """
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
-from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Watchdog
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.realtime.frame_reader import Boundary, FrameReader
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
 from bhd_lerobot.robots.host.frames import frame_of, report_of
@@ -33,7 +33,7 @@ from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of
 
-_SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck
+_SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop is stuck
 
 
 class LiveClock:
@@ -54,7 +54,7 @@ class LiveHost:
 
     Attributes:
         mirror: this process's image of the robot.
-        link: its processes.
+        link: its real-time process.
         bridge: how commands get to its cerebellum.
 
     Args:
@@ -79,7 +79,7 @@ class LiveHost:
         self.bridge = LiveBridge(self.link.block, mirror.rates, self.link.bridge_side.client, self.link.wait)
         self._sender = CommandSender(self.bridge, mirror.to_setpoints)
         self._frame_ns = NANOSECONDS // self.rates.fps
-        self._reader: RingReader | None = None
+        self._reader: FrameReader | None = None
         self._boundary: Any = None  # the newest boundary of a frame that was taken
         self._shown: Any = None  # the state that the mirror shows
         self._watchdog = Watchdog(0)  # of the last frame
@@ -101,7 +101,7 @@ class LiveHost:
     def truth(self) -> Any:
         """Return what is true at the start of the present frame."""
         if self._shown is None and self._boundary is not None:
-            self._show(self._boundary["state"])
+            self._show(self._boundary.state)
         return self.mirror.truth()
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,7 +175,8 @@ class LiveHost:
             RealtimeError: a process has ended or does not answer.
         """
         if self._reader is None:
-            self._reader = self.link.log.reader()
+            self._reader = FrameReader(self.link.block.ring, self.rates.ticks_per_frame)
+            self.link.block.words[[Word.RECORDER_FRAMES, Word.RECORDER_DROPS]] = 0
             self._origin = self.link.run() - NANOSECONDS // self.rates.control_hz
             self._take(0)
 
@@ -188,8 +189,8 @@ class LiveHost:
     def observe(self) -> Frame:
         """Return the observation that the present frame began with; its age is what it is now."""
         self.begin()
-        self._show(self._boundary["state"])
-        return self._frame_of(self._boundary["state"], time.monotonic_ns())
+        self._show(self._boundary.state)
+        return self._frame_of(self._boundary.state, time.monotonic_ns())
 
     def latest(self) -> Frame:
         """Return the newest observation, whatever frame it is in.
@@ -208,7 +209,7 @@ class LiveHost:
         silence = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
         if self._reader is not None and self.running[0] and silence > _SILENCE_S:
             raise RealtimeError(
-                f"The cerebellum's process ({self.link.pids['cerebellum']}) has published nothing for {silence:.1f} s: "
+                f"The cerebellum's process ({self.link.pid}) has published nothing for {silence:.1f} s: "
                 "it is stopped, or gets no processor time. Disconnect and connect again."
             )
         return state
@@ -229,7 +230,7 @@ class LiveHost:
             RealtimeError: a process has ended, or is stopped.
         """
         self._show(self._newest())  # what a tool pose is solved from is where the arm is commanded to be
-        start = int(self._boundary["frame"]) * self._frame_ns if isinstance(command, Chunk) else None
+        start = self._boundary.frame * self._frame_ns if isinstance(command, Chunk) else None
         return self._sender.send(command, self.running, start)
 
     def act(self, command: Command) -> ActionReport:
@@ -246,10 +247,10 @@ class LiveHost:
         """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report."""
         # Boundary k is the end of tick k F - 1, one period before k frames.
         now = time.monotonic_ns() - self._origin
-        last = max(int(self._boundary["frame"]) + 1, now // self._frame_ns + 1)
+        last = max(self._boundary.frame + 1, now // self._frame_ns + 1)
         boundaries = [self._boundary]
-        while int(boundaries[-1]["frame"]) < last:
-            boundaries.append(self._take(int(boundaries[-1]["frame"]) + 1))
+        while boundaries[-1].frame < last:
+            boundaries.append(self._take(boundaries[-1].frame + 1))
         reports = [self._report(*pair, command) for pair in pairwise(boundaries)]
         *missed, report = reports
         report.sent, report.refusals, report.missed = receipt.sent, receipt.refusals, missed
@@ -260,37 +261,39 @@ class LiveHost:
         self._watchdog = Watchdog(int(report.watchdog[0]))
         return report
 
-    def _report(self, before: Any, after: Any, command: Command) -> FrameReport:
+    def _report(self, before: Boundary, after: Boundary, command: Command) -> FrameReport:
         """Report the frame between two boundaries."""
-        end = after["state"]
+        end = after.state
         return report_of(
             self.mirror,
             before,
             after,
             requested=end["command"] if isinstance(command, Goals) else end["requested"],
-            truth=partial(self._truth_at, end, end["touches"] > before["state"]["touches"]),
+            truth=partial(self._truth_at, end, end["touches"] > before.state["touches"]),
             origin_ns=self._origin,
         )
 
-    def _take(self, number: int) -> Any:
+    def _take(self, number: int) -> Boundary:
         """Wait for a boundary of this number or, if that one was lost, a later one."""
-        link, reader = self.link, self._reader
+        link, reader, words = self.link, self._reader, self.link.block.words
         if reader is None:
             raise RealtimeError("The robot is in no episode. Call reset() first.")
         due = self._origin + number * self._frame_ns
         while True:
-            entry = reader.read()
-            if entry is not None and int(entry["state"]["segment"]) == int(link.block.words[Word.SEGMENT]):
-                if int(entry["frame"]) >= number:
-                    self._boundary = entry
-                    return entry
+            boundary = reader.read()
+            if boundary is not None and boundary.state["segment"] == words[Word.SEGMENT]:
+                if boundary.frame >= number:
+                    self._boundary = boundary
+                    words[Word.RECORDER_FRAMES] += boundary.frame > 0
+                    words[Word.RECORDER_DROPS] = boundary.drops
+                    return boundary
                 continue
             left = due - time.monotonic_ns()
             if left < -_SILENCE_S * NANOSECONDS:
                 link.check()
                 raise RealtimeError(
-                    f"Frame {number} was due {_SILENCE_S:g} s ago and has not come: the real-time process or the "
-                    "recorder is stopped, or gets no processor time. Without commands the robot holds by itself."
+                    f"Frame {number} was due {_SILENCE_S:g} s ago and has not come: the real-time process is "
+                    "stopped, or gets no processor time. Without commands the robot holds by itself."
                 )
             if left > 0:
                 time.sleep(left / NANOSECONDS)
@@ -329,7 +332,7 @@ class LiveHost:
         return self.mirror.render_later(sim, camera, deliver)
 
     def close(self) -> None:
-        """End the robot's processes and free the renderers. May be called twice."""
+        """End the robot's process and free the renderers. May be called twice."""
         self.mirror.close()
         self.link.close()
 

@@ -14,6 +14,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.fields import Field
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -134,3 +135,13 @@ class IntegersPart(NumbersPart):
 def own_topic(key: str) -> str:
     """Return the topic of a feature that goes into a message of ours."""
     return "/bhd/" + re.sub(r"[^A-Za-z0-9_]+", "_", key).strip("_")
+
+
+def camera_name(key: str) -> str:
+    """Return what a camera is called in topics."""
+    return own_topic(key.removeprefix(f"{keys.OBSERVATION_IMAGES}.")).removeprefix("/bhd/")
+
+
+def image_topic(key: str, *, compressed: bool) -> str:
+    """Return the topic of a camera's images."""
+    return f"/{camera_name(key)}/image_raw" + ("/compressed" if compressed else "")

@@ -8,10 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, ArmChain, Drive
+from bhd_lerobot.bodies.body import Arm, ArmChain, Body, Drive
 from bhd_lerobot.bodies.registry import body_of
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.ros2.messages.base import BaseNoise
 from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, TOOL_FRAME
@@ -20,7 +18,6 @@ from bhd_lerobot.ros2.messages.views import JointFrame, RobotView, StaticFrame
 _BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
 _CASTER = (-0.081, 0.0, -0.004)  # [m] in base_link, the same
 _WHEEL_TURN = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # their z axes are the axles, the same; it rounds to 1.57 rad
-_WHEELS = {"wheel_left_joint": ("qpos_7", "qvel_6"), "wheel_right_joint": ("qpos_8", "qvel_7")}
 
 # Universal Robots' ROS 2 description, ur_macro.xacro: base_link is as REP-103 wants it, x to the front; the frames
 # of the controller, base and base_link_inertia, look back. The flange's x axis points out of it, as tool0's z does.
@@ -30,17 +27,16 @@ _WRISTS = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
 
 def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
     """Return what is known of a robot; of a plug-in's base its scanner, of robots without a body here nothing."""
+    body = body_of(robot_type)
+    if body is None:
+        return RobotView()
     if robot_type == "turtlebot3":
         robot = (recording or {}).get("robot")
-        return _turtlebot3(is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
-    if robot_type == "ur5":
-        return _ur5()
-    body = body_of(robot_type)
-    return RobotView(lidar=body.lidar) if body else RobotView()
+        return _turtlebot3(body, is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
+    return _ur5(body) if robot_type == "ur5" else RobotView(lidar=body.lidar)
 
 
-def _turtlebot3(*, is_simulated: bool) -> RobotView:
-    body = turtlebot3_burger()
+def _turtlebot3(body: Body, *, is_simulated: bool) -> RobotView:
     drive = body.need(Drive)
     model = ElementTree.fromstring(body.mjcf)
     camera = _find(model, "camera", "front")
@@ -60,7 +56,7 @@ def _turtlebot3(*, is_simulated: bool) -> RobotView:
             for wheel in drive.joints
         ),
         fovy={"front": math.radians(float(camera.get("fovy", "nan")))},
-        wheels=_WHEELS,
+        wheels={f"{wheel}_joint": (f"qpos_{7 + i}", f"qvel_{6 + i}") for i, wheel in enumerate(drive.joints)},
     )  # fmt: skip
 
 
@@ -72,18 +68,18 @@ def _base_noise(drive: Drive) -> BaseNoise:
     """
     count = 2 * math.pi * drive.wheel_radius / drive.encoder_ticks
     wheel = count * math.sqrt(2 / 12)
+    speed, turn = drive.limits.velocity
     rounding = 2.0**-24 / math.sqrt(3)
     return BaseNoise(
         distance=wheel / math.sqrt(2),
         yaw=wheel * math.sqrt(2) / drive.wheel_separation,
-        speed=MAX_LINEAR * rounding,
-        turn=MAX_ANGULAR * rounding,
-        gyro=MAX_ANGULAR * rounding,
+        speed=speed * rounding,
+        turn=turn * rounding,
+        gyro=turn * rounding,
     )
 
 
-def _ur5() -> RobotView:
-    body = ur5()
+def _ur5(body: Body) -> RobotView:
     chain = body.need(Arm).chain
     model = ElementTree.fromstring(body.mjcf)
     camera = _find(model, "camera", "wrist")

@@ -1,5 +1,7 @@
 """One table of what the standard messages carry of our robots: which field of which type is which column."""
 
+from collections.abc import Sequence
+
 STAMPED_TWIST, TWIST_TYPE = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"  # the second is Humble's
 ODOMETRY_TYPE, IMU_TYPE, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu", "sensor_msgs/msg/LaserScan"
 POSE_TYPE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
@@ -25,11 +27,13 @@ TWIST = tuple(FIELDS[TWIST_TYPE])
 ODOMETRY = tuple(FIELDS[ODOMETRY_TYPE])[2:]
 GYRO = tuple(FIELDS[IMU_TYPE])
 TOOL = tuple(FIELDS[POSE_TYPE])
-WHEELS = ("wheel_left.pos", "wheel_right.pos", "wheel_left.vel", "wheel_right.vel")
-"""Of a TurtleBot3's JointState; turtlebot3_node has the speeds in m/s."""
-
 ODOM_FRAME, FOOTPRINT_FRAME, SCAN_FRAME, IMU_FRAME = "odom", "base_footprint", "base_scan", "imu_link"
 ARM_FRAME, TOOL_FRAME = "base", "tool"
+
+
+def joint_columns(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of joints in a JointState; of wheels, turtlebot3_node has the speeds in m/s."""
+    return tuple(f"{joint}.{end}" for end in _OF_JOINT for joint in joints)
 
 
 def path_of(msgtype: str, column: str) -> str:

@@ -9,6 +9,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, install_extra
 
 FORMAT = 2
@@ -20,9 +21,16 @@ INTERFACES = "bhd_interfaces"
 EPISODE, EPISODE_TOPIC = "bhd_msgs/msg/Episode", "/bhd/episode"
 STATE = "bhd_msgs/msg/CerebellumState"
 OUTCOME = "bhd_msgs/msg/Outcome"
+STATE_TOPIC, OUTCOME_TOPIC = "/bhd/cerebellum", "/bhd/outcome"
 NUMBERS = "bhd_msgs/msg/Numbers"
 INTEGERS = "bhd_msgs/msg/Integers"
 TEXT = "bhd_msgs/msg/Text"
+
+STATE_COLUMNS = (
+    keys.TIME, keys.AGE, keys.COMMAND_AGE, keys.LATENESS, keys.OVERRUNS, keys.SKIPPED, keys.INFERENCE_TIME, keys.LATE,
+    keys.LIMITS, keys.WATCHDOG, keys.MODE,
+)  # fmt: skip
+OUTCOME_COLUMNS = (keys.REWARD, keys.SUCCESS, keys.DONE, keys.EVENT)
 
 DEFINITIONS = {
     EPISODE: """

@@ -10,7 +10,16 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages.presets import columns
-from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, SCAN, STAMPED_TWIST, TWIST, TWIST_TYPE, WHEELS
+from bhd_lerobot.ros2.messages.table import (
+    GYRO,
+    IMU_TYPE,
+    JOINTS,
+    SCAN,
+    STAMPED_TWIST,
+    TWIST,
+    TWIST_TYPE,
+    joint_columns,
+)
 from bhd_lerobot.ros2.robots.plant import Ros2Plant, scan_reader
 
 _STOP = (0.0, 0.0)
@@ -37,7 +46,7 @@ class BasePlant(Ros2Plant):
         node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         twist_type = TWIST_TYPE if config.ros2.distro == "humble" else STAMPED_TWIST
         inputs = [
-            InputSpec.of(columns("/joint_states", JOINTS, WHEELS), SENSOR_DATA, node_silence),
+            InputSpec.of(columns("/joint_states", JOINTS, joint_columns(drive.joints)), SENSOR_DATA, node_silence),
             InputSpec(
                 "/scan",
                 SCAN,

@@ -19,11 +19,10 @@ from bhd_lerobot.ros2.messages.base import OdometryPart, ScanPart
 from bhd_lerobot.ros2.messages.parts import FieldsPart, Frames, header
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.split import gyro_message
-from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, ODOMETRY, TWIST, WHEELS
+from bhd_lerobot.ros2.messages.table import GYRO, IMU_TYPE, JOINTS, ODOMETRY, TWIST, joint_columns
 from bhd_lerobot.ros2.serve.server import Output, State, Topics
 
 NODE_HZ = 20  # of turtlebot3_node's timer
-_JOINTS = ("wheel_left_joint", "wheel_right_joint")
 _BATTERY = "sensor_msgs/msg/BatteryState"
 _VOLTAGE, _CAPACITY = 11.1, 1.8  # [V], [A h], ROBOTIS e-Manual: LiPo, 11.1 V, 1800 mAh
 _LIPO, _GOOD, _FULL = 3, 1, 4  # BatteryState's constants: technology, health, supply status
@@ -48,7 +47,7 @@ class BaseTopics(Topics):
         self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=lidar)
         self._odometry_part = OdometryPart("/odom", (*TWIST, *ODOMETRY))
         self._gyro_part = FieldsPart("/imu", GYRO, **gyro_message())
-        self._wheel_part = FieldsPart("/joint_states", WHEELS, JOINTS, frame="base_link")
+        self._wheel_part = FieldsPart("/joint_states", joint_columns(self._drive.joints), JOINTS, frame="base_link")
         self._scan_period_ns = NANOSECONDS // lidar.rate_hz
         self._scanned_ns = 0  # when the last scan that was published was taken [ns]
         self._scan_due_ns = 0
@@ -83,7 +82,7 @@ class BaseTopics(Topics):
         }
         self._battery.send(encode(_BATTERY, battery, 1)[0])
         self._transforms.send(views.base_transforms(self._odometry_part, frames, moved)[0])
-        motion = views.Motion(dict(zip(_JOINTS, angles.T, strict=True)))
+        motion = views.Motion(dict(zip((f"{joint}_joint" for joint in self._drive.joints), angles.T, strict=True)))
         for message in views.moving_transforms(self._view, frames, motion):
             self._transforms.send(message)
 

@@ -30,7 +30,6 @@ from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime import shared_memory
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
-from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.keys import KeySource, KeyTerminal
 from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.realtime.timing import TimingStatistics
@@ -56,14 +55,11 @@ class Robot:
 
     def __init__(self, name: str = NAME) -> None:
         dtype = published()
-        layout = LiveLayout(
-            2, dtype, 16, 64, {"statistics": TimingStatistics.nbytes, "frames": FrameLog.nbytes(dtype, 8)}
-        )
-        about = {"robot": "turtlebot3", "fps": 10, "control_hz": 200, "frames": 8, "commands": ["x.vel", "theta.vel"]}
+        layout = LiveLayout(2, dtype, 16, 64, {"statistics": TimingStatistics.nbytes})
+        about = {"robot": "turtlebot3", "fps": 10, "control_hz": 200, "commands": ["x.vel", "theta.vel"]}
         self.block = layout.create(name, about)
         self.made = int(self.block.about["made_ns"])
         self.now = self.made + 100 * S
-        self.log = FrameLog(dtype, 8, self.block.section("frames"))
         self.statistics = TimingStatistics(S // 200, self.block.section("statistics"))
         self.state = np.zeros((), dtype)
         self.start()
@@ -85,7 +81,7 @@ class Robot:
             state[name] = value
         words[Word.EXECUTED] = state["executed"]
         self.block.ring.publish(state)
-        for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE, Word.RECORDER_ALIVE):
+        for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE):
             words[word] = self.now
 
     def sampler(self) -> tuple[Sampler, LiveBlock]:
@@ -173,8 +169,7 @@ def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
     assert (first.control_rate, first.frame_rate, first.command_rate) == (None, None, None)
     for _ in range(40):
         robot.tick(25, setpoints=robot.state["setpoints"] + 1)
-        entry = np.zeros((), robot.log.dtype)
-        robot.log.append(entry)
+        robot.block.words[Word.RECORDER_FRAMES] += 1
         shown = sampler.sample()
     assert shown.control_rate == pytest.approx(200)
     assert shown.frame_rate == pytest.approx(8)
@@ -236,7 +231,7 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     assert shown.episode_time == pytest.approx(2.01)
     assert shown.command_age == pytest.approx(0.04)
     assert shown.observation_age == pytest.approx(0.16)
-    assert shown.alive == dict.fromkeys(("brain", "cerebellum", "recorder"), pytest.approx(0.01))
+    assert shown.alive == dict.fromkeys(("brain", "cerebellum"), pytest.approx(0.01))
     assert [(d.name, d.requested, d.applied, d.measured) for d in shown.dimensions] == [
         ("x.vel", 0.2, 0.1, 0.09),
         ("theta.vel", 1.0, 0.5, 0.4),

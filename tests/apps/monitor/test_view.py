@@ -50,7 +50,7 @@ def state(**overrides: Any) -> MonitorState:
         "limits": {name: Count(0, 0.0) for name in monitor_state.LIMITS},
         "watchdogs": {name: Count(0, 0.0) for name in monitor_state.WATCHDOGS},
         "refusals": {},
-        "alive": {"brain": 0.004, "cerebellum": 0.0005, "recorder": 0.003},
+        "alive": {"brain": 0.004, "cerebellum": 0.0005},
         "goal": None,
         "pose": {},
     }
@@ -81,7 +81,7 @@ EXTREME = state(
     limits={name: Count(999_999, 499.9) for name in monitor_state.LIMITS},
     watchdogs={name: Count(999_999, 499.9) for name in monitor_state.WATCHDOGS},
     refusals=dict.fromkeys(monitor_state.REASONS[1:], 999_999),
-    alive=dict.fromkeys(("brain", "cerebellum", "recorder"), 123.4),
+    alive=dict.fromkeys(("brain", "cerebellum"), 123.4),
     goal={"task_id": "g" * 64, "phase": "CONVERTING", "progress": 1.7, "remaining_s": 123.4, "position_error": 0.1},
     estop=True,
 )

@@ -1,4 +1,4 @@
-"""Export: read by readers that are not ours, and back into a dataset of the same drives by the robot's preset."""
+"""Export, read by readers that are not ours."""
 
 import re
 from collections import defaultdict
@@ -86,59 +86,8 @@ def arm(ur5):
     return decoded(bags / "episode_000001/episode_000001.mcap")
 
 
-def test_numbers_of_an_unknown_robot_come_back_as_they_were(tmp_path):
-    """With the names, rate, instructions and outcomes that the bags state, and every episode, however short."""
-    plain, again = tmp_path / "plain", tmp_path / "again"
-    features = {
-        key: {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
-        for key in ("observation.state", "action")
-    }
-    with DatasetRecorder.create("t/t", 30, features, robot_type="toy", root=plain) as recorder:
-        for number in range(3):
-            writer = recorder.begin_episode()
-            frames = np.arange(20, dtype=np.float32)[:, None] * (1, 0.1) + number
-            writer.set_columns({"observation.state": np.sin(frames), "action": np.cos(frames)})
-            ended = {"outcome": "success" if number else "timeout", "success": bool(number)}
-            recorder.save(writer, task=f"Put {number}.", metadata=ended)
-    bags = export(plain, tmp_path / "bags")
-    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={again}"]) == 0
-    other = dataset_info(again)
-    assert (other.robot_type, other.fps, other.tasks) == ("toy", 30, ("Put 0.", "Put 1.", "Put 2."))
-    assert [one.metadata["outcome"] for one in other.episodes] == ["timeout", "success", "success"]
-    for key in ("observation.state", "action"):
-        assert other.features[key]["names"] == ["pan.pos", "lift.pos"]
-        for number in range(3):
-            assert np.array_equal(*(np.asarray(read_episode(root, number)[key]) for root in (plain, again)))
-
-
 def stamp(message):
     return message.header.stamp.sec * NANO + message.header.stamp.nanosec
-
-
-@pytest.mark.law
-@pytest.mark.parametrize(
-    ("robot", "layout", "arguments"),
-    [
-        ("turtlebot3", ["--one_bag", "--format=sqlite3", "--twist"], ["--odometry", "--imu=/imu"]),
-        ("ur5", [], ["--map=ur5"]),
-    ],
-)
-def test_a_drive_comes_back_by_its_preset(request, tmp_path, robot, layout, arguments):
-    """Without what the bag says of itself: by topics, types and fields."""
-    root = request.getfixturevalue(robot)
-    bags, old = export(root, tmp_path / "bags", *layout), dataset_info(root)
-    assert (bags / "metadata.yaml").exists() == bool(layout)
-    arguments += ["--task=Move.", "--min_episode_s=0", f"--fps={old.fps}", f"--root={tmp_path / 'back'}"]
-    assert main.main(["import", str(bags), "--repo_id=t/t", *arguments]) == 0
-    info = dataset_info(tmp_path / "back")
-    assert (info.robot_type, info.tasks) == (robot, ("Move.",))
-    for one, other in zip(old.episodes, info.episodes, strict=True):
-        ours, theirs = read_episode(root, one.index), read_episode(tmp_path / "back", other.index)
-        assert 0 <= other.frames - one.frames <= 2  # in the gap to the next, whose readings are fresh enough
-        for key in ("observation.state", "action"):
-            assert info.features[key]["names"] == old.features[key]["names"]
-            np.testing.assert_allclose(ours[key], theirs[key][: one.frames], atol=1e-6, err_msg=key)
-    assert main.main(["check", str(tmp_path / "back")]) == 0
 
 
 @pytest.mark.parametrize("compressed", [[], ["--compressed_images"]])

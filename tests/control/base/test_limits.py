@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
+from bhd_lerobot.control.base import limits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-
-from bhd_lerobot.control.base import limits
 
 N = 5
 ANY = st.floats(-1e6, 1e6) | st.floats(-3, 3) | st.sampled_from([0.0, -0.0, 0.22, 2.84, 1e300, -1e300])

@@ -120,6 +120,11 @@ def test_a_new_episode_starts_from_nothing() -> None:
     assert desk.brain.subtasks()[0] == "hold"
 
 
+def test_a_speed_that_no_joint_of_the_arm_has_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"brain\.max_velocity is 3\.2; .* 3\.14159 rad/s"):
+        ReachBrain(ReachBrainConfig(max_velocity=3.2)).bind(RobotFeatures((), (), 25, ENVIRONMENT, body=ur5()))
+
+
 def test_a_task_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
         ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, (), body=ur5()))

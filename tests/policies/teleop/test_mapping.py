@@ -1,22 +1,32 @@
 """From a teleoperator's action to a robot's."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from bhd_lerobot.bodies.body import Drive
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.teleop.mapping import ActionMap, Pair
+from tests.cases import each_case
 
 ROVER = ("linear_velocity", "angular_velocity")
 BASE = ("x.vel", "theta.vel")
 LEADER = ("shoulder_pan.pos", "gripper.pos")
 
 
-def test_a_known_pair_needs_no_map() -> None:
-    mapped = ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)
+BURGER = turtlebot3_burger().drive
+FASTER = replace(BURGER, limits=replace(BURGER.limits, velocity=(0.5, 3.0)))
+KNOWN = Pair("keyboard_rover", "turtlebot3", same_project=False, drive=BURGER)
+
+
+@each_case(("drive", "largest"), [(BURGER, (0.22, 2.84)), (FASTER, (0.5, 3.0))])
+def test_shares_of_the_largest_speeds_need_no_map(drive: Drive, largest: tuple[float, float]) -> None:
+    mapped = ActionMap({}, replace(KNOWN, drive=drive), ROVER, BASE)
     action = mapped({"linear_velocity": 1.0, "angular_velocity": -0.5})
-    assert action == {"x.vel": 0.22, "theta.vel": -0.5 * 2.84}
+    assert action == {"x.vel": largest[0], "theta.vel": -0.5 * largest[1]}
 
 
 def test_units_scales_and_offsets() -> None:
@@ -62,6 +72,6 @@ def test_a_wrong_map_is_named(asked: dict[str, Any], message: str) -> None:
 
 @pytest.mark.parametrize("given", [{"linear_velocity": 1.0}, {"linear_velocity": "fast", "angular_velocity": 0.0}])
 def test_a_wrong_action_is_named(given: dict[str, Any]) -> None:
-    mapped = ActionMap({}, Pair("keyboard_rover", "turtlebot3", same_project=False), ROVER, BASE)
+    mapped = ActionMap({}, KNOWN, ROVER, BASE)
     with pytest.raises(ActionError, match=r"angular_velocity|fast"):
         mapped(given)

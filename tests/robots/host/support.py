@@ -23,7 +23,7 @@ from tests.waiting import until
 
 def relaxed(**options: Any) -> RealtimeConfig:
     """Return options with which a busy machine alone does not stop a robot."""
-    return RealtimeConfig(**{"brain_timeout_s": 20.0, "recorder_timeout_s": 20.0, "most_misses": 10**6, **options})
+    return RealtimeConfig(**{"brain_timeout_s": 20.0, "most_misses": 10**6, **options})
 
 
 def turtlebot(name: str, *, require_realtime: bool = False, **options: Any) -> TurtleBot3:
@@ -99,11 +99,11 @@ class States:
 
 
 def drive_on(name: str, options: dict[str, Any]) -> None:
-    """Connect a base, drive it, say which its processes are, and go on."""
+    """Connect a base, drive it, say which its real-time process is, and go on."""
     robot = turtlebot(name, **options)
     robot.connect()
     drive(robot)
-    print(json.dumps({"pids": robot.host.link.pids}), flush=True)
+    print(json.dumps({"pid": robot.host.link.pid}), flush=True)
     while True:
         robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})
         time.sleep(0.05)

@@ -63,7 +63,7 @@ def expect_stop(robot: TurtleBot3) -> None:
 def test_the_real_time_process_has_imported_neither_torch_nor_lerobot(robot):
     link = robot.host.link
     assert link.about["heavy"] == ["mujoco"]  # it is simulated
-    assert link.about["pid"] == link.pids["cerebellum"] != os.getpid()
+    assert link.about["pid"] == link.pid != os.getpid()
     assert {grant["name"] for grant in link.grants} >= {"scheduler", "memory lock", "collector", "timer slack"}
 
 
@@ -131,14 +131,14 @@ def test_a_press_of_another_process_while_it_connects_stays_until_a_person_reset
         expect_stop(second)
         recover(second)
         assert {NAME, name} <= set(names())
-        pids = second.host.link.pids
-        assert not set(pids.values()) & set(robot.host.link.pids.values())
+        pid = second.host.link.pid
+        assert pid != robot.host.link.pid
         drive(second)
         assert mode(robot) in (Mode.HOLD, Mode.TRACKING)
     finally:
         second.disconnect()
     assert is_gone(name)
-    assert not any(is_alive(pid) for pid in pids.values())
+    assert not is_alive(pid)
     with pytest.raises(DeviceNotConnectedError):
         second.get_observation()
     assert NAME in names()

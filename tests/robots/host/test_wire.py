@@ -188,7 +188,7 @@ def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, Sta
 def test_a_cerebellum_that_was_away_does_not_catch_up_at_the_wire(arm: tuple[UR5, States]) -> None:
     robot, states = arm
     turn(robot, "away", 0.8)
-    pid = robot.host.link.pids["cerebellum"]
+    pid = robot.host.link.pid
     os.kill(pid, signal.SIGSTOP)
     time.sleep(AWAY_S)
     os.kill(pid, signal.SIGCONT)

@@ -26,6 +26,8 @@ from bhd_lerobot.ros2.messages.parts import (
     IntegersPart,
     NumbersPart,
     Part,
+    camera_name,
+    image_topic,
     own_topic,
     stamp_tree,
 )
@@ -37,13 +39,6 @@ _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating
 _LONGEST_S = 1e8  # three years, longer than any recording
 _PAUSE_NS = 10 * NANO  # between two episodes
 START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
-
-STATE_COLUMNS = (
-    keys.TIME, keys.AGE, keys.COMMAND_AGE, keys.LATENESS, keys.OVERRUNS, keys.SKIPPED, keys.INFERENCE_TIME, keys.LATE,
-    keys.LIMITS, keys.WATCHDOG, keys.MODE,
-)  # fmt: skip
-OUTCOME_COLUMNS = (keys.REWARD, keys.SUCCESS, keys.DONE, keys.EVENT)
-STATE_TOPIC, OUTCOME_TOPIC = "/bhd/cerebellum", "/bhd/outcome"
 
 
 @dataclass(frozen=True)
@@ -84,7 +79,7 @@ class EpisodeTopics:
     def _parts_of(self, key: str) -> list[Part]:
         feature = self._features[key]
         kind, shape = feature["dtype"], tuple(feature["shape"])
-        if key in (*STATE_COLUMNS, *OUTCOME_COLUMNS, keys.SUBTASK) and shape == (1,):
+        if key in (*types.STATE_COLUMNS, *types.OUTCOME_COLUMNS, keys.SUBTASK) and shape == (1,):
             return []
         if kind in ("video", "string", "language"):
             return []
@@ -134,8 +129,8 @@ class EpisodeTopics:
                 streams += self._video(key, row, at_start)
             elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
                 streams.append(_texts(key, at_start, columns[key]))
-        streams.append(_stream(STATE_TOPIC, types.STATE, at_end, _states(at_end, observed, columns)))
-        streams.append(_stream(OUTCOME_TOPIC, types.OUTCOME, at_end, _outcomes(at_end, columns)))
+        streams.append(_stream(types.STATE_TOPIC, types.STATE, at_end, _states(at_end, observed, columns)))
+        streams.append(_stream(types.OUTCOME_TOPIC, types.OUTCOME, at_end, _outcomes(at_end, columns)))
         return streams
 
     def _check_times(self, episode: int, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -202,16 +197,6 @@ class EpisodeTopics:
         return encode(types.EPISODE, fields, 1)[0]
 
 
-def camera_name(key: str) -> str:
-    """Return what a camera is called in topics."""
-    return own_topic(key.removeprefix(f"{keys.OBSERVATION_IMAGES}.")).removeprefix("/bhd/")
-
-
-def image_topic(key: str, *, compressed: bool) -> str:
-    """Return the topic of a camera's images."""
-    return f"/{camera_name(key)}/image_raw" + ("/compressed" if compressed else "")
-
-
 def _split(
     feature: Mapping[str, Any], parts: Sequence[Part], values: NDArray[Any] | None
 ) -> Iterator[tuple[Part, NDArray[Any]]]:
@@ -258,13 +243,13 @@ def scan_stream(part: ScanPart, frames: Frames, values: NDArray[Any], age: NDArr
 
 def _states(frames: Frames, observed: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
     fields = {**frames.fields(), "observed": stamp_tree(observed)}
-    fields |= {key.removeprefix("control."): columns[key] for key in STATE_COLUMNS if key in columns}
+    fields |= {key.removeprefix("control."): columns[key] for key in types.STATE_COLUMNS if key in columns}
     return encode(types.STATE, fields, len(observed))
 
 
 def _outcomes(frames: Frames, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
     fields = {**frames.fields(), "subtask": columns.get(keys.SUBTASK, "")}
-    fields |= {key.removeprefix("next."): columns[key] for key in OUTCOME_COLUMNS if key in columns}
+    fields |= {key.removeprefix("next."): columns[key] for key in types.OUTCOME_COLUMNS if key in columns}
     return encode(types.OUTCOME, fields, len(frames.stamps))
 
 

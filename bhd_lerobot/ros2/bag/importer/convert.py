@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import DatasetError, DatasetWriteError
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetWriteError
 from bhd_lerobot.ros2.bag.importer.columns import (
     MOST_UNEXPLAINED,
     command_note,
@@ -22,9 +22,9 @@ from bhd_lerobot.ros2.bag.importer.columns import (
     unanswered,
     unexplained_frames,
 )
-from bhd_lerobot.ros2.bag.importer.exported import as_stated
+from bhd_lerobot.ros2.bag.importer.exported import Exported, StatedEpisode, exported
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids, newest
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
 from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.ros2.bag.importer.video import CameraImages
@@ -66,7 +66,9 @@ def import_bags(bags: Sequence[Bag], root: Path, repo_id: str, options: ImportOp
         _recording(folder, repo_id, options) as recording,
     ):
         for bag in bags:
-            robot_bag = _RobotBag(bag, options if options.stated_fps is None else as_stated(bag, options), recording)
+            stated = exported(bag)
+            _check_stated(bag, stated, options)
+            robot_bag = _RobotBag(bag, options, recording, stated)
             episodes = list(robot_bag.episodes())
             robot_bag.check_commands(episodes)
             for episode in episodes:
@@ -90,6 +92,20 @@ def import_bags(bags: Sequence[Bag], root: Path, repo_id: str, options: ImportOp
             f"one of {bag_name}: {most})"
         )
     return report
+
+
+def _check_stated(bag: Bag, stated: Exported | None, options: ImportOptions) -> None:
+    """Check that the instruction is known, and that robot and rate are the dataset's."""
+    if not options.task and (stated is None or not all(one.task for one in stated.episodes)):
+        raise ConfigError(f"{bag.path} states no instruction. Describe the robot's task: --task='Drive around.'")
+    if stated is None:
+        return
+    is_other = options.robot_is_stated and stated.robot_type != options.robot_type
+    if is_other or (options.as_stated and stated.fps != options.fps):
+        raise DatasetError(
+            f"The dataset is of {options.robot_type!r} at {options.fps} fps, and {bag.path} of {stated.robot_type!r} "
+            f"at {stated.fps} fps. Import the bags one by one; --fps sets one rate for all."
+        )
 
 
 @contextlib.contextmanager
@@ -154,19 +170,26 @@ class _Recording:
 
 @dataclass(frozen=True)
 class _Episode:
-    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time."""
+    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time.
+
+    Attributes:
+        stated: what the bag states of it; None of bags that were not exported.
+    """
 
     grid: Grid
     tracks: Sequence[Track]
+    stated: StatedEpisode | None
 
 
 class _RobotBag:
     """One bag, all of it but images in memory."""
 
-    def __init__(self, bag: Bag, options: ImportOptions, recording: _Recording) -> None:
+    def __init__(self, bag: Bag, options: ImportOptions, recording: _Recording, stated: Exported | None) -> None:
         self.notes: list[str] = []
-        self._bag, self._options, self._recording = bag, options, recording
+        self._bag, self._options, self._recording, self._stated = bag, options, recording, stated
         self._tracks = read_tracks(bag, options, self.notes)
+        is_whole = stated is not None and not bag.problems and all(len(one.times) for one in stated.episodes)
+        self._is_as_stated = options.as_stated and is_whole
         self._cameras = [CameraImages(bag, track, self.notes) for track in self._tracks if not track.names]
         self._begin = min(int(track.times.min()) for track in self._tracks)
         self._check_clocks()
@@ -186,7 +209,30 @@ class _RobotBag:
 
     def episodes(self) -> Iterator[_Episode]:
         """Yield the episodes in order."""
-        options = self._options
+        for found in self._found():
+            if (grid := self._answered(found.grid, found.tracks)) is None:
+                continue
+            lasts = (len(grid.times) - 1) / self._options.fps
+            if lasts >= self._options.min_episode_s:
+                yield replace(found, grid=grid)
+            else:
+                self.notes.append(
+                    f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
+                    "was left out"
+                )
+
+    def _found(self) -> Iterator[_Episode]:
+        """Yield the episodes that a bag states, or that its sensors allow."""
+        options, stated = self._options, () if self._stated is None else self._stated.episodes
+        if self._is_as_stated:
+            tracks = [track.part(np.ones(len(track.times), np.bool_)) for track in self._tracks]
+            readings = [track.times for track in tracks if not track.is_action]
+            for one in stated:
+                rows = np.stack([newest(times, one.times) for times in readings])
+                ages = one.times - np.stack([times[row] for times, row in zip(readings, rows, strict=True)])
+                if (blind := int((rows < 0).any(axis=0).sum())) < len(one.times):
+                    yield _Episode(Grid(one.times, ages, "start").since(blind), tracks, one)
+            return
         parts = segments(
             self._tracks,
             stamps=options.stamps,
@@ -202,24 +248,15 @@ class _RobotBag:
             tracks = [track.part((of_commands if track.is_action else part).mask(track)) for track in self._tracks]
             sensors = [track for track in tracks if not track.is_action]
             self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
-            times = [track.times for track in sensors]
-            for found in grids(
-                times,
+            for grid in grids(
+                [track.times for track in sensors],
                 options.fps,
                 max_age_ns=round(options.max_age_s * NANO),
                 max_gap_ns=round(options.max_gap_s * NANO),
                 why=part.why,
             ):
-                if (grid := self._answered(found, tracks)) is None:
-                    continue
-                lasts = (len(grid.times) - 1) / options.fps
-                if lasts >= options.min_episode_s:
-                    yield _Episode(grid, tracks)
-                else:
-                    self.notes.append(
-                        f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
-                        "was left out"
-                    )
+                last, by_header = int(grid.times[-1]), options.stamps == "header"
+                yield _Episode(grid, tracks, self._stated.at(last, by_header=by_header) if self._stated else None)
 
     def _answered(self, grid: Grid, tracks: Sequence[Track]) -> Grid | None:
         """Return frames from the first on that has a command, of actions that are positions; None if none has."""
@@ -261,23 +298,32 @@ class _RobotBag:
 
     def save(self, episode: _Episode) -> int:
         """Save an episode and return its number of frames."""
-        recorder = self._recording.recorder(self._cameras)
+        recorder, options = self._recording.recorder(self._cameras), self._options
         episode = self._with_images(episode)
+        if (stated := episode.stated) is not None:
+            options = replace(options, task=options.task or stated.task, outcome=options.outcome or stated.outcome)
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
             for camera in self._cameras:
                 shown = camera.write(camera.of(episode.tracks), times, writer)
                 ages = np.maximum(ages, times - shown)
-            columns = frame_columns(self._options, episode.tracks, times, ages)
+            columns = frame_columns(options, episode.tracks, times, ages)
+            is_as_recorded = self._is_as_stated and stated is not None and len(times) == len(stated.times)
+            if stated is not None and is_as_recorded:
+                own = set() if options.robot_is_stated else {keys.APPLIED_ACTION}  # in the units of another mapping
+                own |= {keys.SUCCESS, keys.EVENT} if self._options.outcome else set()
+                columns |= {key: values for key, values in stated.columns.items() if key not in own}
             self._recording.refuse_again(self._bag.path, int(times[0]), columns)
             writer.set_columns(columns)
-            recorder.save(writer, task=self._options.task, metadata=self._metadata(episode, columns))
+            recorder.save(writer, task=options.task, metadata=self._metadata(episode, columns, options.outcome))
         except BaseException:
             writer.discard()
             raise
         begin = self._after_start(episode.grid)
-        if silence := command_note(self._options, columns):
+        if is_as_recorded:
+            return len(times)
+        if silence := command_note(options, columns):
             self.notes.append(f"{begin}: {silence}")
         if late := int(columns[keys.LATE].sum()):
             self._recording.late.append((late, self._bag.path.name))
@@ -294,9 +340,8 @@ class _RobotBag:
             )
         return replace(episode, grid=grid.since(blind))
 
-    def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]], outcome: str | None) -> dict[str, Any]:
         """Return how an episode ended, if that is known, and where it is from."""
-        outcome = self._options.outcome
         ended = {} if outcome is None else {"outcome": outcome, "success": outcome == Event.SUCCESS.cause}
         source = {
             "bag": self._bag.path.name,

@@ -1,72 +1,144 @@
-"""Bags of robots that only their export knows: what `bhd-data export` writes down about them is their mapping."""
+"""What a bag that `bhd-data export` wrote states of its dataset and of each episode: what no other topic carries."""
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.storage.read import Bag
-from bhd_lerobot.ros2.messages import types
-from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.ros2.bag.importer.resample import NANO, Times
+from bhd_lerobot.ros2.bag.storage.read import Bag, Topic
+from bhd_lerobot.ros2.messages import presets, types
+from bhd_lerobot.ros2.messages.mapping import FieldConfig, ImageConfig, MappingConfig, features_of, topics_of
+from bhd_lerobot.ros2.messages.parts import image_topic
 from bhd_lerobot.ros2.messages.serialize import decode
-from bhd_lerobot.tasks.task import OUTCOMES
+from bhd_lerobot.ros2.messages.table import SCAN
+from bhd_lerobot.tasks.task import Event
+
+_TOPICS = (types.EPISODE_TOPIC, types.STATE_TOPIC, types.OUTCOME_TOPIC)
+
+
+@dataclass(frozen=True)
+class StatedEpisode:
+    """What an exported bag states of an episode.
+
+    Attributes:
+        received, stamp: when it starts, by the recorder's clock and by the headers' [ns].
+        outcome: None if its dataset has none.
+        times: of its frames [ns]; none if some are not in the bag, or the bag was recorded anew while it was played.
+        columns: of its frames, beside observation and action.
+    """
+
+    received: int
+    stamp: int
+    task: str
+    outcome: str | None
+    times: Times
+    columns: dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an exported bag states of its dataset, and of the episode in it; no outcome if that is not known."""
+    """What an exported bag states; no mapping if the bag of its robot cannot be read by one."""
 
     robot_type: str
-    task: str
-    outcome: str | None
     fps: int
-    mapping: MappingConfig
+    mapping: MappingConfig | None
+    episodes: Sequence[StatedEpisode]
+
+    def at(self, time: int, *, by_header: bool) -> StatedEpisode:
+        """Return the episode that a time [ns] lies in."""
+        later = [one for one in self.episodes if (one.stamp if by_header else one.received) <= time]
+        return later[-1] if later else self.episodes[0]
 
 
 def exported(bag: Bag) -> Exported | None:
-    """Return what a bag states of itself; None of any other, and of one whose numbers are in messages of ROS 2."""
+    """Return what a bag states; None of any other, and of one whose statement is damaged."""
     if types.EPISODE_TOPIC not in bag.topics or bag.topics[types.EPISODE_TOPIC].msgtype != types.EPISODE:
         return None
+    kinds = dict(zip(_TOPICS, (types.EPISODE, types.STATE, types.OUTCOME), strict=True))
+    found = bag.read(kinds)
     try:
-        messages = bag.read([types.EPISODE_TOPIC])[types.EPISODE_TOPIC].data
-        message = decode(types.EPISODE, messages[0])
-        outcome = json.loads(message.metadata).get("outcome")
-        topics = [one for one in json.loads(message.topics) if one["feature"] in (keys.OBSERVATION_STATE, keys.ACTION)]
-        sections: dict[str, dict[str, FieldConfig]] = {keys.OBSERVATION_STATE: {}, keys.ACTION: {}}
-        for one in topics:
-            if one["kind"] != "NumbersPart":
-                return None
-            sections[one["feature"]] |= {
-                name: FieldConfig(one["topic"], types.NUMBERS, f"values[names={name}]") for name in one["names"]
-            }
+        heads, states, outcomes = [[decode(kinds[topic], data) for data in found[topic].data] for topic in kinds]
+        received = found[types.EPISODE_TOPIC].received.tolist()
+        episodes = [_episode(*one, states, outcomes) for one in zip(heads, received, strict=True)]
+        for episode, applied in zip(episodes, _applied(bag, heads), strict=False):
+            episode.columns[keys.APPLIED_ACTION] = applied
+        return Exported(heads[0].robot_type, heads[0].fps, _mapping(bag.topics, heads[0]), episodes)
     except (DatasetError, IndexError, KeyError, TypeError, ValueError):
         return None  # damaged; import names what it lacks
-    if not all(sections.values()):
-        return None
-    if len(messages) > 1:
-        raise ConfigError(
-            f"{bag.path} holds {len(messages)} episodes, whose instructions and outcomes may differ. Export a bag for "
-            "each, without --one_bag, or name the fields with --map."
-        )
-    mapping = MappingConfig(sections[keys.OBSERVATION_STATE], sections[keys.ACTION])
-    return Exported(message.robot_type, message.task, outcome if outcome in OUTCOMES else None, message.fps, mapping)
 
 
-def as_stated(bag: Bag, options: ImportOptions) -> ImportOptions:
-    """Return the options of one of several exported bags: with the instruction and the outcome of its episode.
+def _episode(head: Any, received: int, states: Sequence[Any], outcomes: Sequence[Any]) -> StatedEpisode:
+    metadata, features = json.loads(head.metadata), json.loads(head.features)
+    # Of a dataset with outcomes each episode has one.
+    outcome = Event[(metadata["outcome"] or "nothing").upper()].cause if "outcome" in metadata else None
+    states, outcomes = ([one for one in all_ if one.episode_index == head.episode_index] for all_ in (states, outcomes))
+    columns = {
+        key: np.array([getattr(one, key.rpartition(".")[2]) for one in messages]).astype(keys.SCALARS[key][0])
+        for names, messages in ((types.STATE_COLUMNS, states), (types.OUTCOME_COLUMNS, outcomes))
+        for key in names
+        if key in features
+    }
+    stamp = _nanoseconds(head.stamp)
+    is_whole = len(states) == len(outcomes) == head.frames and received == stamp
+    times = [_nanoseconds(one.observed) for one in states if is_whole]
+    return StatedEpisode(received, stamp, head.task, outcome, np.array(times, np.int64), columns)
 
-    Raises:
-        DatasetError: it is of another robot or another rate than the first, or states nothing.
-    """
-    one = exported(bag)
-    if one is None:
-        raise DatasetError(
-            f"The first bag was exported from a dataset; {bag.path} was not, or is damaged. Leave it out."
-        )
-    if one.robot_type != options.robot_type or options.stated_fps not in (0, one.fps):
-        raise DatasetError(
-            f"The first bag is of {options.robot_type!r} at {options.fps} fps, and {bag.path} of {one.robot_type!r} at "
-            f"{one.fps} fps. Import them one by one; --fps sets one rate for all."
-        )
-    return replace(options, task=options.task or one.task, outcome=options.outcome or one.outcome)
+
+def _nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec * NANO + stamp.nanosec)
+
+
+def _applied(bag: Bag, heads: Sequence[Any]) -> list[NDArray[np.float32]]:
+    """Return what was applied in the frames of each episode; nothing if messages are missing."""
+    section, ends = _section(bag.topics, heads[0], keys.APPLIED_ACTION), np.cumsum([head.frames for head in heads])
+    values = np.zeros((ends[-1], len(section)), np.float32)
+    for one in topics_of(section, {}):
+        messages = bag.read([one.topic])[one.topic].data
+        if len(messages) != len(values):
+            return []
+        values[:, one.columns] = [one.read(decode(one.msgtype, data)) for data in messages]
+    return np.split(values, ends[:-1]) if section else []
+
+
+def _mapping(topics: Mapping[str, Topic], head: Any) -> MappingConfig | None:
+    observation, action = (_section(topics, head, key) for key in (keys.OBSERVATION_STATE, keys.ACTION))
+    images = {}
+    for key, feature in json.loads(head.features).items():
+        for topic in (image_topic(key, compressed=compressed) for compressed in (False, True)):
+            name = key.removeprefix(f"{keys.OBSERVATION_IMAGES}.")
+            if feature["dtype"] == "video" and topic in topics and name.isidentifier():
+                images[name] = ImageConfig(topic, type=topics[topic].msgtype)
+    return MappingConfig(observation, action, images) if observation and action else None
+
+
+def _section(topics: Mapping[str, Topic], head: Any, key: str) -> dict[str, FieldConfig]:
+    """Return where the numbers of a feature are, in its order; nothing if there are none, or they are whole numbers."""
+    features = json.loads(head.features)
+    if features.get(key, {}).get("dtype") not in ("float32", "float64"):
+        return {}
+    entries: dict[str, FieldConfig] = {}
+    for part in json.loads(head.topics):
+        if part["feature"] == key:
+            entries |= _entries(topics[part["topic"]], part["names"], head.robot_type)
+    names = keys.numbered_names_of(features[key])
+    in_order = dict(sorted(entries.items(), key=lambda entry: names.index(entry[1].names(entry[0])[0])))
+    return in_order if features_of(in_order) == names else {}
+
+
+def _entries(topic: Topic, names: Sequence[str], robot_type: str) -> dict[str, FieldConfig]:
+    if topic.msgtype == types.NUMBERS:
+        return {name: FieldConfig(topic.name, types.NUMBERS, f"values[names={name}]") for name in names}
+    if topic.msgtype != SCAN:
+        return presets.entries(topic.name, topic.msgtype, names)
+    lidar = getattr(body_of(robot_type), "lidar", None)
+    if lidar is None:
+        return {}
+    ranges = {"range_min": lidar.range_min, "range_max": lidar.range_max}
+    return {"scan": FieldConfig(topic.name, SCAN, "ranges", beams=len(names), **ranges)}

@@ -22,7 +22,8 @@ class ImportOptions:
         command_timeout_s: silence after which a command is no longer in force and the robot stands.
         timeouts: those that the user chooses from where the robot moves without a command; none if one was given.
         min_episode_s: shorter episodes are left out.
-        stated_fps: of bags that were exported, and state instruction and outcome; 0 for any rate; None of other bags.
+        as_stated: whether the frames of an exported bag are those that it states. Otherwise it is resampled.
+        robot_is_stated: whether robot and mapping are those that the first bag states.
         given: what else decides the episodes, JSON values.
     """
 
@@ -40,7 +41,8 @@ class ImportOptions:
     stamps: str = "receive"
     pose: bool = False
     outcome: str | None = None
-    stated_fps: int | None = None
+    as_stated: bool = True
+    robot_is_stated: bool = False
     timeouts: tuple[float, ...] = ()
     given: Mapping[str, Any] = field(default_factory=dict)
 
