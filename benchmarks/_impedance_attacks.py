@@ -72,12 +72,12 @@ class Liar:
     def read(self, out: PlantReading) -> None:
         """Read, and falsify."""
         self._plant.read(out)
-        values, rows, joint = out.values[:2, :, :6], self._rows, self._joint
-        position, velocity = values
+        position, velocity = values = out.position[:, :6], out.velocity[:, :6]
+        rows, joint = self._rows, self._joint
         since = self._tick - self._begin
         lies = since >= 0
         self._held = np.where((since <= 0)[:, None], values, self._held)
-        self._past = [*self._past[-LATE_TICKS:], values.copy()]
+        self._past = [*self._past[-LATE_TICKS:], np.array(values)]
         out.stamp_ns = np.full(self.n, self._tick * 10**9 // self._hz)
         match self._attack:
             case "frozen":
@@ -88,7 +88,7 @@ class Liar:
             case "wrong sign":
                 velocity[lies] *= -1.0
             case "late":
-                values[:] = self._past[0]
+                position[:], velocity[:] = self._past[0]
             case "drifting positions" | "drifting":
                 position[rows, joint] += self._by * np.maximum(since, 0) / self._hz
                 velocity[rows, joint] += self._by * lies * (self._attack == "drifting")

@@ -8,16 +8,12 @@ finite, in the actuator's range, and changes from tick to tick that the body per
 that are no measurements: false, drifting, wrapped, frozen, counting twice, from the future, of robots that move; with
 the largest distance of a joint or a wheel from where the stop found it, and how many times as fast joints and tool are
 after the stop, by physics. The third attacks impedance control: with such readings, late ones and speeds of the wrong
-sign, walls that vanish, stiffnesses that change with every frame; with the largest speeds and forces. The last is the
-share of the guard, the last
-check before the plant, in a tick, that of the collision monitor, and that of the distance check of setpoints. Exits
+sign, walls that vanish, stiffnesses that change with every frame; with the largest speeds and forces. Exits
 with 3 if anything unsafe was written, or a stop was followed by more motion than it needs.
 """
 
 import argparse
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,7 +28,6 @@ from benchmarks._turns import status
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_simulation import BaseSimulation
@@ -208,16 +203,16 @@ class Stream:
 
 def vandalise(simulation: Any, rng: np.random.Generator) -> None:
     """Overwrite memory that other processes share, or a faulty controller would spoil, with random bytes."""
-    fifo, controller = simulation.cerebellum.fifo, simulation.cerebellum.controller
+    queues, controller = simulation.cerebellum.fifo.queues, simulation.cerebellum.controller
     what = rng.integers(6)
     if what == 0:
-        fifo._values.view(np.uint64)[...] = rng.integers(0, 2**63, fifo._values.shape, np.uint64)
+        queues["values"] = rng.integers(0, 2**63, queues["values"].shape, np.uint64).view(np.float64)
     elif what == 1:
-        fifo._due[...] = rng.integers(-(2**62), 2**62, fifo._due.shape)
+        queues["due_ns"] = rng.integers(-(2**62), 2**62, queues["due_ns"].shape)
     elif what == 2:
-        fifo._mask[...] = rng.random(fifo._mask.shape) < 0.5
+        queues["waits"] = rng.random(queues["waits"].shape) < 0.5
     elif what == 3:
-        fifo._tail[0], fifo._head[0] = rng.integers(-(2**40), 2**40, 2)
+        queues["tail"], queues["head"] = rng.integers(-(2**40), 2**40, (2, len(queues)))
     else:
         chosen = rng.random(simulation.n) < 0.3
         values = (controller.command, controller.actuators)[int(what == 4)]
@@ -369,62 +364,6 @@ def deceive(space: str, lie: str, streams: int, frames: int, seed: int) -> Follo
     return Followed(streams, int((simulation.modes == Mode.FAULT).sum()), judge.unsafe, moved, faster)
 
 
-def timed(function: Callable[[], object], count: int) -> float:
-    """Return how long a call takes [s]; the shortest of 20 times `count` calls."""
-    best = np.inf
-    for _ in range(20):
-        started = time.perf_counter()
-        for _ in range(count):
-            function()
-        best = min(best, (time.perf_counter() - started) / count)
-    return best
-
-
-def distance_share(n: int) -> tuple[float, float]:
-    """Return what the distance check of setpoints adds to a tick [s], and such a tick.
-
-    The arms are close above the table and sway, so that every check computes distances.
-    """
-    ticks = []
-    for checks in (False, True):
-        arm = make("joints", n)
-        action = start_of(arm)
-        for _ in range(60):
-            action[:, 1] += 0.02  # the shoulder lowers the arm, until the check stops it
-            arm.step(action)
-        held = arm.cerebellum.command.copy()
-        if not checks:
-            arm.controller.setpoints.clearance = None
-        swayed = [held, held + np.array([0.02, -0.02, 0, 0, 0, 0, 0])]
-        ticks.append(timed(lambda arm=arm, swayed=swayed: [arm.step(one) for one in swayed], 2))
-    without, whole = (one / 2 / arm.rates.ticks_per_frame for one in ticks)
-    return whole - without, whole
-
-
-def share(space: str, n: int) -> tuple[float, float]:
-    """Return what the check takes, and a whole tick with the physics [s]; the smallest of many.
-
-    The check is that of the guard; of monitored wheels that of the collision monitor.
-    """
-    simulation = make(space, n)
-    action = start_of(simulation)
-    cerebellum = simulation.cerebellum
-    for frame in range(10):
-        simulation.step(action + 0.001 * (frame % 2))
-
-    actuators = cerebellum.controller.actuators
-    shifted = actuators + 1e-6
-    pair = [actuators, shifted]
-    if space == MONITORED:
-        monitor, command, pose = cerebellum.controller._monitor, np.tile([0.2, 1.0], (n, 1)), np.zeros((n, 3))
-        check = timed(lambda: monitor.limit(command.copy(), command, pose), 200)
-    else:
-        position = cerebellum.reading.position
-        check = timed(lambda: [cerebellum.guard.check(one, position) for one in pair], 200) / 2
-    whole = timed(lambda: simulation.step(action), 3) / simulation.rates.ticks_per_frame
-    return check, whole
-
-
 def impedance_table(streams: int, frames: int, seed: int) -> tuple[Table, int]:
     """Attack impedance control; return a table of what came of it, and how many writes and attacks were not safe."""
     unsafe = 0
@@ -466,7 +405,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--streams", type=int, default=1000, help="of each action space, and again with vandals")
     parser.add_argument("--frames", type=int, default=60, help="of each stream")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--n", type=int, nargs="+", default=[1, 64], help="simulations, in the second table")
     options = parser.parse_args(arguments)
     console = Console(width=120)
     table = Table(title="What was written to the plants")
@@ -511,26 +449,6 @@ def main(arguments: list[str] | None = None) -> int:
     table, found = impedance_table(options.streams, options.frames, options.seed)
     console.print(table)
     unsafe += found
-    compile_at_once()
-    shares = Table(title="The share of the checks in a tick, physics and sensors included")
-    for column in ("robot", "n", "check", "tick", "share"):
-        shares.add_column(column, justify="left" if column == "robot" else "right")
-    for space in ("wheels", MONITORED, "joints", "impedance"):
-        for n in options.n:
-            check, whole = share(space, n)
-            shares.add_row(
-                space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{100 * check / whole:.1f} %"
-            )
-    for n in options.n:
-        check, whole = distance_share(n)
-        shares.add_row(
-            "joints, distances",
-            str(n),
-            f"{check * 1e6:.1f} us",
-            f"{whole * 1e6:.0f} us",
-            f"{100 * check / whole:.1f} %",
-        )
-    console.print(shares)
     return status(met=not unsafe)
 
 

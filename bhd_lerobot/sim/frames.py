@@ -208,6 +208,7 @@ class Frames:
         beams: int,
     ) -> None:
         self._world, self._cerebellum, self._touched = world, cerebellum, touched
+        self._plant = cerebellum.plant
         self._handled = 0
         model, layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = layout[0], world.servos
@@ -237,8 +238,11 @@ class Frames:
             ticks: how many.
 
         Returns:
-            False if nothing was done, because Python does it as well so far.
+            False if nothing was done: Python does it as well so far, or the cerebellum's plant is another than the
+            world's.
         """
+        if self._cerebellum.plant is not self._plant:
+            return False
         ids = np.arange(self._world.n) if ids is None else ids
         self._handled += len(ids) * ticks * _TICK_VALUES
         if not is_worth_compiling(run_frames, self._handled) or not _load():

@@ -206,7 +206,7 @@ def test_a_reset_acknowledges_only_a_press_that_its_caller_saw_latched(rig):
     def meanwhile(now_ns: int) -> None:  # the request is on its way when another process presses, and a tick sees it
         rig.server.serve = server
         rig.other.estop.press()
-        rig.cerebellum.estop.see()
+        rig.cerebellum.tick(now_ns)
         server(now_ns)
 
     rig.server.serve = meanwhile
