@@ -368,7 +368,7 @@ class Cerebellum:
             self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         taken = self.states["setpoints_taken"][ids]
         self.states[ids] = new_states(1)
-        self.states["setpoints_taken"][ids], self.states["mode_is_new"][ids] = taken, True
+        self.states["setpoints_taken"][ids] = taken
         self.controller.restart(ids)
         self.readings.forget(ids)
         self._start_writing(ids)

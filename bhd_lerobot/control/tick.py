@@ -176,7 +176,8 @@ def take_command(state: Any, queue: Any, estop: Counts, limits: Any, now_ns: int
             if state.next_due_ns > now_ns:
                 return
         entry = state.next_entry
-        sequence, due_ns = queue.sequence[entry], queue.due_ns[entry]
+        # Another process may have written to the entry since it was found due.
+        sequence, due_ns = queue.sequence[entry], min(queue.due_ns[entry], now_ns)
         queue.waits[entry] = False
         # None is taken twice, and none is so far ahead that all that follow would be refused.
         if not last < sequence <= last + SEQUENCE_STEP:
