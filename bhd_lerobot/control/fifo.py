@@ -81,9 +81,10 @@ class CommandFifo:
 
 @kernel()
 def ends(queue: Any) -> tuple[int, int]:
-    """Return the numbers of the oldest entry and of the next; a queue in which another process wrote others is emptied."""
+    """Return the numbers of the oldest entry and of the next; garbage of another process empties the queue."""
     tail, head = queue.tail, queue.head
-    if not (tail <= head and 0 <= head - tail <= QUEUE):  # compiled, a difference of two numbers may have the wrong sign
+    # Compiled, the difference of two numbers may have the wrong sign.
+    if not (tail <= head and 0 <= head - tail <= QUEUE):
         queue.tail = tail = head
     return tail, head
 

@@ -60,9 +60,7 @@ class Bases:
         self.controller.configure(np.array(ids), PlantReading(len(self.states), 2, 0, self.states))
 
 
-@given(
-    target=arrays(np.float64, (N, 2), elements=ANY), velocity=arrays(np.float64, (2,), elements=st.floats(1e-3, 10))
-)
+@given(target=arrays(np.float64, (N, 2), elements=ANY), velocity=arrays(np.float64, (2,), elements=st.floats(1e-3, 10)))
 def test_the_velocity_limit_is_the_nearest_there_is_and_told_if_and_only_if_it_is_met(
     target: Array, velocity: Array
 ) -> None:
