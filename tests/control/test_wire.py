@@ -373,7 +373,9 @@ def test_a_command_is_never_taken_twice() -> None:
     assert rig.command[0] == 0
 
 
-@pytest.mark.parametrize("ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2), (2**63 - 1, -(2**63)), (-(2**62), 2**62)])
+@pytest.mark.parametrize(
+    "ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2), (2**63 - 1, -(2**63)), (-(2**62), 2**62)]
+)
 def test_garbage_in_the_queues_ends_empties_it(ends: tuple[int, int]) -> None:
     rig = base_rig()
     rig.send(0.2)
