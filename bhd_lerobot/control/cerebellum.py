@@ -176,7 +176,7 @@ class Cerebellum:
     def _run_controller(self, controller: Any, now_ns: int) -> None:
         """Run a tick with a controller that is no part of the compiled one."""
         states = self.states
-        if np.count_nonzero(self.mode == Mode.STOPPING):
+        if np.count_nonzero((self.mode == Mode.TRACKING) | (self.mode == Mode.STOPPING)):  # a stop may begin
             states["is_at_rest"] = controller.at_rest()
         self._begin(now_ns)
         self._tell_controller()
@@ -368,7 +368,7 @@ class Cerebellum:
             self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         taken = self.states["setpoints_taken"][ids]
         self.states[ids] = new_states(1)
-        self.states["setpoints_taken"][ids], self.states["mode_is_new"][ids] = taken, True
+        self.states["setpoints_taken"][ids] = taken
         self.controller.restart(ids)
         self.readings.forget(ids)
         self._start_writing(ids)

@@ -80,6 +80,8 @@ def odometry_after(state: Any, limits: Any, left: float, right: float) -> tuple[
     moved_left, moved_right = left - state.encoder[0], right - state.encoder[1]
     distance, turn = (moved_left + moved_right) * limits.per_count, (moved_right - moved_left) * limits.yaw_per_count
     heading = turn * 0.5 + state.odometry[2]
+    if not math.isfinite(heading):
+        heading = math.nan  # Python raises for the cosine of an infinity
     x, y = state.odometry[0] + math.cos(heading) * distance, state.odometry[1] + math.sin(heading) * distance
     return x, y, state.odometry[2] + turn
 

@@ -80,11 +80,19 @@ class CommandFifo:
 
 
 @kernel()
+def ends(queue: Any) -> tuple[int, int]:
+    """Return the numbers of the oldest entry and of the next; garbage of another process empties the queue."""
+    tail, head = queue.tail, queue.head
+    # Compiled, the difference of two numbers may have the wrong sign.
+    if not (tail <= head and 0 <= head - tail <= QUEUE):
+        queue.tail = tail = head
+    return tail, head
+
+
+@kernel()
 def find_next(state: Any, queue: Any) -> None:
     """Note when the next entry of a queue is due, and release the oldest entries that do not wait any more."""
-    head, tail = queue.head, queue.tail
-    if not 0 <= head - tail <= QUEUE:  # another process wrote garbage: the queue is emptied
-        queue.tail = tail = head
+    tail, head = ends(queue)
     state.seen_head, state.next_due_ns = head, NEVER
     is_first = True
     for number in range(tail, head):
@@ -93,8 +101,9 @@ def find_next(state: Any, queue: Any) -> None:
             continue
         if is_first:
             queue.tail, is_first = number, False
-        if queue.due_ns[slot] < state.next_due_ns:
-            state.next_due_ns, state.next_entry = queue.due_ns[slot], slot
+        due_ns = min(queue.due_ns[slot], NEVER - 1)
+        if due_ns < state.next_due_ns:
+            state.next_due_ns, state.next_entry = due_ns, slot
     if is_first:
         queue.tail = head
 
@@ -102,8 +111,9 @@ def find_next(state: Any, queue: Any) -> None:
 @kernel()
 def drop(state: Any, queue: Any, lowest: int, highest: int) -> int:
     """Drop what waits and has a sequence number in a range; return how many that were."""
-    dropped, head = 0, queue.head
-    for number in range(max(queue.tail, head - QUEUE), head):
+    dropped = 0
+    tail, head = ends(queue)
+    for number in range(tail, head):
         slot = number % QUEUE
         if queue.waits[slot] and lowest <= queue.sequence[slot] <= highest:
             queue.waits[slot] = False
@@ -115,8 +125,9 @@ def drop(state: Any, queue: Any, lowest: int, highest: int) -> int:
 @kernel()
 def keep_newest(state: Any, queue: Any, now_ns: int) -> None:
     """Drop every entry that is due and that a later one, which is due too, takes the place of."""
-    newest, head = -1, queue.head
-    for number in range(max(queue.tail, head - QUEUE), head):
+    newest = -1
+    tail, head = ends(queue)
+    for number in range(tail, head):
         slot = number % QUEUE
         if queue.waits[slot] and queue.due_ns[slot] <= now_ns:
             if newest >= 0:

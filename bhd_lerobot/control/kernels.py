@@ -59,8 +59,10 @@ class Kernel[**P, R]:
         import numba
 
         config: Any = numba.config
-        if config.DISABLE_JIT or not self.signature:
+        if not self.signature:
             return numba.njit(error_model="numpy")(self.function)
+        if config.DISABLE_JIT:
+            return lambda *arguments: self.function(*map(as_objects, arguments))
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()

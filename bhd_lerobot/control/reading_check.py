@@ -20,6 +20,8 @@ _MEMORY_S = 0.3  # over which the ways of joints are compared with their speeds
 _CONTRADICTION_RAD, _CONTRADICTION_SHARE = 0.01, 0.05  # so far they may differ: at least, and of the way
 _LONGEST_GAP_PERIODS = 10
 _FROZEN_S = 0.02  # a reading that is the same for so long
+LARGEST = 1e9  # [rad, rad/s] nothing turns as far, or as fast
+_FARTHEST_NS = 1 << 61  # of a stamp from 0: differences of such stamps are numbers of 64 bits
 _FROZEN_SHARE = 0.01  # while the torque changed by more than this share of the largest does not measure
 
 
@@ -35,10 +37,11 @@ def are_positions_wrong(state: Any, limits: Any) -> bool:
     stop of its own may be moved by hand and is not checked for that; neither is a gripper, whose fingers a collision
     throws. Wrong positions become the last that were measurements.
     """
+    state.stamp_ns = min(max(state.stamp_ns, -_FARTHEST_NS), _FARTHEST_NS)
     state.elapsed_ns, state.read_ns = max(state.stamp_ns - state.read_ns, 0), state.stamp_ns
     is_finite = is_known = is_still = True
     for k in range(limits.joints):
-        is_finite &= math.isfinite(state.position[k])
+        is_finite &= abs(state.position[k]) < LARGEST
         is_known &= math.isfinite(state.near[k])
         is_still &= abs(state.position[k] - state.near[k]) <= limits.step[k]
     is_wrong, is_new = not is_finite, is_finite and (is_still or not is_known or state.safety != 0)

@@ -173,7 +173,7 @@ def new_states(n: int) -> NDArray:
     states["near"] = states["seen_position"] = np.nan
     states["sent_sequence"] = states["taken_sequence"] = states["seen_head"] = -1
     states["sent_due_ns"] = np.iinfo(np.int64).min
-    states["next_due_ns"] = NEVER
+    states["next_due_ns"], states["mode_is_new"] = NEVER, True
     return states
 
 

@@ -15,7 +15,7 @@ from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Mode, Reason, Watchdog
 from bhd_lerobot.control.plant import SafetyStatus
-from bhd_lerobot.control.reading_check import are_motions_wrong, are_positions_wrong, is_time_wrong
+from bhd_lerobot.control.reading_check import LARGEST, are_motions_wrong, are_positions_wrong, is_time_wrong
 from bhd_lerobot.control.record import NEVER
 
 _HOLD, _TRACKING, _STOPPING, _SAFE_OFF = (int(Mode[name]) for name in ("HOLD", "TRACKING", "STOPPING", "SAFE_OFF"))
@@ -128,7 +128,7 @@ def judge_reading(state: Any, limits: Any) -> None:
         is_bad = True
     is_finite, has_effort = True, True
     for k in range(limits.joints):
-        is_finite &= math.isfinite(state.velocity[k])
+        is_finite &= abs(state.velocity[k]) < LARGEST
         has_effort &= math.isfinite(state.effort[k])
     is_bad = is_bad or not is_finite or not has_effort
     state.is_distrusted = is_bad
@@ -176,7 +176,8 @@ def take_command(state: Any, queue: Any, estop: Counts, limits: Any, now_ns: int
             if state.next_due_ns > now_ns:
                 return
         entry = state.next_entry
-        sequence, due_ns = queue.sequence[entry], queue.due_ns[entry]
+        # Another process may have written to the entry since it was found due.
+        sequence, due_ns = queue.sequence[entry], min(queue.due_ns[entry], now_ns)
         queue.waits[entry] = False
         # None is taken twice, and none is so far ahead that all that follow would be refused.
         if not last < sequence <= last + SEQUENCE_STEP:

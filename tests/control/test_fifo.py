@@ -6,117 +6,149 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.fifo import CommandFifo, RingReader, StateRing
+from bhd_lerobot.control.fifo import CommandFifo, RingReader, StateRing, drop, find_next, keep_newest
+from bhd_lerobot.control.kernels import as_objects
+from bhd_lerobot.control.record import NEVER, new_states
 from bhd_lerobot.errors import ConfigError
 from tests.control import support
 from tests.forks import Fork
 
-ALL = np.ones(1, np.bool_)
 
-
-def push(fifo: CommandFifo, number: int, due: int | None = None, mask: np.ndarray | None = None) -> bool:
+def push(fifo: CommandFifo, number: int, due: int | None = None, mask: np.ndarray | None = None) -> list[bool]:
+    mask = np.ones(fifo.n, np.bool_) if mask is None else mask
     values = np.full((fifo.n, fifo.width), float(number))
-    return fifo.push(
-        number, number if due is None else due, values, np.ones(fifo.n, np.bool_) if mask is None else mask
-    )
+    pushed: list[bool] = fifo.push(number, number if due is None else due, values, mask).tolist()
+    return pushed
 
 
-def pop(fifo: CommandFifo) -> tuple[int, list[int]] | None:
-    """The number of the next command, and the simulations that it is for."""
-    values, mask = np.zeros((fifo.n, fifo.width)), np.zeros(fifo.n, np.bool_)
-    result = fifo.pop(values, mask)
-    if result is None:
-        return None
-    assert (values == result[0]).all()
-    return result[0], np.flatnonzero(mask).tolist()
+class Reader:
+    """The end of the queues that a tick has."""
+
+    def __init__(self, fifo: CommandFifo) -> None:
+        self.fifo, self.records = fifo, new_states(fifo.n)
+        self.states, self.queues = as_objects(self.records), as_objects(fifo.queues)
+
+    def next_due(self, sim: int = 0) -> int | None:
+        find_next(self.states[sim], self.queues[sim])
+        due = self.states[sim].next_due_ns
+        return None if due == NEVER else due
+
+    def pop(self, sim: int = 0) -> int | None:
+        """Take the next command of a robot; return its number."""
+        if self.next_due(sim) is None:
+            return None
+        entry = self.states[sim].next_entry
+        number = int(self.queues[sim].sequence[entry])
+        assert (self.queues[sim].values[entry, : self.fifo.width] == number).all()
+        self.queues[sim].waits[entry] = False
+        find_next(self.states[sim], self.queues[sim])
+        return number
+
+    def drop(self, sim: int = 0) -> int:
+        return int(drop(self.states[sim], self.queues[sim], -(2**63), NEVER))
 
 
 @pytest.mark.law
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 7))
 def test_it_behaves_like_a_bounded_queue(pushes: list[bool], capacity: int) -> None:
     fifo, model = CommandFifo(1, 2, capacity), deque[int]()
+    reader = Reader(fifo)
     for number, is_push in enumerate(pushes):
         if is_push:
-            accepted = push(fifo, number)
-            assert accepted == (len(model) < capacity)
-            if accepted:
+            assert push(fifo, number) == [len(model) < capacity]
+            if len(model) < capacity:
                 model.append(number)
         else:
-            popped = pop(fifo)
-            assert popped == ((model.popleft(), [0]) if model else None)
+            assert reader.pop() == (model.popleft() if model else None)
         assert len(fifo) == len(model)
-        assert fifo.next_due() == (model[0] if model else None)
+        assert reader.next_due() == (model[0] if model else None)
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 5), st.booleans()), max_size=40))
-def test_simulations_do_not_wait_for_each_other(steps: list[tuple[int, int, bool]]) -> None:
-    """Each simulation's commands come out in its own order and when they are due, as from a queue of its own."""
-    shared = CommandFifo(3, 1, 64)
-    alone = [deque[tuple[int, int]]() for _ in range(3)]
-    last_due = [0, 0, 0]
-    now = 0
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 5), st.booleans()), max_size=300))
+def test_commands_come_out_when_they_are_due_and_simulations_do_not_wait_for_each_other(
+    steps: list[tuple[int, int, bool]],
+) -> None:
+    shared, waiting, now = CommandFifo(3, 1, 64), [list[tuple[int, int]]() for _ in range(3)], 0
+    reader = Reader(shared)
     for number, (sim, delay, is_push) in enumerate(steps, 1):
         if is_push:
-            due = max(last_due[sim], now + delay)  # in one simulation due times do not decrease
-            last_due[sim] = due
-            mask = np.arange(3) == sim
-            assert push(shared, number, due, mask)
-            alone[sim].append((number, due))
-        else:
-            now += delay
-            taken: list[list[int]] = [[], [], []]
-            while (due_next := shared.next_due()) is not None and due_next <= now:
-                popped = pop(shared)
-                assert popped is not None
-                for member in popped[1]:
-                    taken[member].append(popped[0])
-            for member in range(3):
-                expected = []
-                while alone[member] and alone[member][0][1] <= now:
-                    expected.append(alone[member].popleft()[0])
-                assert taken[member] == expected
+            if push(shared, number, now + delay, np.arange(3) == sim)[sim]:
+                waiting[sim].append((now + delay, number))
+            continue
+        now += delay
+        for member in range(3):
+            while (due := reader.next_due(member)) is not None and due <= now:
+                waiting[member].sort()
+                assert (due, reader.pop(member)) == waiting[member].pop(0)
+            assert all(due > now for due, _ in waiting[member])
 
 
 def test_what_is_dropped_is_counted_and_makes_room() -> None:
     fifo = CommandFifo(2, 1, 3)
-    first, both = np.array([True, False]), np.array([True, True])
-    for number, mask in enumerate((first, both, first)):
-        given = mask.copy()
-        assert push(fifo, number, mask=given)
-        given[:] = False  # a command is a copy
-    assert fifo.drop(np.array([0])).tolist() == [3]
-    assert pop(fifo) == (1, [1])
-    assert pop(fifo) is None
-    assert [push(fifo, number) for number in range(10, 14)] == [True, True, True, False]
-    assert fifo.drop(np.array([0, 1])).tolist() == [3, 3]
+    reader = Reader(fifo)
+    for number, both in enumerate((False, True, False)):
+        assert push(fifo, number, mask=np.array([True, both])) == [True, both]
+    assert reader.drop() == 3
+    assert [reader.pop(), reader.pop(1), reader.pop(1)] == [None, 1, None]
+    assert [push(fifo, number)[0] for number in range(10, 14)] == [True, True, True, False]
+    assert [reader.drop(sim) for sim in (0, 1, 0)] == [3, 3, 0]
     assert len(fifo) == 0
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(-3, 3)), max_size=30), st.integers(-3, 3))
+def test_of_what_is_due_the_newest_is_kept_and_of_numbers_those_out_of_a_range(
+    entries: list[tuple[int, int]], now: int
+) -> None:
+    for judge in ("due", "numbers"):
+        fifo = CommandFifo(1, 1)
+        reader = Reader(fifo)
+        for number, due in entries:
+            push(fifo, number, due)
+        if judge == "due":
+            keep_newest(reader.states[0], reader.queues[0], now)
+            left = [one for one in entries if one[1] > now] + [one for one in entries if one[1] <= now][-1:]
+        else:
+            dropped = drop(reader.states[0], reader.queues[0], 3, 5)
+            left = [one for one in entries if not 3 <= one[0] <= 5]
+            assert dropped == len(entries) - len(left)
+        assert sorted(iter(reader.pop, None)) == sorted(number for number, _ in left)
+
+
+def test_a_command_for_the_end_of_all_time_is_seen_and_does_not_keep_its_place_for_ever() -> None:
+    fifo = CommandFifo(1, 1, 4)
+    reader = Reader(fifo)
+    push(fifo, 1, NEVER)
+    assert reader.next_due() == NEVER - 1
+    assert [reader.drop(), len(fifo)] == [1, 0]
 
 
 def test_a_queue_has_room_and_the_stated_size() -> None:
     for n in (1, 3, 64):
-        size = CommandFifo.nbytes(n, 2, 4)
+        size = CommandFifo.nbytes(n)
         fifo = CommandFifo(n, 2, 4, bytearray(size))
-        assert [push(fifo, number) for number in range(5)] == [True] * 4 + [False]
+        assert [push(fifo, number) for number in range(5)] == [[True] * n] * 4 + [[False] * n]
         with pytest.raises(ValueError, match="buffer"):
             CommandFifo(n, 2, 4, bytearray(size - 1))
     for make in (lambda: CommandFifo(1, 2, 0), lambda: StateRing(np.dtype(np.float64), 0)):
         with pytest.raises(ConfigError, match="0"):
             make()
+    with pytest.raises(ConfigError, match="257; it must be from 1 to 256"):
+        CommandFifo(1, 2, 257)
 
 
 def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path) -> None:
-    count = 1000
-    path = tmp_path / "block"
-    reader = CommandFifo(
-        *support.FIFO_SHAPE, buffer=support.shared_block(path, CommandFifo.nbytes(*support.FIFO_SHAPE))
-    )
+    count, path = 1000, tmp_path / "block"
+    block = support.shared_block(path, CommandFifo.nbytes(support.FIFO_SHAPE[0]))
+    reader = Reader(CommandFifo(*support.FIFO_SHAPE, buffer=block))
     process = Fork(support.push_commands, path, count)
     for number in range(count):
-        while (popped := pop(reader)) is None:
-            assert process.poll() is None or len(reader) > 0
-        assert popped == (number, [sim for sim in range(3) if number % (sim + 1) == 0])
+        for sim in range(3):
+            if number % (sim + 1) == 0:
+                while (popped := reader.pop(sim)) is None:
+                    assert process.poll() is None or len(reader.fifo) > 0
+                assert popped == number
     assert process.wait() == 0
-    assert pop(reader) is None
+    assert [reader.pop(sim) for sim in range(3)] == [None] * 3
 
 
 def test_the_ring_keeps_the_newest_and_hands_out_copies() -> None:

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bhd_lerobot.control.base.diff_drive import DiffDrive, integrate
 
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
+from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.control.base.drive import read_odometry
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
 from tests.control.test_wire import arm, base_rig, twist_rig
@@ -31,17 +32,77 @@ KERNELS = {
 SPECIAL = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 1e-300)
 
 
+# What comes from outside of the core, or from a controller that is broken: any number may be in it.
+OUTSIDE = {"position", "velocity", "effort", "actuators", "requested", "target", "values", "near"}
+POSITIVE = {"deceleration", "reach", "range_min", "range_max"}
+TIMES = (0, 1, 10**6, 10**9, -(10**9), 2**62, -(2**62), 2**63 - 1, -(2**63))
+WHOLE = {  # the smallest and the largest; others are from 0 to 3
+    "mode": (0, 8),
+    "joints": (2, 8),
+    "width": (2, 8),
+    "late": (1, 5),
+    "gyro": (-1, 6),
+    "beams": (0, 7),
+    "count": (0, 40),
+    "next_entry": (0, 256),
+    "ticks": (3, 9),
+    "refusals": (0, 99),
+}
+
+
+def floats(shape: Any, rng: np.random.Generator, *, special: bool = True) -> Any:
+    values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 2, shape)
+    return np.where(rng.random(shape) < 0.1, rng.choice(SPECIAL, shape), values) if special else values
+
+
+def records(name: str, rng: np.random.Generator) -> Any:
+    """Return two records, or one of limits, that a core may come to; a queue holds whatever another process wrote."""
+    n = 1 if name == "limits" else 2
+    made = np.zeros(n, kernels.RECORDS[name])
+    if name == "queue" and rng.random() < 0.3:
+        return np.frombuffer(rng.bytes(made.nbytes), made.dtype).copy()
+    for field in made.dtype.names or ():
+        shape, kind = made[field].shape, made[field].dtype.kind
+        if kind == "f":
+            values = floats(shape, rng, special=field in OUTSIDE)
+            made[field] = np.abs(values) + 1e-3 if name == "limits" or field in POSITIVE else values
+        elif kind == "b":
+            made[field] = rng.random(shape) < 0.5
+        elif field.endswith("_ns") or field == "sequence":
+            made[field] = rng.choice(TIMES[: None if name == "queue" or field == "stamp_ns" else 5], shape)
+        else:
+            made[field] = rng.integers(*WHOLE.get(field, (0, 3)), shape)
+    if name == "queue":
+        made["tail"] = rng.choice(TIMES, n)
+        with np.errstate(over="ignore"):
+            made["head"] = made["tail"] + rng.choice([0, 1, 5, 256, 300, -1, 2**62, -(2**63)], n)
+    return made
+
+
 def drawn(kind: str, rng: np.random.Generator) -> Any:
     """Return an argument of a type in numba's words, large enough for two robots with up to six values."""
     name, _, dimensions = kind.partition("[")
+    if name in kernels.RECORDS:
+        return records(name, rng)
     shape = (2, 2, 6)[-1 - dimensions.count(",") :] if dimensions else ()
+    if kind == "i8[:,:]":  # the words of emergency stops
+        shape = (3, 2)
     if name in ("i8", "i1"):
         return rng.integers(-1, 3, shape).astype(name) if shape else int(rng.integers(-1, 2))
     if name == "b1":
         return rng.random(shape) < 0.5 if shape else bool(rng.random() < 0.5)
-    values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 2, shape)
-    values = np.where(rng.random(shape) < 0.1, rng.choice(SPECIAL, shape), values)
+    values = floats(shape, rng)
     return values if shape else np.float64(values)
+
+
+def assert_same(one: Any, other: Any, what: str) -> None:
+    if one.dtype.names:
+        for name in one.dtype.names:
+            assert_same(one[name], other[name], f"{what}: {name}")
+        return
+    np.testing.assert_array_equal(one, other, err_msg=what)
+    signs = (np.signbit(value) | np.isnan(value) for value in (one, other))  # IEEE 754: NaN has none
+    np.testing.assert_array_equal(*signs, err_msg=what)
 
 
 @pytest.mark.parametrize("name", sorted(KERNELS))
@@ -53,11 +114,9 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
         plain = [drawn(kind, rng) for kind in kinds]
         compiled = [value.copy() if isinstance(value, np.ndarray) else value for value in plain]
         with np.errstate(all="ignore"):
-            assert one(*plain) == one.compiled(*compiled)
+            assert one(*map(kernels.as_objects, plain)) == one.compiled(*compiled)
         for k, (mine, other) in enumerate(zip(plain, compiled, strict=True)):
-            np.testing.assert_array_equal(mine, other, err_msg=f"argument {k}")
-            signs = (np.signbit(value) | np.isnan(value) for value in (mine, other))  # IEEE 754: NaN has none
-            np.testing.assert_array_equal(*signs, err_msg=f"argument {k}")
+            assert_same(np.asarray(mine), np.asarray(other), f"argument {k}")
 
 
 @pytest.fixture
@@ -82,14 +141,15 @@ def test_a_tick_of_a_loop_on_the_wall_clock_compiles_nothing(make: Callable[[], 
 
 
 def test_a_kernel_takes_no_other_types_than_it_was_compiled_for() -> None:
-    good = [np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 3))]
-    for position in range(3):
+    base = BaseController(turtlebot3_burger().drive, 1, 200)
+    good: list[Any] = [base.states, base.numbers, np.zeros((1, 2)), np.zeros((1, 3))]
+    for position in range(4):
         for bad in (np.zeros((1, 3), np.float32), np.zeros(3)):
             arrays = [bad if k == position else one for k, one in enumerate(good)]
             with pytest.raises(TypeError, match="No matching definition"):
-                integrate.compiled(*arrays, 1.0, 1.0, 1.0)
-            with pytest.raises(TypeError, match=f"Argument {position} of integrate is an array of"):
-                Kernel(integrate.function, integrate.signature).bind()(*arrays, 1.0, 1.0, 1.0)
+                read_odometry.compiled(*arrays)
+            with pytest.raises(TypeError, match=f"Argument {position} of read_odometry is an array of"):
+                Kernel(read_odometry.function, read_odometry.signature).bind()(*arrays)
 
 
 @pytest.fixture
@@ -99,39 +159,39 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def compiled(one: Kernel[..., Any]) -> Callable[..., Any]:
         names.append(one.function.__name__)
-        return one.function
+        return lambda *arguments: one.function(*map(kernels.as_objects, arguments))
 
     monkeypatch.setattr(Kernel, "compiled", property(compiled))
     for one in KERNELS.values():
         monkeypatch.delitem(vars(one), "compiled", raising=False)
-    monkeypatch.setattr(kernels, "_values", 60)
+    monkeypatch.setattr(kernels, "_values", 240)
     return names
 
 
 def drive(ticks: int) -> None:
-    base = DiffDrive(turtlebot3_burger().drive, 3)
+    base = BaseController(turtlebot3_burger().drive, 3, 200)
     for tick in range(ticks):
-        base.update_odometry(np.full((3, 2), 0.1 * tick))
+        base.odometry_at(np.full((3, 2), 0.1 * tick))
 
 
 def test_a_kernel_is_compiled_once_it_has_run_for_long(compilations: list[str]) -> None:
     drive(10)  # of three robots
     assert compilations == []
     drive(12)
-    assert compilations == ["integrate"]
+    assert compilations == ["read_odometry"]
     with kernels.never_compiled():
         drive(12)
-    assert compilations == ["integrate"]
+    assert compilations == ["read_odometry"]
     kernels.compile_at_once()
     drive(0)
-    assert compilations == ["integrate", "integrate"]
+    assert compilations == ["read_odometry", "read_odometry"]
 
 
 def test_arrays_of_a_reading_are_not_replaced() -> None:
     reading = PlantReading(1, 2)
     reading.has_effort, reading.stamp_ns = True, np.zeros(1, np.int64)
     reading.position += 1.0
-    assert reading.values[0].tolist() == [[1.0, 1.0]]
+    assert reading.position.tolist() == [[1.0, 1.0]]
     with pytest.raises(
         TypeError, match=r"PlantReading.position is not to be replaced: write into it, out.position\[:\]"
     ):
@@ -141,9 +201,10 @@ def test_arrays_of_a_reading_are_not_replaced() -> None:
 def start(cache: Path, **environment: str) -> subprocess.Popen:
     program = (
         "import numpy as np\n"
-        "from bhd_lerobot.control.base.diff_drive import integrate\n"
-        "odometry = np.zeros((1, 3))\n"
-        "integrate.compiled(np.ones((1, 2)), np.zeros((1, 2)), odometry, 651.9, 2.5e-5, 3.2e-4)\n"
+        "from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger\n"
+        "from bhd_lerobot.control.base.controller import BaseController, read_odometry\n"
+        "base, odometry = BaseController(turtlebot3_burger().drive, 1, 200), np.zeros((1, 3))\n"
+        "read_odometry.compiled(base.states, base.numbers, np.ones((1, 2)), odometry)\n"
         "print(odometry.tolist())\n"
     )
     return subprocess.Popen(

@@ -373,7 +373,9 @@ def test_a_command_is_never_taken_twice() -> None:
     assert rig.command[0] == 0
 
 
-@pytest.mark.parametrize("ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2), (2**63 - 1, -(2**63))])
+@pytest.mark.parametrize(
+    "ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2), (2**63 - 1, -(2**63)), (-(2**62), 2**62)]
+)
 def test_garbage_in_the_queues_ends_empties_it(ends: tuple[int, int]) -> None:
     rig = base_rig()
     rig.send(0.2)
@@ -383,6 +385,18 @@ def test_garbage_in_the_queues_ends_empties_it(ends: tuple[int, int]) -> None:
     rig.tick(300)
     assert rig.mode == Mode.HOLD
     assert rig.command == [0, 0]
+
+
+def test_a_due_time_that_is_overwritten_in_the_queue_does_not_end_the_command_time_out() -> None:
+    rig = base_rig()
+    rig.send(0.2, due=5 * support.TICK_NS)
+    rig.tick()
+    rig.cerebellum.fifo.queues["due_ns"] = 2**62
+    rig.tick(40)
+    assert rig.mode == Mode.TRACKING
+    rig.tick(200)
+    assert rig.mode == Mode.HOLD
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.COMMAND_AGE]
 
 
 def test_a_command_for_later_than_the_horizon_is_refused_and_dropped_from_the_queue() -> None:

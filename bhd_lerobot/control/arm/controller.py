@@ -191,6 +191,7 @@ class ArmController(SteppedController):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             self._stopped &= ~mask
+            self._rest_ticks *= self._stopped
             self._relief.restart(mask)
             self._wrong &= ~mask[:, None]
             self._driven[mask] = cause == Mode.HOLD

@@ -410,3 +410,25 @@ def test_an_arm_that_never_moved_is_named_otherwise_than_one_that_is_blocked(mov
     rig.tick(3 * HZ)
     assert rig.cerebellum.mode[0] == Mode.FAULT
     assert cause in rig.controller.cause
+
+
+@pytest.mark.law
+def test_a_stop_is_not_over_before_the_arm_is_at_rest_however_often_it_stops() -> None:
+    rig, side, resets = Rig(), 1.5, []
+    for _ in range(3):
+        side = -side
+        rig.stream(off(j0=side), 6)
+        rig.until(Mode.STOPPING)
+        assert np.abs(rig.controller.velocity).max() > 0.1
+        rig.until(Mode.HOLD)
+        assert not rig.controller.velocity.any()
+        rig.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)
+        rig.tick()
+        resets.append(0)
+        while not rig.request(Request.RESET).accepted.all():
+            rig.tick()
+            resets[-1] += 1
+        assert rig.request(Request.ACTIVATE).accepted.all()
+        rig.tick(5)
+    assert resets == [resets[0]] * 3
+    assert resets[0] > 10

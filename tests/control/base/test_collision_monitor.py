@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.control.collision_monitor import MARGIN, CollisionMonitor
-from bhd_lerobot.control.drive import BaseController
+from bhd_lerobot.control.base.collision_monitor import MARGIN, new_monitors
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
@@ -86,8 +86,8 @@ def test_in_free_space_it_changes_nothing() -> None:
 def watched(n: int = 1) -> support.Rig:
     """Return bases that drive by what a test writes into the scans."""
     rig = base_rig(n)
-    monitor = CollisionMonitor(support.BODY.drive, LIDAR, n, support.HZ, BEAMS)
-    controller = BaseController(support.BODY.drive, n, support.HZ, monitor=monitor)
+    monitors = new_monitors(support.BODY.drive, LIDAR, n, support.HZ, BEAMS)
+    controller = BaseController(support.BODY.drive, n, support.HZ, monitors=monitors)
     cerebellum = support.Cerebellum(support.BODY, rig.plant, support.HZ, controller, sensors=BEAMS)
     rig.cerebellum = cerebellum
     for request in (support.Request.CONFIGURE, support.Request.ACTIVATE):
@@ -128,36 +128,45 @@ def test_without_scans_of_the_last_three_periods_it_stands_and_goes_on_with_the_
         assert rig.command[0] == pytest.approx(0.2, abs=0.005)
 
 
+def stamped(slack_ns: int = 0) -> support.Rig:
+    """Return a watched base whose readings have stamps, which may be so far off."""
+    rig = watched()
+    read, origin = rig.plant.read, 10**12
+
+    def read_with_stamps(out: Any) -> None:
+        read(out)
+        out.stamp_ns = np.array([origin + rig.now])
+
+    rig.plant.read = read_with_stamps  # type: ignore[method-assign]
+    rig.cerebellum.stamp_origin_ns = origin
+    if slack_ns:
+        rig.cerebellum.readings.accept_until(slack_ns, slack_ns)
+    return rig
+
+
+def scan_of(rig: support.Rig, late: float) -> None:
+    scan(rig, 3.0)
+    rig.cerebellum.reading.sensors_ns += rig.cerebellum.stamp_origin_ns - round(late * 1e9)
+
+
 def test_scans_that_come_too_late_or_from_the_future_are_none_of_the_present() -> None:
     for late, moves in ((0.4, True), (0.7, False), (-0.02, False), (-10.0, False)):
-        rig = watched()
-        read = rig.plant.read
-
-        def stamped(out: Any, read: Any = read, rig: support.Rig = rig) -> None:
-            read(out)
-            out.stamp_ns = np.array([10**12 + rig.now])
-
-        rig.plant.read = stamped  # type: ignore[method-assign]
-        rig.cerebellum.stamp_origin_ns = 10**12
-        for tick in range(100):
-            if tick % 20 == 0:
-                rig.cerebellum.reading.sensors[:] = 3.0
-                rig.cerebellum.reading.sensors_ns[:] = 10**12 + rig.now - round(late * 1e9)
-                rig.send(0.2)
-            rig.tick()
+        rig = stamped()
+        for _ in range(5):
+            scan_of(rig, late)
+            rig.send(0.2)
+            rig.tick(20)
         assert rig.mode == (Mode.TRACKING if late > 0 else Mode.FAULT)
         assert (rig.command[0] > 0.1) == moves
 
 
 def test_a_scan_from_the_future_does_not_take_the_place_of_one_that_grows_old() -> None:
-    monitor = CollisionMonitor(support.BODY.drive, LIDAR, 1, support.HZ, BEAMS)
-    pose, far = np.zeros((1, 3)), np.full((1, monitor.beams), 3.0)
+    rig = stamped(slack_ns=20 * support.NANOSECONDS)
     for tick in range(4 * SCAN_TICKS):
-        stamp = np.array([tick])
-        monitor.see(far, stamp, pose, np.array([-2000 if tick else 0]))
-        twist = np.array([[0.2, 0.0]])
-        limited = monitor.limit(twist, twist.copy(), pose)
-        assert (limited is None) == (tick <= 3 * SCAN_TICKS), tick
+        scan_of(rig, -10.0 if tick else 0.0)
+        rig.send(0.1)
+        rig.tick()
+        assert bool(rig.cerebellum.take_flags()[0][0] & Limit.CLEARANCE) == (tick > 3 * SCAN_TICKS), tick
 
 
 def test_beside_an_obstacle_only_what_leads_nearer_is_taken_away() -> None:
