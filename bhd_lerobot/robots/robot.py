@@ -12,6 +12,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.control.messages import Mode, Reason
@@ -73,15 +74,22 @@ class BhdRobot(Robot):
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
 
-    @property
-    @abstractmethod
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action's floats, in order."""
+    @cached_property
+    def body(self) -> Body:
+        """The robot's hardware."""
+        made: Body = self.config.body()
+        return made
 
     @property
-    @abstractmethod
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the action's floats, in order."""
+        return self.body.limits.names
+
+    @property
     def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Image shapes (height, width, 3) by camera name."""
+        cameras = self.body.cameras if self.config.camera else {}
+        return {name: (camera.height, camera.width, 3) for name, camera in cameras.items()}
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
