@@ -202,7 +202,7 @@ class RlConfig(Options):
         super().__post_init__()
         self._check_reward()
         _ = self.policy.actor()
-        check_task(self.task, self.robot.type)
+        check_task(self.task, self.robot)
         if self.validation.seed == self.seed:
             raise ConfigError(
                 f"validation.seed and seed are both {self.seed}; the policy would be evaluated on its training "
