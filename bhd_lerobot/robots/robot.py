@@ -38,7 +38,7 @@ class BhdRobot(Robot):
     on a table. Time stands still between two calls of `send_action`, so that a slow brain is not a late one. And
     `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
 
-    With ``clock = "realtime"`` the robot runs on the wall clock, in processes of its own: `send_action` returns at
+    With ``clock = "realtime"`` the robot runs on the wall clock, in a process of its own: `send_action` returns at
     once, and a robot that gets no command for too long decelerates and holds.
     """
 
