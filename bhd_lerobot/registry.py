@@ -158,9 +158,16 @@ def robot_configs() -> dict[str, type[RobotConfig]]:
     return {name: RobotConfig.get_choice_class(name) for name in ROBOTS}
 
 
-def parts_of(robot_type: str) -> Set[type]:
-    """Return the parts of a robot that can be simulated, as `Body.parts`; none if it is not known."""
-    return BODIES[robot_type]().parts.keys() if robot_type in ROBOTS else frozenset()
+def parts_of(robot: Any) -> Set[type]:
+    """Return the parts of a robot's body, as in `Body.parts`; none of a robot of another package.
+
+    Args:
+        robot: its configuration; or its type, for the parts that it has by default.
+    """
+    if not is_ours(robot_type := robot if isinstance(robot, str) else robot.type):
+        return frozenset()
+    body: Body = BODIES[robot_type]() if isinstance(robot, str) else robot.body()
+    return body.parts.keys()
 
 
 def robots_with(needs: Set[type]) -> list[str]:
@@ -176,7 +183,7 @@ def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
             f"--task.instruction='…', or another --task.type: {', '.join(name for name in TASKS if name != 'free')}."
         )
     if is_ours(robot.type):
-        check_task(task, robot.type)
+        check_task(task, robot)
         _ = robot.rates
     elif needs := needs_of_task(task):
         raise ConfigError(
@@ -186,12 +193,12 @@ def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
         )
 
 
-def check_task(task: TaskConfig, robot_type: str) -> None:
+def check_task(task: TaskConfig, robot: Any) -> None:
     """Refuse a task that needs a part that a robot does not have."""
-    if missing := needs_of_task(task) - parts_of(robot_type):
+    if missing := needs_of_task(task) - parts_of(robot):
         raise ConfigError(
             f"task.type is {task.get_choice_name(type(task))!r}, which needs {_listed(missing)}; robot.type is "
-            f"{robot_type!r}, which has none. Valid: {', '.join(robots_with(needs_of_task(task)))}."
+            f"{robot.type!r}, which has none. Valid: {', '.join(robots_with(needs_of_task(task))) or 'none'}."
         )
 
 
@@ -208,22 +215,23 @@ def check_brain(key: str, brain: BrainConfig, robot: RobotConfig) -> None:
         raise ConfigError(f"{key}: {error}") from error
     for name, part in _composed_of(brain).items():
         check_brain(f"{key}.{name}", part, robot)
-    is_trained_on = robot_type in ("", robot.type, *names_of_robot(robot))
-    if is_trained_on and not (missing := needs_of_brain(brain) - parts_of(robot.type)):
+    missing, is_robot = needs_of_brain(brain) - parts_of(robot), f"robot.type is {robot.type!r}"
+    if robot_type not in ("", robot.type, *names_of_robot(robot)):
+        problem = f"drives {with_article(robot_type)}; {is_robot}"
+    elif missing:
+        has = "which has none" if is_ours(robot.type) else "whose parts are not known"
+        problem = f"needs {_listed(missing)}; {is_robot}, {has}"
+    else:
         return
     path = getattr(brain, "path", None)
     name = f"{key}.path is {str(path)!r}" if path else f"{key}.type is {brain.get_choice_name(type(brain))!r}"
-    wanted = f"needs {_listed(missing)}" if is_trained_on else f"drives {with_article(robot_type)}"
-    has = ("which has none" if is_ours(robot.type) else "whose parts are not known") if is_trained_on else ""
-    raise ConfigError(
-        f"{name}, which {wanted}; robot.type is {robot.type!r}{', ' * is_trained_on}{has}. Brains for it: "
-        f"{', '.join(brains_for(robot.type))}."
-    )
+    raise ConfigError(f"{name}, which {problem}. Brains for it: {', '.join(brains_for(robot))}.")
 
 
-def drives(brain: BrainConfig, robot_type: str) -> bool:
-    """Return whether a brain is for a robot: it has the parts, and it is the one that it was trained on, if any."""
-    return robot_of_brain(brain) in ("", robot_type) and needs_of_brain(brain) <= parts_of(robot_type)
+def drives(brain: BrainConfig, robot: Any) -> bool:
+    """Return whether a robot, given as in `parts_of`, has the parts for a brain, and is the one it was trained on."""
+    robot_type = robot if isinstance(robot, str) else robot.type
+    return robot_of_brain(brain) in ("", robot_type) and needs_of_brain(brain) <= parts_of(robot)
 
 
 def needs_of_task(config: TaskConfig) -> Set[type]:
@@ -249,14 +257,16 @@ def _listed(parts: Set[type]) -> str:
     return " and ".join(with_article(name) for part, name in PARTS.items() if part in parts)
 
 
-def brains_for(robot_type: str) -> tuple[str, ...]:
-    """Return the names of the brains for a type of robot."""
-    return tuple(sorted(name for name, brain in BRAINS.items() if set(brain.needs) <= parts_of(robot_type)))
+def brains_for(robot: Any) -> tuple[str, ...]:
+    """Return the names of the brains for a robot, given its configuration or its type."""
+    parts = parts_of(robot)
+    return tuple(sorted(name for name, brain in BRAINS.items() if set(brain.needs) <= parts))
 
 
-def tasks_for(robot_type: str) -> tuple[str, ...]:
-    """Return the names of the tasks for a type of robot."""
-    return tuple(sorted(name for name, task in TASKS.items() if set(task.needs) <= parts_of(robot_type)))
+def tasks_for(robot: Any) -> tuple[str, ...]:
+    """Return the names of the tasks for a robot, given its configuration or its type."""
+    parts = parts_of(robot)
+    return tuple(sorted(name for name, task in TASKS.items() if set(task.needs) <= parts))
 
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:

@@ -29,9 +29,8 @@ from tests.cases import each_case
     [
         (NavigateConfig, {"tolerance_m": 2.0}),  # more than the distance to the goal
         (NavigateConfig, {"hold_s": 60.0}),  # the whole episode
-        (GapFollowerConfig, {"forward_speed": 0.3}),  # faster than the wheels
-        (NavigatorConfig, {"forward_speed": 0.3}),
-        (GapFollowerConfig, {"range_min_m": 4.0}),
+        (GapFollowerConfig, {"rim_speed": 0.2, "forward_speed": 0.3}),  # faster than the wheels
+        (NavigatorConfig, {"range_max_m": 3.5, "range_min_m": 4.0}),
         (RandomisationConfig, {"latency_s": 0.01, "latency_min_s": 0.02}),
     ],
 )

@@ -47,7 +47,7 @@ def make_settings(
     robot_type, task_type = ENVIRONMENTS[name]
     made_robot = _configuration(robot_configs()[robot_type], robot, "robot", robot_type)
     made_task = _configuration(TaskConfig.get_choice_class(task_type), task, "task", task_type)
-    check_task(made_task, robot_type)
+    check_task(made_task, made_robot)
     if made_robot.clock != "lockstep":
         raise ConfigError(
             f"robot.clock is {made_robot.clock!r}; an environment's time goes by when it is stepped: leave it "

@@ -119,6 +119,7 @@ class Parser(argparse.ArgumentParser):
         """End with status 2, the usage, and what is wrong."""
         if found := re.fullmatch(r"argument COMMAND: invalid choice: '(.*)' \(choose from (.*)\)", message):
             message = unknown_name("command", found[1], re.findall(r"[\w-]+", found[2]))
+            message += " Its content is in `bhd-data info`." * (found[1] == "timing")
         super().error(message)
 
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:

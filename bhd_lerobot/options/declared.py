@@ -45,7 +45,8 @@ class Range:
         too_low = is_kind and not (value > self.low if self._above else value >= self.low)
         if not is_kind or too_low or not (value < self.high if self._below else value <= self.high):
             number = "" if is_kind else f"a {'whole ' * (kind is int)}number, "
-            raise ConfigError(f"{key} is {value!r}; it must be {number}{self}.")
+            no_limit = ", or .inf for no limit" if kind is float and self.high == math.inf and not self._below else ""
+            raise ConfigError(f"{key} is {value!r}; it must be {number}{self}{no_limit}.")
 
 
 class OneOf:
@@ -118,7 +119,10 @@ def check_option(key: str, value: Any, kind: Any) -> None:
             check_option(f"{key}.{name}", entry, inner[1])
     elif type(None) in inner:
         for one in inner:
-            check_option(key, value, one)
+            try:
+                check_option(key, value, one)
+            except ConfigError as error:
+                raise ConfigError(f"{str(error).removesuffix('.')}; null is valid, too.") from None
 
 
 def declaration_of(config_class: type, name: str) -> str:

@@ -29,14 +29,3 @@ class SimulatedBase(BhdRobot):
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
         return observation_names(self.config)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action's floats, in order."""
-        return self.simulation_class.action_names
-
-    @property
-    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Image shapes (height, width, 3) by camera name."""
-        cameras = self.config.body().cameras if self.config.camera else {}
-        return {name: (camera.height, camera.width, 3) for name, camera in cameras.items()}

@@ -28,7 +28,7 @@ class BhdRobotConfig(RobotConfig):
     Attributes:
         fps: actions a second [Hz]; one `send_action` advances simulated time by 1 / fps. Record at the same rate.
         clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can; ``"realtime"``:
-            the wall clock, in processes of its own.
+            the wall clock, in a process of its own.
         require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
         realtime: how it runs on the wall clock.
         plant: what is driven in place of a simulated robot: ``"ros2"``, a robot of this type on a ROS 2 network; or a

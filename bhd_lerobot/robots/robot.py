@@ -12,6 +12,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
@@ -37,7 +38,7 @@ class BhdRobot(Robot):
     on a table. Time stands still between two calls of `send_action`, so that a slow brain is not a late one. And
     `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
 
-    With ``clock = "realtime"`` the robot runs on the wall clock, in processes of its own: `send_action` returns at
+    With ``clock = "realtime"`` the robot runs on the wall clock, in a process of its own: `send_action` returns at
     once, and a robot that gets no command for too long decelerates and holds.
     """
 
@@ -73,15 +74,22 @@ class BhdRobot(Robot):
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
 
-    @property
-    @abstractmethod
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action's floats, in order."""
+    @cached_property
+    def body(self) -> Body:
+        """The robot's hardware."""
+        made: Body = self.config.body()
+        return made
 
     @property
-    @abstractmethod
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the action's floats, in order."""
+        return self.body.limits.names
+
+    @property
     def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Image shapes (height, width, 3) by camera name."""
+        cameras = self.body.cameras if self.config.camera else {}
+        return {name: (camera.height, camera.width, 3) for name, camera in cameras.items()}
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:

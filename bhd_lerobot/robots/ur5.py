@@ -32,12 +32,11 @@ class UR5(BhdRobot):
 
     def __init__(self, config: UR5Config) -> None:
         super().__init__(config)
-        self._body = config.body()
         self._task: Any = None
         if config.scene == "reach":
-            self._task = ReachTask(ReachConfig(), 1, config.fps, self._body)
+            self._task = ReachTask(ReachConfig(), 1, config.fps, self.body)
         elif config.scene == "pick":
-            self._task = PickTask(PickConfig(), 1, config.fps, self._body)
+            self._task = PickTask(PickConfig(), 1, config.fps, self.body)
         self._scene: TableScene | None = None
 
     def make_scene(self) -> TableScene:
@@ -63,15 +62,9 @@ class UR5(BhdRobot):
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
-        return observation_names(self._body, tool_pose=self.config.tool_pose)
+        return observation_names(self.body, tool_pose=self.config.tool_pose)
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the action's floats, in order."""
-        return TOOL_NAMES if self.config.action_space == "tool" else self._body.limits.names
-
-    @property
-    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Image shapes (height, width, 3) by camera name."""
-        shape = (self.config.camera_height, self.config.camera_width, 3)
-        return dict.fromkeys(("scene", "wrist"), shape) if self.config.camera else {}
+        return TOOL_NAMES if self.config.action_space == "tool" else super().action_names

@@ -63,7 +63,7 @@ class UR5Simulation(ArmHost, Simulation):
             LatePlant(SimulatedPlant(world), len(body.limits.names), round(MAX_LATENCY_S * config.control_hz)),
             planning,
             world=world,
-            camera_names=("scene", "wrist") if config.camera else (),
+            camera_names=tuple(body.cameras) if config.camera else (),
         )
         self._reading = PlantReading(n, self.controller.joints)
         self._noise = np.zeros(n)

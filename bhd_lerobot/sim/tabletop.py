@@ -72,7 +72,7 @@ class Tabletop:
         self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
         self._free_values = np.add.outer(self._free, np.arange(7)).reshape(-1)
         self._target = model.body("target").id
-        self._wrist = model.camera("wrist").id
+        self._on_arm = [model.camera(name).id for name in world.body.cameras if name != "scene"]
         self._scene, self._light = model.camera("scene").id, model.light("main").id
         self._top = model.geom(TABLE_TOP).id
         self._wood = model.mat_rgba[model.geom_matid[self._top], :3].copy()
@@ -137,7 +137,8 @@ class Tabletop:
         field["cam_pos"][sim] = model.cam_pos
         field["cam_pos"][sim, self._scene] += variation.camera_shift
         field["cam_quat"][sim] = model.cam_quat
-        for camera, turn in ((self._scene, variation.camera_turn), (self._wrist, variation.wrist_turn)):
+        turns = dict.fromkeys(self._on_arm, variation.wrist_turn) | {self._scene: variation.camera_turn}
+        for camera, turn in turns.items():
             field["cam_quat"][sim, camera] = _turned(model.cam_quat[camera], turn)
         field["geom_rgba"][sim, self._top, :3] = np.clip(self._wood + variation.surface, 0.0, 1.0)
         field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]

@@ -93,7 +93,7 @@ class BhdBrain(Teleoperator):
         """The actions that it gives: those of the robot that it drives, if that is connected already."""
         names = action_names_of(self.config.brain)
         robots = connected_robots()
-        if len(robots) == 1 and drives(self.config.brain, robots[0].name):
+        if len(robots) == 1 and drives(self.config.brain, robots[0].config):
             names = robots[0].action_names
         return dict.fromkeys(names, float)
 
@@ -146,12 +146,12 @@ class BhdBrain(Teleoperator):
     def _next_action(self) -> dict[str, Any]:
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
-            if not drives(self.config.brain, robot.name):
+            if not drives(self.config.brain, robot.config):
                 is_arm = robot.host.body.arm is not None
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
-                    f"--teleop.brain.type: {', '.join(brains_for(robot.name))}.{example}"
+                    f"--teleop.brain.type: {', '.join(brains_for(robot.config))}.{example}"
                 )
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment

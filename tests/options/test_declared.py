@@ -95,7 +95,7 @@ def test_defaults_are_what_is_declared() -> None:
     [
         ("(0, inf)", "positive and finite", (1e-9, 7), (0, -1, math.inf, math.nan, True, "1")),
         ("[0, inf)", "at least 0 and finite", (0, 1), (-1e-9, math.inf)),
-        ("[1, inf]", "at least 1", (1, math.inf), (0, math.nan)),
+        ("[1, inf]", "at least 1, or .inf for no limit", (1, math.inf), (0, math.nan)),
         ("(-inf, inf)", "finite", (-1e300, 0), (math.inf, -math.inf, math.nan)),
         ("(0, 180]", "above 0 and at most 180", (0.1, 180), (0, 180.1)),
         ("[0, 1)", "from 0 to below 1", (0, 0.9), (1, -0.1)),
@@ -110,3 +110,5 @@ def test_a_range_is_its_interval(interval: str, words: str, inside: tuple[Any, .
     for value in outside:
         with pytest.raises(ConfigError, match=rf"^a\.b is {value!r}; it must be .*{words}\.$"):
             check_option("a.b", value, hint)
+    with pytest.raises(ConfigError, match="null is valid, too"):
+        check_option("a.b", outside[0], hint | None)

@@ -12,6 +12,8 @@ from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.options.plugins import load_lerobot
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.ros2.serve.bridge import BridgeConfig
+from bhd_lerobot.ros2.serve.serve import ServeConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.rl.config import RlConfig
 
@@ -53,6 +55,11 @@ def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
     assert "Its options: --task.type=TYPE --help" in text
     assert "--robot.beams" not in help_of(RecordConfig, {})
     assert "--policy.chunk_size=N" in help_of(BhdTrainConfig, {"policy.type": "act"})
+
+
+@pytest.mark.parametrize("program", [ServeConfig, BridgeConfig])
+def test_types_that_a_program_refuses_are_not_listed(program: type) -> None:
+    assert "Valid: turtlebot3, ur5. Its options" in " ".join(help_of(program, {}).split())
 
 
 def test_brains_by_name() -> None:

@@ -116,7 +116,7 @@ def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robo
     said, command = how_to_evaluate(PolicyContract(robot_type=robot.type), "c")
     assert "does not record its task" in said
     config = parse(EvalConfig, [*shlex.split(command)[1:], "--brain.type=learned"])
-    check_task(config.task, robot.type)
+    check_task(config.task, robot)
 
 
 def test_the_command_names_the_module_of_a_policy_that_nothing_else_imports() -> None:

@@ -63,8 +63,8 @@ def views_of(
     arm, drive = (body.arm, body.drive) if body else (None, None)
     if arm is not None and (joints := _joints(arm, names, observed, physics)) is not None:
         capsules = arm.chain.capsules
-        palm = next(number for number, capsule in enumerate(capsules) if capsule.name == "palm")
-        about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": palm}
+        hand = next(number for number, capsule in enumerate(capsules) if capsule.frame == len(arm.chain.joints))
+        about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": hand}
         arrays |= _arm(arm, *joints)
         if physics is not None and physics.shape[1] > _arm_state(arm):
             arrays["objects"] = _objects(arm, physics)

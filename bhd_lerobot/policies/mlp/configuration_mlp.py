@@ -76,7 +76,7 @@ class MlpConfig(TrainedConfig):
         layer_norm: normalise each hidden layer before its activation.
         dropout: share of hidden values that are dropped in training.
         feature_clip: normalised inputs beyond ± this count as this: a number that never changed in the dataset has no
-            scale; nothing turns it off.
+            scale; null turns it off.
         min_std: least standard deviation that an input or an action is divided by, in its own unit: what varies by less
             than a millimetre or a milliradian is noise, and would be blown up to the size of everything else. An input
             that stays within twice of it in the whole dataset has no influence.

@@ -1,7 +1,8 @@
 """What brains have in common that drive along free paths: parameters, inputs and the twist."""
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,37 +26,53 @@ class DrivingConfig(BrainConfig):
     """Parameters of driving along free paths.
 
     Attributes:
-        forward_speed: speed when driving straight [m/s].
-        rim_speed: highest speed of a wheel's rim, 6.885 rad/s at 0.033 m [m/s]; turning costs forward speed.
+        forward_speed: speed when driving straight [m/s]; the base's largest if not set.
+        rim_speed: highest speed of a wheel's rim [m/s], that of the base if not set; turning costs forward speed.
         turn_speed: highest yaw rate [rad/s].
         settle_s: a heading error is corrected in about this time [s].
         margin_m: room that a path leaves beside the robot, where there is any [m].
         stop_m: a path must be free for this much more than its turn, so that the robot can turn around in time [m].
         horizon_m: paths are judged up to this length [m].
-        range_min_m: a reading below this is not valid [m].
-        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
+        range_min_m: a reading below this is not valid [m]; the lidar's shortest range if not set.
+        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this, the lidar's
+            longest range if not set.
     """
 
-    forward_speed: Positive = 0.22
-    rim_speed: Positive = 0.2272
+    forward_speed: Positive | None = None
+    rim_speed: Positive | None = None
     turn_speed: Positive = 2.0
     settle_s: Positive = 0.35
     margin_m: NotNegative = 0.05
     stop_m: Share = 0.35
     horizon_m: Annotated[float, Range(f"[{PLACE_SPACING}, {LONGEST}]")] = 3.4
-    range_min_m: NotNegative = 0.12
-    range_max_m: Positive = 3.5
+    range_min_m: NotNegative | None = None
+    range_max_m: Positive | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.forward_speed > self.rim_speed:
+        if (self.forward_speed or 0.0) > (self.rim_speed or math.inf):
             raise ConfigError(
                 f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
             )
-        if self.range_min_m >= self.range_max_m:
+        if (self.range_min_m or 0.0) >= (self.range_max_m or math.inf):
             raise ConfigError(
                 f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."
             )
+
+    def of(self, drive: Drive, lidar: LidarSpec) -> Self:
+        """Return the parameters for a base: what is not set is what its body says.
+
+        Raises:
+            ConfigError: what is set does not fit that.
+        """
+        rim = self.rim_speed or round(drive.max_wheel_speed * drive.wheel_radius, 6)
+        return replace(
+            self,
+            forward_speed=self.forward_speed or min(drive.limits.velocity[0], rim),
+            rim_speed=rim,
+            range_min_m=lidar.range_min if self.range_min_m is None else self.range_min_m,
+            range_max_m=self.range_max_m or lidar.range_max,
+        )
 
 
 class DrivingBrain(ConfiguredBrain):
@@ -65,16 +82,18 @@ class DrivingBrain(ConfiguredBrain):
     has_narrow = True
     """Whether it drives through places with less room than usual, which needs a table of its own."""
     config: Any
+    bound: Any = None
+    """The parameters for the robot that it is bound to."""
     _paths: Paths
     _n: int
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist, and prepare the look-up table for this shape and this number of beams."""
-        config = self.config
         if robot.body is None or robot.body.drive is None or robot.body.lidar is None:
             raise ConfigError(
                 f"The brain {self.name!r} needs to know the shape of its robot; it drives simulated bases with a lidar."
             )
+        config = self.bound = self.config.of(robot.body.drive, robot.body.lidar)
         self._paths = make_paths(config.forward_speed, config.rim_speed, Footprint.of(robot.body))
         self._prepare(self._paths)
         self._reader = ScanReader(robot.observation_names, self.name, (config.range_min_m, config.range_max_m))
@@ -91,6 +110,10 @@ class DrivingBrain(ConfiguredBrain):
             range_max=config.range_max_m,
             has_narrow=self.has_narrow,
         )
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the type and the parameters; once it is bound, as they are for its robot."""
+        return {"type": self.name, **asdict(self.bound or self.config)}
 
     def _prepare(self, paths: Paths) -> None:
         """Compute what follows from the paths alone."""

@@ -156,7 +156,7 @@ class NavigatorBrain(DrivingBrain):
             self._scan = np.full(scan.shape, math.nan)
         new = (scan != self._scan).any(axis=1) & awake
         self._scan = scan
-        hit = self._reader.valid(scan) & (scan < self.config.range_max_m - 1e-3) & new[:, None]
+        hit = self._reader.valid(scan) & (scan < self.bound.range_max_m - 1e-3) & new[:, None]
         ranges = np.where(hit, scan, 0.0)
         # A scan is up to a frame old.
         smear = np.where(np.isfinite(rate), np.abs(rate), 1e3) * self._dt
@@ -211,7 +211,7 @@ class NavigatorBrain(DrivingBrain):
 
     def _approach(self, ranges: Array, distance: Array, bearing: Array, motion: tuple[Array, Array, Array]) -> None:
         """Where the goal is near and nothing in between, drive there straight: changes that part of the motion."""
-        config = self.config
+        config = self.bound
         ids = np.flatnonzero(distance < config.approach_m)
         if not len(ids):
             return

@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -113,9 +114,8 @@ class BaseGoals:
             x, y, yaw = self._odometry()
             cos, sin = math.cos(yaw), math.sin(yaw)
             goal = np.array([x + cos * goal[0] - sin * goal[1], y + sin * goal[0] + cos * goal[1], yaw + goal[2]])
-        config = NavigatorConfig()
-        if command.max_velocity is not None:
-            config.forward_speed = min(config.forward_speed, command.max_velocity)
+        fastest = self._host.body.need(Drive).limits.velocity[0]
+        config = NavigatorConfig(forward_speed=min(fastest, command.max_velocity or fastest))
         self._end(ResultCode.PREEMPTED, f"The goal {command.task_id!r} took its place.")
         self._brain = NavigatorBrain(config)
         self._brain.bind(self._features)

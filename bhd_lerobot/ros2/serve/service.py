@@ -5,13 +5,14 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
 from rich.console import Console
 
 from bhd_lerobot.options.declared import NotNegative, Options, Range
+from bhd_lerobot.robots.config import BhdRobotConfig
 from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.viewer.viewer import viewed
@@ -33,6 +34,8 @@ class ServiceConfig(Options):
         articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
             messages (`package.xml` and `msg/`), whose fields are found by their names.
     """
+
+    taken: ClassVar = {"robot": BhdRobotConfig}  # of all types that there are
 
     robot: RobotConfig
     network: NetworkConfig = field(default_factory=NetworkConfig)

@@ -44,7 +44,7 @@ class RlPolicyConfig(Options, prefix="policy."):
         hidden_dims: widths of the hidden layers.
         activation: one of bhd_mlp's.
         layer_norm: normalise each hidden layer before its activation.
-        feature_clip: normalised inputs beyond ± this count as this; nothing turns it off.
+        feature_clip: normalised inputs beyond ± this count as this; null turns it off.
         scan: how a range finder's beams become inputs.
         critic_dims: widths of the critic's hidden layers.
         privileged_critic: let the critic see more than the actor, which is all that a robot has: of a base how near the
@@ -84,7 +84,7 @@ class PpoConfig(Options, prefix="ppo."):
         max_grad_norm: largest norm of the gradient.
         lr: learning rate of Adam.
         lr_schedule: ``"linear"``: to 0 over `steps`, whatever time they take; ``"constant"``.
-        target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
+        target_kl: an update ends when the policy has changed by 1.5 times this; null turns it off.
         log_std_init: logarithm of the exploration noise, in normalised actions, the same for all; the mean of the
             checkpoint's own, or 0, if not set.
     """
@@ -202,7 +202,7 @@ class RlConfig(Options):
         super().__post_init__()
         self._check_reward()
         _ = self.policy.actor()
-        check_task(self.task, self.robot.type)
+        check_task(self.task, self.robot)
         if self.validation.seed == self.seed:
             raise ConfigError(
                 f"validation.seed and seed are both {self.seed}; the policy would be evaluated on its training "

@@ -48,6 +48,7 @@ REFUSALS = [
     ("mark d --episodes 0 --intervention 3..5", "FIRST-LAST"),
     ("mark d --episodes 0 --intervention 3-50", "not frames of episode 0; valid: 0 to 4"),
     ("info none", "does not exist"),
+    ("timing d", "Its content is in `bhd-data info`"),
     ("info file", "file is not a LeRobot dataset"),
     ("info folder", "has no meta/info.json"),
     ("export d --output=x --episodes=7", "no episode 7 in"),

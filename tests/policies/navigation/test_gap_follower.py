@@ -1,10 +1,13 @@
 """Laws of the gap follower: limits, symmetry, sides, memory, independence of n, and what it achieves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.differential_base import differential_base
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
@@ -163,6 +166,26 @@ def test_a_robot_that_it_cannot_drive_is_refused() -> None:
         bound(30, 1)
     with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
         GapFollowerBrain().bind(RobotFeatures(("x.vel", *names_of(90)[2:]), ACTIONS, 10, body=BURGER))
+
+
+@each_case(("asked", "speed"), [({}, 0.5), ({"forward_speed": 0.1}, 0.1), ({"rim_speed": 0.3}, 0.3)])
+def test_speeds_and_ranges_are_those_of_the_base_where_they_are_not_set(asked: dict[str, float], speed: float) -> None:
+    base = differential_base(
+        "rover", wheel_radius=0.06, wheel_separation=0.2, size=(0.24, 0.18, 0.08), mass=2.5, max_velocity=(0.5, 2.5)
+    )
+    brain = GapFollowerBrain(GapFollowerConfig(**asked))
+    body = replace(base, lidar=replace(base.lidar, range_min=0.05, range_max=8.0))
+    brain.bind(RobotFeatures(names_of(90), ACTIONS, 10, body=body))
+    brain.reset(np.arange(1), [0], 1)
+    assert brain.parameters()["forward_speed"] == speed
+    assert (brain.parameters()["range_min_m"], brain.parameters()["range_max_m"]) == (0.05, 8.0)
+    assert see(brain, np.full(90, 8.0))[0] == pytest.approx([speed, 0.0])
+
+
+def test_what_does_not_fit_the_base_is_refused() -> None:
+    for asked in ({"forward_speed": 0.3}, {"range_min_m": 4.0}):
+        with pytest.raises(ConfigError, match=rf"brain\.{next(iter(asked))} is {next(iter(asked.values()))}"):
+            bound(90, 1, GapFollowerConfig(**asked))
 
 
 def test_straight_ahead_the_table_is_plain_geometry() -> None:

@@ -1,4 +1,4 @@
-"""A base on the wall clock, in processes of its own: its life, its motion, and every way to stop it."""
+"""A base on the wall clock, in a process of its own: its life, its motion, and every way to stop it."""
 
 import os
 import threading
