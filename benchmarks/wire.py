@@ -204,18 +204,18 @@ class Stream:
 def vandalise(simulation: Any, rng: np.random.Generator) -> None:
     """Overwrite memory that other processes share, or a faulty controller would spoil, with random bytes."""
     queues, controller = simulation.cerebellum.fifo.queues, simulation.cerebellum.controller
-    what = rng.integers(6)
+    what, spoiled = rng.integers(4, size=2)
     if what == 0:
         queues["values"] = rng.integers(0, 2**63, queues["values"].shape, np.uint64).view(np.float64)
     elif what == 1:
         queues["due_ns"] = rng.integers(-(2**62), 2**62, queues["due_ns"].shape)
     elif what == 2:
         queues["waits"] = rng.random(queues["waits"].shape) < 0.5
-    elif what == 3:
-        queues["tail"], queues["head"] = rng.integers(-(2**40), 2**40, (2, len(queues)))
     else:
+        queues["tail"], queues["head"] = rng.integers(-(2**40), 2**40, (2, len(queues)))
+    if spoiled < 2:
         chosen = rng.random(simulation.n) < 0.3
-        values = (controller.command, controller.actuators)[int(what == 4)]
+        values = (controller.command, controller.actuators)[spoiled]
         values[chosen] = rng.choice([np.nan, np.inf, -1e300, 3.0, 0.0], values[chosen].shape)
 
 

@@ -62,7 +62,7 @@ class Kernel[**P, R]:
         if not self.signature:
             return numba.njit(error_model="numpy")(self.function)
         if config.DISABLE_JIT:
-            return lambda *arguments: self.function(*map(as_objects, arguments))
+            return self._plain
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
@@ -76,6 +76,10 @@ class Kernel[**P, R]:
             return numba.njit(signature, **options)(self.function)
         finally:
             config.CACHE_DIR = before
+
+    def _plain(self, *arguments: Any) -> Any:
+        python: Callable[..., Any] = self.function
+        return python(*map(as_objects, arguments))
 
     def bind(self, *bound: Any) -> Callable[..., R]:
         """Return this kernel with its first arguments, to be called with the others.
