@@ -27,6 +27,12 @@ NEVER_IN = {
     "lerobot": ("errors", "options", "bodies", "sim", "control", "realtime", "tasks"),
     "mujoco": ("options", "bodies", "control", "realtime"),
 }
+# The bodies of our two robots, and what may know them: their configurations, presets and defaults. Others ask a `Body`.
+OWN_BODIES = ("bodies.turtlebot3", "bodies.ur5")
+OF_OWN_BODIES = {
+    *("robots.config_turtlebot3", "robots.config_ur5", "ros2.messages.presets", "cli.data.import_bag"),
+    *("teleoperators.config_bhd_keyboard_base", "policies.cnn.configuration_cnn"),
+}
 # What of LeRobot is made for plug-ins; everything else moves from version to version, and only `stock` imports it.
 LEROBOT_MODULES = (
     *(
@@ -132,6 +138,16 @@ def wrong_imports(source: Path) -> list[str]:
 
 def test_every_import_follows_an_arrow() -> None:
     assert wrong_imports(SOURCE) == []
+
+
+def test_what_is_for_any_robot_knows_no_body_of_ours() -> None:
+    importers = {
+        module_name(path, SOURCE)
+        for path in SOURCE.rglob("*.py")
+        for _, name in imported_names(path, SOURCE)
+        if module_of(name.removeprefix(f"{PACKAGE}.")) in OWN_BODIES
+    }
+    assert {name for name in importers if not name.startswith("bodies.")} == OF_OWN_BODIES
 
 
 @each_case(

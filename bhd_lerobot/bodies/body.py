@@ -338,12 +338,18 @@ class GripperSpec:
     Attributes:
         joints: joint names, left then right; each moves by half the opening.
         actuator: name of the actuator; its command is the opening [m].
+        body: name of the body that palm and fingers belong to.
+        tendon: name of the tendon whose length is the opening.
+        pads: names of the geoms that hold, left then right.
         max_opening: largest opening [m].
         widest: narrow side of the widest object that it is given to grasp [m].
     """
 
     joints: tuple[str, str]
     actuator: str
+    body: str
+    tendon: str
+    pads: tuple[str, str]
     max_opening: float
     widest: float
 

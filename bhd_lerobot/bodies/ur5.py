@@ -125,7 +125,13 @@ def ur5(
                 min_manipulability=0.003,
             ),
             gripper=GripperSpec(
-                joints=("finger_left", "finger_right"), actuator="gripper", max_opening=MAX_OPENING, widest=0.076
+                joints=("finger_left", "finger_right"),
+                actuator="gripper",
+                body="gripper",
+                tendon="opening",
+                pads=("pad_left", "pad_right"),
+                max_opening=MAX_OPENING,
+                widest=0.076,
             ),
             servo_stiffness=(40_000.0, 40_000.0, 40_000.0, 8_000.0, 8_000.0, 8_000.0, 8_000.0),
             servo_damping=(800.0, 800.0, 450.0, 80.0, 80.0, 80.0, 150.0),

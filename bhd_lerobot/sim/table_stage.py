@@ -9,14 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Shape
+from bhd_lerobot.bodies.body import Arm, GripperSpec, Shape
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, SCENE_CAMERA, CameraView
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 
 TABLE_BIT, ARM_BIT, OBJECT_BIT = 1, 2, 4  # contact bits; those of the arm are in its MJCF
 HANDLE_PARTS = 3
-PADS = ("pad_left", "pad_right")
 # Absent objects float, without weight, far above the table and far from each other, where they are dropped at once from
 # the search for contacts. Below it they would touch it: a plane is solid all the way down.
 PARKED = tuple((3.0 * number, 0.0, 100.0) for number in range(MAX_OBJECTS))
@@ -41,9 +40,9 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
         axes = _towards(view.position, view.target)
         spec.worldbody.add_camera(name=name, pos=view.position, xyaxes=axes, fovy=view.fovy)
     for number in range(MAX_OBJECTS):
-        _add_object(spec, number)
+        _add_object(spec, number, arm.gripper)
     _add_target(spec)
-    _add_touch_sensors(spec, root)
+    _add_touch_sensors(spec, root, arm.gripper.body)
     for number, shape in enumerate(fixtures):
         _add_fixture(spec, root, number, shape)
     _add_start(spec, arm)
@@ -57,7 +56,7 @@ def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
         gripper = number == len(arm.chain.joints)
         actuator = spec.add_actuator(
             name=name,
-            target="opening" if gripper else arm.chain.joints[number],
+            target=arm.gripper.tendon if gripper else arm.chain.joints[number],
             trntype=mujoco.mjtTrn.mjTRN_TENDON if gripper else mujoco.mjtTrn.mjTRN_JOINT,
             forcerange=[-effort, effort],
         )
@@ -154,7 +153,7 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     spec.visual.quality.offsamples = 0
 
 
-def _add_object(spec: mujoco.MjSpec, number: int) -> None:
+def _add_object(spec: mujoco.MjSpec, number: int, gripper: GripperSpec) -> None:
     """Add a free body with one geometry to touch and some only rendered; each simulation gives them their size."""
     body = spec.worldbody.add_body(name=f"object_{number}", pos=PARKED[number], gravcomp=1.0)
     body.add_freejoint(name=f"object_{number}")
@@ -174,7 +173,7 @@ def _add_object(spec: mujoco.MjSpec, number: int) -> None:
         _visual(body, "box", (0, 0, 0), (0.001,) * 3, name=f"object_{number}_{part}", group=5)
     # Written out as pairs, the pads' friction is a property of the two that touch; and only what is gripped needs
     # friction against turning.
-    for pad in PADS:
+    for pad in gripper.pads:
         spec.add_pair(
             geomname1=pad,
             geomname2=f"object_{number}",
@@ -207,14 +206,14 @@ def _add_target(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_touch_sensors(spec: mujoco.MjSpec, root: str) -> None:
+def _add_touch_sensors(spec: mujoco.MjSpec, root: str, gripper: str) -> None:
     """Count contacts: of the whole arm with anything, the table and itself, and of the gripper with each object."""
     tree, one = mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_BODY
     pairs = [
         ("touch_any", root, None, None),
         ("touch_table", root, one, "table"),
         ("touch_self", root, tree, root),
-        *((f"touch_object_{number}", "gripper", one, f"object_{number}") for number in range(MAX_OBJECTS)),
+        *((f"touch_object_{number}", gripper, one, f"object_{number}") for number in range(MAX_OBJECTS)),
     ]
     for name, subtree, kind, other in pairs:
         reference = {} if kind is None else {"reftype": kind, "refname": other}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.engine import mujoco
-from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PADS, PARKED, TABLE_TOP
+from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PARKED, TABLE_TOP
 from bhd_lerobot.sim.world import Ids, World
 
 _TYPES = {name: int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")) for name in ("box", "capsule", "cylinder")}
@@ -62,7 +62,7 @@ class Tabletop:
             ]
             for k in range(MAX_OBJECTS)
         ]
-        self._pads = [model.geom(pad).id for pad in PADS]
+        self._pads = [model.geom(pad).id for pad in self.arm.gripper.pads]
         self._pairs = [
             [i for i in range(model.npair) if self._geoms[k][0] in (model.pair_geom1[i], model.pair_geom2[i])]
             for k in range(MAX_OBJECTS)
