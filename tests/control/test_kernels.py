@@ -15,8 +15,7 @@ import pytest
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
-from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.base.drive import read_odometry
+from bhd_lerobot.control.drive import BaseController, read_odometry
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
 from tests.control.test_wire import arm, base_rig, twist_rig
@@ -202,7 +201,7 @@ def start(cache: Path, **environment: str) -> subprocess.Popen:
     program = (
         "import numpy as np\n"
         "from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger\n"
-        "from bhd_lerobot.control.base.controller import BaseController, read_odometry\n"
+        "from bhd_lerobot.control.drive import BaseController, read_odometry\n"
         "base, odometry = BaseController(turtlebot3_burger().drive, 1, 200), np.zeros((1, 3))\n"
         "read_odometry.compiled(base.states, base.numbers, np.ones((1, 2)), odometry)\n"
         "print(odometry.tolist())\n"

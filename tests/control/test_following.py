@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Setpoint, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading
 from tests.cases import each_case

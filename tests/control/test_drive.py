@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.base.controller import BaseController, twist_from_wheels
-from bhd_lerobot.control.base.drive import integrate, limit_command, turn_wheels
+from bhd_lerobot.control.drive import BaseController, integrate, limit_command, turn_wheels, twist_from_wheels
 from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.control.plant import PlantReading

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.control.base.collision_monitor import MARGIN, new_monitors
-from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.control.collision_monitor import MARGIN, new_monitors
+from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
