@@ -324,25 +324,31 @@ class Cerebellum:
             self.states["sent_due_ns"][allowed] = np.iinfo(np.int64).min
         if request == Request.RESET:
             # A press after another latch has not been seen yet: the next tick will.
-            self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP), press)
+            latched = self.mode == Mode.ESTOP
             if np.count_nonzero(allowed):
-                self._recover(allowed)
+                known = self._recover(allowed)
+                reasons[allowed & ~known] = Reason.FAULT
+                allowed &= known
+            self.estop.acknowledge(allowed & latched, press)
         self._set_mode(allowed, result)
         if request == Request.DEACTIVATE:
             self.states["is_deactivating"] |= allowed
         self._count_refusals(reasons)
         return SendResult(reasons)
 
-    def _recover(self, mask: NDArray[np.bool_]) -> None:
-        """Leave stops of the robots' own, and take where they are now."""
+    def _recover(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Leave stops of the robots' own, and take where they are now; return of which robots that is known."""
         moved = self.plant.recover()
         self._read_anew(mask)
+        known: NDArray[np.bool_] = np.isfinite(self.states["near"][:, 0])
+        mask = mask & known
         self._configure(mask & ~self.states["is_configured"])
         if moved:
             # It stopped elsewhere than the reference came to rest: to go there would be a jump.
             ids = np.flatnonzero(mask)
             self.controller.resume(ids, self.reading)
             self._start_writing(ids)
+        return known
 
     def _read_anew(self, mask: NDArray[np.bool_]) -> None:
         """Take where robots are now, wherever they were before; `mask` has shape (n,)."""

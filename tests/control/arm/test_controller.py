@@ -432,3 +432,18 @@ def test_a_stop_is_not_over_before_the_arm_is_at_rest_however_often_it_stops() -
         rig.tick(5)
     assert resets == [resets[0]] * 3
     assert resets[0] > 10
+
+
+def test_an_arm_is_not_reset_before_it_is_known_where_it_is() -> None:
+    rig = Rig(active=False)
+    rig.plant.lie[0] = np.nan
+    rig.tick(50)
+    assert rig.mode == Mode.FAULT
+    for _ in range(3):
+        assert rig.request(Request.RESET).reasons.tolist() == [Reason.FAULT]
+        rig.tick()
+    rig.plant.lie.clear()
+    for request in (Request.RESET, Request.ACTIVATE):
+        assert rig.request(request).accepted.all()
+    rig.tick(5)
+    np.testing.assert_allclose(rig.plant.written, np.tile(HOME, (5, 1, 1)), atol=1e-9)
