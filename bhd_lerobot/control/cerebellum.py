@@ -85,6 +85,14 @@ class Cerebellum:
         self.written: NDArray[np.float64] = states["written"][:, : controller.joints]
         self._rate: NDArray[np.float64] = states["written_rate"][:, : controller.joints]
         self._actuators: NDArray[np.float64] = states["actuators"][:, : controller.joints]
+        # Fields that every tick uses: an index costs as much as a write.
+        self._entered, self._has_setpoint, self._goes_back, self._is_distrusted, self._mode_is_new = (
+            states[name] for name in ("entered", "has_setpoint", "goes_back", "is_distrusted", "mode_is_new")
+        )
+        self._busy, self._follows_goal, self._protective_stop, self._stamp_ns, self._has_stamps = (
+            *(states[name] for name in ("busy", "follows_goal", "protective_stop", "stamp_ns")),
+            numbers["has_stamps"],
+        )
         self.reading = PlantReading(n, self.controller.joints, sensors, states)
         self.readings = ReadingCheck(body, control_hz, states, numbers)
         wire = WireLimits.of(body, control_hz, plant.takes)
@@ -161,28 +169,27 @@ class Cerebellum:
             self._run(now_ns)
         else:
             self._run_controller(self.controller, now_ns)
-        if np.count_nonzero(self.states["mode_is_new"]):
-            self.states["mode_is_new"] = False
+        if np.count_nonzero(self._mode_is_new):
+            self._mode_is_new[:] = False
             self.plant.set_mode(self.mode)
         if self._may_write:
             self.plant.write(self.written)
 
     def _read(self) -> None:
-        reading, states = self.reading, self.states
+        reading = self.reading
         self.plant.read(reading)
-        states["stamp_ns"] = self._now_ns if reading.stamp_ns is None else reading.stamp_ns
-        self.numbers["has_stamps"] = reading.stamp_ns is not None
+        self._stamp_ns[:] = self._now_ns if reading.stamp_ns is None else reading.stamp_ns
+        self._has_stamps[0] = reading.stamp_ns is not None
 
     def _run_controller(self, controller: Any, now_ns: int) -> None:
         """Run a tick with a controller that is no part of the compiled one."""
-        states = self.states
-        if np.count_nonzero((self.mode == Mode.TRACKING) | (self.mode == Mode.STOPPING)):  # a stop may begin
-            states["is_at_rest"] = controller.at_rest()
+        if np.count_nonzero(self.mode == _STOPPING):
+            self.states["is_at_rest"] = controller.at_rest()
         self._begin(now_ns)
         self._tell_controller()
         controller.run(self.reading)
-        self._actuators[:], states["busy"] = controller.actuators, controller.busy
-        states["protective_stop"], states["follows_goal"] = controller.protective_stop, controller.following
+        self._actuators[:], self._busy[:] = controller.actuators, controller.busy
+        self._protective_stop[:], self._follows_goal[:] = controller.protective_stop, controller.following
         self._end()
         self._tell_controller()
 
@@ -191,8 +198,7 @@ class Cerebellum:
         if self._is_compiled:
             return
         controller: Any = self.controller
-        states = self.states
-        goes_back, entered, has_setpoint = states["goes_back"], states["entered"], states["has_setpoint"]
+        goes_back, entered, has_setpoint = self._goes_back, self._entered, self._has_setpoint
         if np.count_nonzero(goes_back):
             controller.go_back(goes_back.copy(), self.written, self._rate)
             goes_back[:] = False
@@ -202,9 +208,9 @@ class Cerebellum:
                 if np.count_nonzero(mask):
                     controller.stop(mask, mode)
             entered[:] = 0
-        if np.count_nonzero(states["is_distrusted"]):
-            controller.distrust(states["is_distrusted"].copy())
-            states["is_distrusted"] = False
+        if np.count_nonzero(self._is_distrusted):
+            controller.distrust(self._is_distrusted.copy())
+            self._is_distrusted[:] = False
         if np.count_nonzero(has_setpoint):
             mask = has_setpoint.copy()
             has_setpoint[:] = False
@@ -462,6 +468,7 @@ class Cerebellum:
         self.written[ids], self._rate[ids] = self.controller.actuators[ids], 0.0
 
 
+_STOPPING = int(Mode.STOPPING)  # numpy compares plain numbers faster
 _ENTERED = (Mode.STOPPING, Mode.INACTIVE, Mode.HOLD, Mode.SAFE_OFF, Mode.ESTOP, Mode.FAULT)
 _MODE_REASON = np.array([mode_reason(mode) for mode in Mode], np.int8)
 _GOAL_REFUSAL = {

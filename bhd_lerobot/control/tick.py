@@ -86,6 +86,7 @@ def end_tick(state: Any, limits: Any) -> None:
 def set_mode(state: Any, mode: int) -> None:
     """Enter a mode; the controller learns of it before it runs next."""
     state.mode, state.mode_is_new, state.is_deactivating = mode, True, False
+    state.is_at_rest = False  # of a robot that a stop has just begun for it is known in the next tick
     if mode != _TRACKING:
         state.entered |= 1 << mode
 
