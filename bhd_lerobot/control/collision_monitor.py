@@ -202,14 +202,14 @@ def approach(state: Any, monitor: Any, number: int) -> tuple[float, float, float
     for one in range(monitor.rectangles):
         off_x = ahead - clamp(ahead, monitor.outline[one, 0], monitor.outline[one, 1])
         off_y = left - clamp(left, -monitor.outline[one, 2], monitor.outline[one, 2])
-        apart = math.hypot(off_x, off_y)
+        apart = math.sqrt(off_x * off_x + off_y * off_y)  # numba's hypot has other last digits than Python's
         if apart < distance:
             distance, to_x, to_y = apart, off_x, off_y
     if distance < 1e-6:  # inside there is no direction out of it: away from the middle
         to_x, to_y = ahead, left
-    length = max(math.hypot(to_x, to_y), 1e-6)
+    length = max(math.sqrt(to_x * to_x + to_y * to_y), 1e-6)
     to_x, to_y = to_x / length, to_y / length
     way = 0.0 if monitor.is_too_near[number] else max(distance - MARGIN, 0.0)
     # The largest v with v * delay + v^2 / (2 deceleration) = way.
     slope = monitor.deceleration * _DELAY_S
-    return to_x, to_y * ahead - to_x * left, math.sqrt(slope**2 + 2.0 * monitor.deceleration * way) - slope
+    return to_x, to_y * ahead - to_x * left, math.sqrt(slope * slope + 2.0 * monitor.deceleration * way) - slope
