@@ -27,6 +27,7 @@ from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 from bhd_lerobot.control.record import new_states, put
 from bhd_lerobot.control.tick import begin_all, drop_all, end_all, judge_all, tick_all
+from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
 
@@ -93,6 +94,10 @@ class Cerebellum:
             *(states[name] for name in ("busy", "follows_goal", "protective_stop", "stamp_ns")),
             numbers["has_stamps"],
         )
+        if controller.is_compiled:
+            needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
+            if sensors < needed:  # compiled code would read beyond them
+                raise ConfigError(f"The controller of {body.name!r} takes {needed} sensors; the plant reads {sensors}.")
         self.reading = PlantReading(n, self.controller.joints, sensors, states)
         self.readings = ReadingCheck(body, control_hz, states, numbers)
         wire = WireLimits.of(body, control_hz, plant.takes)

@@ -111,15 +111,16 @@ def keep_clear(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64
     monitor.age += 1
     if stamp_ns != monitor.seen_ns:
         see(state, limits, monitor, ranges, stamp_ns)
+    cos, sin = math.cos(state.odometry[2]), math.sin(state.odometry[2])
     up, down, turn_up, turn_down = np.inf, np.inf, np.inf, np.inf
     for number in range(monitor.count):
-        _, lever, speed = approach(state, monitor, number)
+        _, lever, speed = approach(state, monitor, number, cos, sin)
         turn_up = min(turn_up, speed / max(lever, _NEVER))
         turn_down = min(turn_down, speed / max(-lever, _NEVER))
     # Turning comes first: it is what avoids an obstacle. What it leaves is for driving.
     yaw_rate = clamp(state.command[1], -turn_down, turn_up)
     for number in range(monitor.count):
-        ahead, lever, speed = approach(state, monitor, number)
+        ahead, lever, speed = approach(state, monitor, number, cos, sin)
         speed = max(speed - lever * yaw_rate, 0.0)
         up, down = min(up, speed / max(ahead, _NEVER)), min(down, speed / max(-ahead, _NEVER))
     if monitor.age > monitor.oldest_ticks:
@@ -188,28 +189,30 @@ def see(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stam
 
 
 @kernel()
-def approach(state: Any, monitor: Any, number: int) -> tuple[float, float, float]:
+def approach(state: Any, monitor: Any, number: int, cos: float, sin: float) -> tuple[float, float, float]:
     """Return how a return comes nearer to the outline, and how fast it may.
+
+    Args:
+        cos: of the yaw; `sin` likewise.
 
     Returns:
         By how much it comes nearer for each metre that is driven, and for each radian that is turned [m]; and the
         largest speed at which it may [m/s].
     """
-    cos, sin = math.cos(state.odometry[2]), math.sin(state.odometry[2])
     dx, dy = monitor.points[number, 0] - state.odometry[0], monitor.points[number, 1] - state.odometry[1]
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     distance, to_x, to_y = np.inf, 0.0, 0.0  # from the nearest point of the outline
     for one in range(monitor.rectangles):
         off_x = ahead - clamp(ahead, monitor.outline[one, 0], monitor.outline[one, 1])
         off_y = left - clamp(left, -monitor.outline[one, 2], monitor.outline[one, 2])
-        apart = math.hypot(off_x, off_y)
+        apart = math.sqrt(off_x * off_x + off_y * off_y)  # numba's hypot has other last digits than Python's
         if apart < distance:
             distance, to_x, to_y = apart, off_x, off_y
     if distance < 1e-6:  # inside there is no direction out of it: away from the middle
         to_x, to_y = ahead, left
-    length = max(math.hypot(to_x, to_y), 1e-6)
+    length = max(math.sqrt(to_x * to_x + to_y * to_y), 1e-6)
     to_x, to_y = to_x / length, to_y / length
     way = 0.0 if monitor.is_too_near[number] else max(distance - MARGIN, 0.0)
     # The largest v with v * delay + v^2 / (2 deceleration) = way.
     slope = monitor.deceleration * _DELAY_S
-    return to_x, to_y * ahead - to_x * left, math.sqrt(slope**2 + 2.0 * monitor.deceleration * way) - slope
+    return to_x, to_y * ahead - to_x * left, math.sqrt(slope * slope + 2.0 * monitor.deceleration * way) - slope

@@ -346,3 +346,10 @@ def test_a_state_is_a_copy() -> None:
         np.testing.assert_array_equal(getattr(state, name), value)
     state.command[:] = 9.0
     assert rig.command == [0, 0]
+
+
+def test_a_controller_gets_all_sensors_that_it_takes() -> None:
+    controller = BaseController(BODY.drive, 1, HZ, gyro=3)
+    for sensors in (0, 3):
+        with pytest.raises(ConfigError, match=f"takes 4 sensors; the plant reads {sensors}"):
+            Cerebellum(BODY, PerfectPlant(), HZ, controller, sensors=sensors)
