@@ -158,7 +158,7 @@ class Cerebellum:
     @property
     def setpoints_taken(self) -> int:
         """How many setpoints have been taken."""
-        return int(self.states["setpoints_taken"].sum())
+        return sum(self.states["setpoints_taken"].tolist())
 
     # --- one tick ----------------------------------------------------------------------------------------------------
 
@@ -412,10 +412,10 @@ class Cerebellum:
 
     def command_age_of(self, sim: int, now_ns: int) -> int:
         """Return `command_age_ns` of one simulation [ns]."""
-        state = self.states[sim]
-        if state["mode"] != Mode.TRACKING or state["by_goal"]:
+        states = self.states
+        if self.mode[sim] != _TRACKING or states["by_goal"][sim]:
             return 0
-        return now_ns - int(state["due_ns"])
+        return now_ns - int(states["due_ns"][sim])
 
     def state(self, now_ns: int) -> CerebellumState:
         """Return a copy of the present state."""
@@ -473,7 +473,7 @@ class Cerebellum:
         self.written[ids], self._rate[ids] = self.controller.actuators[ids], 0.0
 
 
-_STOPPING = int(Mode.STOPPING)  # numpy compares plain numbers faster
+_TRACKING, _STOPPING = int(Mode.TRACKING), int(Mode.STOPPING)  # numpy compares plain numbers faster
 _ENTERED = (Mode.STOPPING, Mode.INACTIVE, Mode.HOLD, Mode.SAFE_OFF, Mode.ESTOP, Mode.FAULT)
 _MODE_REASON = np.array([mode_reason(mode) for mode in Mode], np.int8)
 _GOAL_REFUSAL = {

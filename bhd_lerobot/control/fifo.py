@@ -49,7 +49,8 @@ class CommandFifo:
 
     def __len__(self) -> int:
         """Return the number of entries in use of the fullest queue: those that wait, and those between them."""
-        return int(np.clip(self._head - self._tail, 0, self.capacity).max())
+        most = max(head - tail for head, tail in zip(self._head.tolist(), self._tail.tolist(), strict=True))
+        return min(max(most, 0), self.capacity)
 
     @property
     def pushed(self) -> int:
