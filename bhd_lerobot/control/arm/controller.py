@@ -191,13 +191,13 @@ class ArmController(SteppedController):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             self._stopped &= ~mask
-            self._rest_ticks *= self._stopped
             self._relief.restart(mask)
             self._wrong &= ~mask[:, None]
             self._driven[mask] = cause == Mode.HOLD
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
+            self._rest_ticks[mask & ~self._stopped] = 0
             self._stopped |= mask
             mask = mask & ~self._yields  # they stop already, and goals have ended
         self._leave_setpoints(mask)
@@ -268,9 +268,9 @@ class ArmController(SteppedController):
 
     def _give_way(self, reading: PlantReading) -> None:
         """Let go of what stopped arms press on, once they have come to rest."""
-        self._rest_ticks += 1
-        self._rest_ticks *= self._stopped & ~self._yields & ~self.goals.following
-        settled = self._rest_ticks > self._settled_ticks
+        self._rest_ticks += self._stopped
+        self._rest_ticks *= ~self._stopped | ~(self._yields | self.goals.following)
+        settled = self._stopped & (self._rest_ticks > self._settled_ticks)
         position, force = reading.position[:, : self.width - 1], self.force
         if force is None:
             none = np.zeros(len(settled), np.bool_)
@@ -286,7 +286,7 @@ class ArmController(SteppedController):
             sensed = Sensed(self._where(reading), force.torque, force.pressing, measured, doubtful)
         known = settled & (sensed.measured | ~self._blind)
         self._blind[:] = False
-        self._relief.run(self._rest_ticks > 0, known, sensed, self.command, self.velocity)
+        self._relief.run(self._stopped & (self._rest_ticks > 0), known, sensed, self.command, self.velocity)
 
     def _watch(self, reading: PlantReading) -> None:
         """Find arms that do not go where they are commanded to, and stop pressing on with them.
@@ -338,6 +338,7 @@ class ArmController(SteppedController):
         self.protective_stop[mask] = int(cause)
         self._any_stopped, self._cause = True, message
         self._off_ticks[mask] = 0
+        self._rest_ticks[mask & ~self._stopped] = 0
         self._stopped |= mask
         self._leave_setpoints(mask)
         if follows:
