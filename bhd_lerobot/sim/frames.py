@@ -223,8 +223,9 @@ class Frames:
         for name, values in efforts.numbers(servos).items():
             row[name][:k] = values
         self._layout = layout
-        self._models: list[mujoco.MjModel] = []
-        self._seen: dict[str, NDArray] = {}
+        self._models: list[mujoco.MjModel | None] = [None] * world.n
+        self._seen: list[bytes] = []  # the fields that they were made with, and of each simulation
+        self._rows: list[bytes | None] = [None] * world.n
         self._threads: list[_Thread] = []
         self._pool: ThreadPoolExecutor | None = None
         self._addresses = np.zeros(world.n, np.int64)
@@ -276,18 +277,17 @@ class Frames:
 
     def _take_models(self) -> None:
         """Make the simulations' models again if their fields have changed."""
-        fields, seen = self._world.fields, self._seen
-        if self._models and len(fields) == len(seen) and all((fields[key] == seen[key]).all() for key in fields):
+        fields = self._world.fields
+        seen = [field.tobytes() for field in fields.values()]
+        if seen == self._seen and self._models[0] is not None:
             return
-        every = not self._models or len(fields) != len(seen)
-        for sim in range(self._world.n):
-            if every or any((fields[key][sim] != seen[key][sim]).any() for key in fields):
-                if not self._models or len(self._models) <= sim:
-                    self._models.append(self._world.copy_model(sim))
-                else:
-                    self._world.copy_model(sim, self._models[sim])
-                self._addresses[sim] = self._models[sim]._address
-        self._seen = {key: field.copy() for key, field in fields.items()}
+        self._seen = seen
+        rows = [b"".join(field[sim].tobytes() for field in fields.values()) for sim in range(self._world.n)]
+        for sim, row in enumerate(rows):
+            if row == self._rows[sim]:
+                continue
+            model = self._models[sim] = self._world.copy_model(sim, self._models[sim])
+            self._addresses[sim], self._rows[sim] = model._address, row
 
     def close(self) -> None:
         """End the threads. May be called twice."""

@@ -168,6 +168,7 @@ class World:
             for name in _POOL_FIELDS:
                 self.model_field(name)
         self._all = np.arange(n)
+        self._offsets: dict[str, NDArray[np.float64]] = {}  # of sites that rays start from, in the root body's frame
         self.reset()
 
     # --- state -------------------------------------------------------------------------------------------------------
@@ -427,7 +428,9 @@ class World:
         """
         self._need_base("A ray from the root body")
         ids = self.selected(ids)
-        origin, heading = rays_in_world(self.qpos[ids], self._site_in_root(site), directions)
+        if site not in self._offsets:
+            self._offsets[site] = self._site_in_root(site)
+        origin, heading = rays_in_world(self.qpos[ids], self._offsets[site], directions)
         distance, _ = self._batch.ray(origin, heading, geomgroup=_SCENE_GROUPS, bodyexclude=self._root, ids=ids)
         return np.where(distance < 0, np.inf, distance), ids
 

@@ -1,0 +1,126 @@
+"""Frames in machine code: the bits of ticks and steps in turns, whatever happens between and within them."""
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.control import kernels
+from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.sim import frames
+from tests.cases import each_case
+
+FRAMES = 30
+
+
+@pytest.fixture
+def compiled() -> Iterator[None]:
+    """Compile frames at once."""
+    before = kernels._values
+    kernels.compile_at_once()
+    yield
+    kernels._values = before
+
+
+def make(n: int, threads: int | None = None, **options: Any) -> BaseSimulation:
+    config = TurtleBot3Config(beams=90, odometry=True, **options)
+    simulation = BaseSimulation(config, n, threads)
+    arenas = [make_arena("random", sim, robot_radius=0.105) for sim in range(n)]
+    simulation.reset(np.arange(n), arenas, list(range(n)))
+    return simulation
+
+
+def run(n: int, threads: int | None = None, **options: Any) -> NDArray[np.float64]:
+    """Return everything that is observed, reported and true of bases that run into things, stop, and go on."""
+    simulation, rng, rows = make(n, threads, **options), np.random.default_rng(0), []
+    friction = simulation.world.model_field("geom_friction")
+    for frame in range(FRAMES):
+        if frame == 8:
+            simulation.estop()
+        if frame == 12:
+            simulation.bridge.reset()
+            simulation.bridge.activate()
+        if frame == 16:
+            friction[:, :, 0] *= 0.3  # written to between two frames: it counts from the next step on
+        if frame == 20 and n > 1:
+            simulation.stop(np.array([1]))
+        if frame == 24 and n > 1:
+            simulation.reset(np.array([1]), [make_arena("random", 9, robot_radius=0.105)], [9])
+        report = simulation.step(rng.uniform(-1, 1, (n, 2)) * (0.3, 3.0))
+        seen, pose = simulation.observe(), simulation.truth()
+        flags = np.stack([report.limits, report.watchdog, report.mode, seen.age_ns, pose.touched], axis=1)
+        efforts = report.columns["control.effort"]
+        every = np.concatenate([seen.state, report.applied, flags, efforts, simulation.physics_state], axis=1)
+        rows.append(np.where(simulation.running[:, None], every, 0.0))  # of robots that were left alone nothing is said
+    simulation.close()
+    return np.array(rows)
+
+
+@pytest.mark.usefixtures("compiled")
+@each_case(
+    "options",
+    [{}, {"imu": True, "collision_monitor": True}, {"physics_hz": 600}, {"physics_hz": 100, "control_hz": 50}],
+)
+@pytest.mark.parametrize(("n", "threads"), [(1, None), (5, 1), (5, 3)])
+def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], n: int, threads: int | None
+) -> None:
+    if options.get("physics_hz") == 100:
+        monkeypatch.setattr("bhd_lerobot.bodies.body.Body.check_rates", lambda *_, **__: None)
+    calls = []
+    real = frames._Thread.run
+    monkeypatch.setattr(frames._Thread, "run", lambda *arguments: (calls.append(1), real(*arguments))[1])
+    fast = run(n, threads, **options)
+    assert calls
+    with kernels.never_compiled():
+        calls.clear()
+        plain = run(n, threads, **options)
+        assert not calls
+    np.testing.assert_array_equal(fast, plain)
+
+
+@pytest.mark.usefixtures("compiled")
+def test_physics_that_diverges_is_found() -> None:
+    simulation = make(3)
+    simulation.world.qvel[1, 0] = 1e300
+    with pytest.raises(SimulationError, match=r"simulation\(s\) \[1\] diverged"):
+        simulation.step(np.zeros((3, 2)))
+    simulation.close()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_plant_that_is_put_in_between_sees_every_write() -> None:
+    simulation = make(1)
+
+    class Between:
+        def __init__(self, plant: Any) -> None:
+            self.plant, self.writes = plant, 0
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.plant, name)
+
+        def write(self, ctrl: NDArray[np.float64]) -> None:
+            self.writes += 1
+            self.plant.write(ctrl)
+
+    simulation.cerebellum.plant = between = Between(simulation.plant)  # type: ignore[assignment]
+    simulation.step(np.zeros((1, 2)))
+    assert between.writes == simulation.rates.ticks_per_frame
+    simulation.close()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_closing_ends_the_threads() -> None:
+    before = threading.active_count()
+    simulation = make(4, 3)
+    simulation.step(np.zeros((4, 2)))
+    assert threading.active_count() > before
+    simulation.close()
+    simulation.close()
+    assert threading.active_count() <= before
