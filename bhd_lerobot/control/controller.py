@@ -1,4 +1,4 @@
-"""What stands between a command and the actuators, for one kind of robot; the modes are the cerebellum's."""
+"""What stands between a command and the actuators; the modes are the cerebellum's."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar

@@ -82,7 +82,7 @@ class Host(ABC):
         """Image shapes (height, width, channels) [px] of the cameras that are observed, by name."""
         return dict.fromkeys(self.camera_names, (self.config.camera_height, self.config.camera_width, 3))
 
-    # --- what a kind of robot defines --------------------------------------------------------------------------------
+    # --- what a subclass defines -------------------------------------------------------------------------------------
 
     @abstractmethod
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -56,7 +56,7 @@ class Simulation(Host):
         self._camera: Camera | None = None
         self._render_thread: RenderThread | None = None
 
-    # --- what a kind of robot defines --------------------------------------------------------------------------------
+    # --- what a subclass defines -------------------------------------------------------------------------------------
 
     @abstractmethod
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
