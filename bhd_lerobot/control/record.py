@@ -38,7 +38,6 @@ STATE = record(
         ("last", *_vector),
         ("read_ns", _i),
         ("elapsed_ns", _i),
-        ("beyond", *_vector),
         ("seen_position", *_vector),
         ("seen_velocity", *_vector),
         ("seen_ns", _i),
