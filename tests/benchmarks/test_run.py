@@ -34,7 +34,7 @@ SHORT = {
     "ros2": "--rounds=1 --seconds=1",
     "ros2_record": "--rounds=1 --seconds=2",
     "sight": "--rounds=1 --seconds=0.2",
-    "wire": "--streams=7 --frames=2 --n=1",
+    "wire": "--streams=7 --frames=2",
 }
 # A minute or more each, because they start several interpreters, each of which imports PyTorch and LeRobot.
 SLOW = {"cluster", "robots", "ros2", "ros2_record"}
