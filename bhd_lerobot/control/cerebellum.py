@@ -25,7 +25,7 @@ from bhd_lerobot.control.messages import (
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
-from bhd_lerobot.control.record import new_states, put
+from bhd_lerobot.control.record import JOINTS, new_states, put
 from bhd_lerobot.control.tick import begin_all, drop_all, end_all, judge_all, tick_all
 from bhd_lerobot.errors import ConfigError
 
@@ -79,6 +79,11 @@ class Cerebellum:
         self.controller = controller
         self.width = width = self.controller.width
         self.command = self.controller.command
+        if max(width, controller.joints) > JOINTS:
+            raise ConfigError(
+                f"The body {body.name!r} has {controller.joints} joints and commands of {width} values; a robot's "
+                f"record holds {JOINTS} of each. Control it as two robots."
+            )
         self.states, self.numbers = states, numbers = controller.states, controller.numbers
         self.mode: NDArray[np.int8] = states["mode"]
         self.refusals: NDArray[np.int64] = states["refusals"].T

@@ -62,7 +62,7 @@ def drive(state: Any, limits: Any, monitor: Any, sensors: Array, sensors_ns: int
 
 
 @kernel()
-def drives_not(state: Any) -> bool:
+def is_base_at_rest(state: Any) -> bool:
     """Return whether a base is commanded to be at rest."""
     return abs(state.command[0]) < _REST and abs(state.command[1]) < _REST
 

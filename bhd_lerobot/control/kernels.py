@@ -1,6 +1,6 @@
 """Loops over simulations in plain scalar Python, and the machine code that numba makes of them once it is worth it.
 
-To load numba and its code takes as long as some 20,000 ticks of a base, or 6,000 of an arm, in Python: what is short
+To load numba and its code takes as long as some 5,000 ticks in Python: what is short
 runs as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
 """
 
@@ -14,12 +14,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, cached_property, partial, update_wrapper
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 _values: float = 40_000  # that a loop handles in Python, until it is compiled
+_LOCK = RLock()  # numba's cache folder is set for the whole process
 _RECORD_VALUES = 8  # that a record counts for
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
 _CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
@@ -63,6 +65,10 @@ class Kernel[**P, R]:
             return numba.njit(error_model="numpy")(self.function)
         if config.DISABLE_JIT:
             return self._plain
+        with _LOCK:
+            return self._compile(numba, config)
+
+    def _compile(self, numba: Any, config: Any) -> Callable[..., R]:
         folder = _folder()
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
@@ -209,7 +215,7 @@ def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, 
 
 @cache
 def _announce() -> None:
-    print("Compiling the control loop for this processor: some seconds, once", file=sys.stderr)
+    print("Compiling the control loop for this processor: up to half a minute, once", file=sys.stderr)
 
 
 @cache
@@ -219,6 +225,7 @@ def _folder() -> Path | None:
 
     code = hashlib.sha256(f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}".encode())
     code.update(_CODE)
+    code.update(os.environ.get("NUMBA_BOUNDSCHECK", "").encode())
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = root / "bhd_lerobot" / "kernels" / code.hexdigest()[:16]

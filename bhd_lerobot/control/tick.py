@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.drive import drive, drive_back, drives_not
+from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
@@ -109,7 +109,7 @@ def supervise(  # noqa: PLR0917
         # What a brain left behind that fell silent moves nothing later.
         state.refusals[_STALE] += drop(state, queue, _LEAST, _MOST)
         set_mode(state, _STOPPING)
-    if state.mode == _STOPPING and (drives_not(state) if limits.is_drive else state.is_at_rest):
+    if state.mode == _STOPPING and (is_base_at_rest(state) if limits.is_drive else state.is_at_rest):
         set_mode(state, _SAFE_OFF if state.is_deactivating else _HOLD)
 
 

@@ -59,6 +59,9 @@ class BaseSimulation(BaseHost, Simulation):
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
+        # What a subclass does after steps and ticks is Python.
+        hooks = ("advance", "_after_step", "_after_tick")
+        self._is_plain = all(getattr(type(self), hook) is getattr(BaseSimulation, hook) for hook in hooks)
         self._frames = Frames(
             world,
             self.cerebellum,
@@ -142,7 +145,7 @@ class BaseSimulation(BaseHost, Simulation):
     def run_ticks(self, number: int, most: int) -> int:
         """Run ticks up to the next scan, see `LockstepBridge`."""
         ticks = max(1, min(most, self._next_scan - self.tick))
-        if not self._frames.run(self._active, number, ticks):
+        if not self._is_plain or not self._frames.run(self._active, number, ticks):
             return 0
         self.tick += ticks
         self._after_tick()

@@ -31,6 +31,7 @@ class MeanEfforts:
         self._reported = bind("qfrc_actuator")
         self.mean: Array = self._reported.copy()
         self._servos = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        self._actuators = int(model.nu)
         joints = model.actuator_trnid[self._servos, 0]
         self._dofs = model.jnt_dofadr[joints]
         self._gear = model.actuator_gear[self._servos, 0]
@@ -40,6 +41,10 @@ class MeanEfforts:
         # Before version 4 MuJoCo damps also where the joint's own limit, and not the servo's, cuts the torque off.
         counts = model.jnt_actfrclimited[joints] & (mujoco.mj_version() >= 4_000_000)
         self._most_torque = np.where(counts, model.jnt_actfrcrange[joints, 1], np.inf)
+
+    def are_all(self, actuators: Sequence[int]) -> bool:
+        """Return whether these actuators of the model, by their numbers, are all that it has, and act on joints."""
+        return np.array_equal(self._servos, actuators) and len(actuators) == self._actuators
 
     def numbers(self, actuators: Sequence[int]) -> dict[str, Array]:
         """Return gear, damping, largest force and largest torque of some servos by their numbers in the model."""

@@ -4,10 +4,13 @@ The results are those of `Cerebellum.tick` and `World.step` in turns, bit for bi
 """
 
 import ctypes
+import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -65,19 +68,18 @@ _get_state: Any = _missing
 _copy: Any = _missing
 
 
+@cache
 def _load() -> bool:
     """Find the C library's functions; return whether there are any that machine code can call."""
     global _step, _set_state, _get_state, _copy
-    if _step is not _missing:
-        return True
-    ending = {"darwin": "libmujoco.*.dylib", "win32": "mujoco.dll"}.get(sys.platform, "libmujoco.so.*")
-    files = sorted(Path(mujoco.__file__).parent.glob(ending))
-    if not files:
+    ending = f"{mujoco.__version__}.dylib" if sys.platform == "darwin" else f"so.{mujoco.__version__}"
+    file = Path(mujoco.__file__).parent / f"libmujoco.{ending}"
+    if not file.exists():
         return False
     from llvmlite import binding
     from numba import types
 
-    library, libc = ctypes.CDLL(str(files[0])), ctypes.CDLL(None)
+    library, libc = ctypes.CDLL(str(file)), ctypes.CDLL(None)
     address, number, nothing = types.intp, types.int32, types.void
     functions = {
         "mj_step": (library, nothing(address, address)),
@@ -97,7 +99,7 @@ def _load() -> bool:
 @kernel(
     "void(i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], "
     "i4[:,:,:], state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], b1[:], f8[:,:], "
-    "layout[::1], i8, i8)"
+    "layout[::1], i8, i8, i4)"
 )
 def run_frames(  # noqa: PLR0912, PLR0917
     ids: Counts,
@@ -126,6 +128,7 @@ def run_frames(  # noqa: PLR0912, PLR0917
     layouts: Any,
     first_tick: int,
     ticks: int,
+    spec: int,
 ) -> None:
     """Let some ticks of some simulations go by, one simulation after the other.
 
@@ -138,12 +141,13 @@ def run_frames(  # noqa: PLR0912, PLR0917
         touched: becomes True where the scene was touched.
         efforts: mean efforts of the last tick, shape (n, nv).
         first_tick: number of the first tick.
+        spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
     """
     layout = layouts[0]
     joints = limits[0].joints
     for sim in ids:
         state, monitor = states[sim], monitors[sim % len(monitors)]
-        _set_state(models[sim], data, rows + sim * row_bytes, _STATE)
+        _set_state(models[sim], data, rows + sim * row_bytes, spec)
         warnings[:] = 0
         for number in range(first_tick, first_tick + ticks):
             now_ns = number * NANOSECONDS // layout.ticks_hz
@@ -174,7 +178,7 @@ def run_frames(  # noqa: PLR0912, PLR0917
                 for k in range(3):
                     sensors[sim, layout.beams + k] = sensordata[layout.gyro + k]
         state.mode_is_new = False
-        _get_state(models[sim], data, rows + sim * row_bytes, _STATE)
+        _get_state(models[sim], data, rows + sim * row_bytes, spec)
         for k in range(len(warnings)):
             all_warnings[sim, k, 1] += warnings[k]
         for k in range(layout.outputs):
@@ -208,7 +212,7 @@ class Frames:
         beams: int,
     ) -> None:
         self._world, self._cerebellum, self._touched = world, cerebellum, touched
-        self._plant = cerebellum.plant
+        self._plant, self._pid = cerebellum.plant, os.getpid()
         self._handled = 0
         model, layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = layout[0], world.servos
@@ -220,8 +224,10 @@ class Frames:
         row["touch"] = model.sensor(touch).adr[0]
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
-        for name, values in efforts.numbers(servos).items():
-            row[name][:k] = values
+        self._is_possible = efforts.are_all(servos)  # others' efforts are averaged in Python
+        if self._is_possible:
+            for name, values in efforts.numbers(servos).items():
+                row[name][:k] = values
         self._layout = layout
         self._models: list[mujoco.MjModel | None] = [None] * world.n
         self._seen: list[bytes] = []  # the fields that they were made with, and of each simulation
@@ -229,6 +235,7 @@ class Frames:
         self._threads: list[_Thread] = []
         self._pool: ThreadPoolExecutor | None = None
         self._addresses = np.zeros(world.n, np.int64)
+        self._checked, self._copies = -1, False
 
     def run(self, ids: NDArray[np.intp] | None, first_tick: int, ticks: int) -> bool:
         """Let some ticks go by.
@@ -242,13 +249,17 @@ class Frames:
             False if nothing was done: Python does it as well so far, or the cerebellum's plant is another than the
             world's.
         """
-        if self._cerebellum.plant is not self._plant:
+        if not self._is_possible or self._cerebellum.plant is not self._plant:
             return False
         ids = np.arange(self._world.n) if ids is None else ids
-        self._handled += len(ids) * ticks * _TICK_VALUES
+        self._handled += len(ids) * _TICK_VALUES
         if not is_worth_compiling(run_frames, self._handled) or not _load():
             return False
+        if not self._are_copied:
+            return False
         self._take_models()
+        if self._pid != os.getpid():  # after a fork there are no threads
+            self._pid, self._pool, self._threads = os.getpid(), None, []
         if not self._threads:
             self._threads = [_Thread(self._world, self._layout) for _ in range(self._world.threads)]
             if len(self._threads) > 1:
@@ -264,9 +275,27 @@ class Frames:
             for thread, share in calls
             if len(share)
         ]
-        for job in jobs:
-            job.result()
+        try:
+            for job in jobs:
+                job.result()
+        finally:
+            wait(jobs)  # whatever interrupts this: no other frame begins meanwhile
         return True
+
+    @property
+    def _are_copied(self) -> bool:
+        """Whether all fields that are read after a frame can be copied out of it."""
+        outputs = self._world.outputs
+        if len(outputs) != self._checked:
+            fields = {name: getattr(self._world.one, name) for name in outputs}
+            self._copies = len(outputs) <= _OUTPUTS and all(
+                isinstance(field, np.ndarray)
+                and outputs[name].flags.c_contiguous
+                and (outputs[name].dtype, outputs[name][0].nbytes) == (field.dtype, field.nbytes)
+                for name, field in fields.items()
+            )
+            self._checked = len(outputs)
+        return self._copies
 
     @property
     def _shared(self) -> tuple[Any, ...]:
@@ -305,13 +334,18 @@ class _Thread:
         fields = data.qpos, data.qvel, data.ctrl, data.sensordata, data.qfrc_actuator
         self._fields = (*fields, data.actuator_force, data.actuator_velocity, data.warning.number)
         self._outputs = 0
+        self._lock = Lock()  # after an interruption the last frame may still be running
 
     def run(self, ids: NDArray, models: Counts, shared: tuple[Any, ...], first_tick: int, ticks: int) -> None:
+        with self._lock:
+            self._run(ids, models, shared, first_tick, ticks)
+
+    def _run(self, ids: NDArray, models: Counts, shared: tuple[Any, ...], first_tick: int, ticks: int) -> None:
         state, row = self._world.state, self._layout[0]
         if len(self._world.outputs) != self._outputs:
-            self._outputs = row["outputs"] = len(self._world.outputs)
             for k, (name, target) in enumerate(self._world.outputs.items()):
                 row["source"][k], row["target"][k] = getattr(self._data, name).ctypes.data, target.ctypes.data
                 row["nbytes"][k] = target[0].nbytes
+            self._outputs = row["outputs"] = len(self._world.outputs)
         where = self._data._address, state.ctypes.data, state.strides[0]
-        run_frames.compiled(ids, models, *where, *self._fields, *shared, self._layout, first_tick, ticks)
+        run_frames.compiled(ids, models, *where, *self._fields, *shared, self._layout, first_tick, ticks, _STATE)

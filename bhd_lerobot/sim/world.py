@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +61,6 @@ Ids = NDArray[np.intp] | NDArray[np.bool_] | Sequence[int] | None
 _SCENE_GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 _POOL_FIELDS = ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group")
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{field}")) for field in ("QPOS", "QVEL", "QACC")]
-_STATE_FIELDS = ("qpos", "qvel", "ctrl", "time")
 _WARNING_COUNT = 1  # the last axis of Batch.warning: last info, count
 
 
@@ -359,7 +359,7 @@ class World:
     def _output(self, name: str) -> NDArray[np.float64]:
         """Return a live field that derives from the state, which is copied out after every step from now on."""
         field = self._batch.bind(name)
-        if name not in _STATE_FIELDS:
+        if not np.may_share_memory(field, self._batch.state):
             self.outputs[name] = field
         return field
 
@@ -499,6 +499,11 @@ class World:
         self._constants = True
         self._batch.set_const(None if ids is None else self.selected(ids))
 
+    @cached_property
+    def one(self) -> mujoco.MjData:
+        """Data of a single simulation, for the types and sizes of its fields."""
+        return mujoco.MjData(self.model)
+
     @property
     def state(self) -> NDArray[np.float64]:
         """MuJoCo's integration states, live, shape (n, nstate)."""
@@ -506,7 +511,7 @@ class World:
 
     @property
     def warnings(self) -> NDArray[np.int32]:
-        """Last information and number of each of MuJoCo's warnings since the last reset, live, shape (n, kinds, 2)."""
+        """Last information, of `step` alone, and number of MuJoCo's warnings since the reset, live, (n, kinds, 2)."""
         return self._batch.warning
 
     def copy_model(self, sim: int, model: mujoco.MjModel | None = None) -> mujoco.MjModel:

@@ -1,6 +1,7 @@
 """Frames in machine code: the bits of ticks and steps in turns, whatever happens between and within them."""
 
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -112,6 +113,78 @@ def test_a_plant_that_is_put_in_between_sees_every_write() -> None:
     simulation.cerebellum.plant = between = Between(simulation.plant)  # type: ignore[assignment]
     simulation.step(np.zeros((1, 2)))
     assert between.writes == simulation.rates.ticks_per_frame
+    simulation.close()
+
+
+FIELDS = ("xfrc_applied", "qacc_warmstart", "ncon", "xquat", "qfrc_bias", "actuator_force")
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 20])
+def test_whatever_is_read_of_a_world_the_physics_is_the_same(count: int) -> None:
+    """Fields of the state, numbers, derived fields, and more of these than frames copy."""
+
+    def fields(simulation: BaseSimulation) -> dict[str, NDArray[np.float64]]:
+        names = [*FIELDS, *(name for name in simulation.world.one._all_fields if name.startswith("x"))][:count]
+        return {name: simulation.world.derived(name) for name in names}
+
+    def seen() -> list[NDArray[np.float64]]:
+        simulation = make(3)
+        bound = fields(simulation)
+        if "xfrc_applied" in bound:
+            bound["xfrc_applied"][1, -1, 2] = 1.0
+        for frame in range(3):
+            simulation.step(np.full((3, 2), 0.1 * frame))
+        simulation.close()
+        return [simulation.world.qpos.copy(), *(field.copy() for field in bound.values())]
+
+    fast = seen()
+    with kernels.never_compiled():
+        plain = seen()
+    for one, other in zip(fast, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.usefixtures("compiled")
+def test_what_a_subclass_does_after_steps_is_done() -> None:
+    class Counting(BaseSimulation):
+        steps = 0
+
+        def _after_step(self) -> None:
+            super()._after_step()
+            self.steps += 1
+
+    simulation = Counting(TurtleBot3Config(), 1)
+    simulation.reset(np.arange(1), [make_arena("empty", 0, robot_radius=0.105)], [0])
+    simulation.step(np.zeros((1, 2)))
+    assert simulation.steps == simulation.rates.ticks_per_frame
+    simulation.close()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_after_an_interruption_the_next_frame_waits_for_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = make(4, 2)
+    simulation.step(np.zeros((4, 2)))
+    real, most = frames._Thread._run, [0, 0]
+
+    def counted(*arguments: Any) -> None:
+        most[0] += 1
+        most[1] = max(most)
+        time.sleep(0.05)
+        real(*arguments)
+        most[0] -= 1
+
+    def interrupted(_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(frames._Thread, "_run", counted)
+    with monkeypatch.context() as patch:
+        patch.setattr(frames, "wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulation.step(np.zeros((4, 2)))
+    for _ in range(3):
+        simulation.step(np.zeros((4, 2)))
+    assert most[1] <= 2  # one for each thread's data
     simulation.close()
 
 
