@@ -8,7 +8,6 @@ import pickle
 import shutil
 import signal
 import tempfile
-import threading
 from importlib import metadata
 from pathlib import Path
 
@@ -128,19 +127,6 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
-
-
-def workers_of(raylets: set[int]) -> list[int]:
-    """Return the processes of our workers on these machines."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        pid = int(path.parent.name)
-        try:
-            if path.read_bytes().startswith(b"ray::RemoteWorker") and parent_of(pid) in raylets:
-                found.append(pid)
-        except OSError:
-            continue
-    return found
 
 
 @pytest.mark.thorough
@@ -420,19 +406,6 @@ def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster, 
         for config, tasks in ((RayConfig(num_workers=5), 2), (RayConfig(), 6)):
             pool._config = config
             assert describe_crowding(config, pool.workers_for(tasks)) == ""
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("driver")
-def test_the_run_stops_when_it_is_told_to(cluster):
-    stopped = threading.Event()
-    threading.Timer(2, stopped.set).start()
-    got, _, error = run_pool(cluster, [fakes.SLOW] * 1000, stop=stopped.is_set)
-    assert error is None
-    assert got == list(range(len(got)))
-    assert len(got) < 1000
-    raylets = {machine.all_processes["raylet"][0].process.pid for machine in cluster.spare}
-    until(lambda: not workers_of(raylets))
 
 
 @pytest.mark.usefixtures("driver")

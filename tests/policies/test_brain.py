@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns, find_scan
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
-from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
+from bhd_lerobot.policies.brain import find_columns, find_scan
 from tests.cases import each_case
-
-BURGER = turtlebot3_burger()
-ACTIONS = ("x.vel", "theta.vel")
-BRAINS = (AvoidanceBrain, GapFollowerBrain)
 
 
 def scan_names(beams: int) -> tuple[str, ...]:
@@ -52,21 +45,3 @@ def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) 
 def test_no_scan_or_a_torn_one_is_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="'rule' needs a range scan"):
         find_scan(names, "rule")
-
-
-@pytest.mark.parametrize("brain_type", BRAINS)
-def test_order_of_features_does_not_matter(brain_type: type[AvoidanceBrain] | type[GapFollowerBrain]) -> None:
-    rng = np.random.default_rng(0)
-    scan, twist = rng.uniform(0.2, 3.4, (4, 90)), rng.uniform(-0.1, 0.1, (4, 2))
-    front = (*ACTIONS, *scan_names(90))
-    back = ("imu_z.vel", *scan_names(90), "theta.vel", "gripper.pos", "x.vel")
-    blank = np.full((4, 1), np.nan)
-    one, other = brain_type(), brain_type()
-    one.bind(RobotFeatures(front, ACTIONS, 10, body=BURGER))
-    other.bind(RobotFeatures(back, ("theta.vel", "gripper.pos", "x.vel"), 10, body=BURGER))
-    for brain in (one, other):
-        brain.reset(np.arange(4), [0] * 4, 4)
-    a = one.act(Observation(front, np.hstack([twist, scan])))
-    b = other.act(Observation(back, np.hstack([blank, scan, twist[:, 1:], blank, twist[:, :1]])))
-    assert np.array_equal(a, b[:, [2, 0]])
-    assert (b[:, 1] == 0).all()

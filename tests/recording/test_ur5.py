@@ -101,28 +101,6 @@ def test_the_recorded_reference_replayed_as_setpoints_stays_close(recorded):
     assert result.position_m.max() < 0.01
 
 
-def test_stock_lerobot_reads_it(recorded):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset("test/avoid", root=recorded, video_backend="pyav", delta_timestamps={"action": [0, 0.04]})
-    columns = data_columns(recorded)
-    item = dataset[7]
-    assert np.array_equal(item["action"].numpy(), np.float32(columns["action"][7:9]))
-    assert item["subtask"] == columns["subtask"][7]
-    assert item["task"] == dataset_info(recorded).episodes[0].task
-    assert item["observation.environment_state"].shape == (80,)
-    # LeRobot's own reading of its language column: what was being done at that time.
-    from lerobot.datasets.language_render import active_at
-
-    for index in (0, 7, 60, len(dataset) - 1):
-        item = dataset[index]
-        row = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="subtask")
-        assert row["content"] == item["subtask"] == columns["subtask"][index]
-        plan = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="plan")
-        assert plan["content"].startswith("1. find the ")
-    assert set(dataset.meta.stats) >= {"observation.environment_state", "action"}
-
-
 def test_reach_is_recorded_and_repeated(tmp_path):
     root = tmp_path / "d"
     result, _ = record(root, task__type="reach", brain__type="reach", dataset__num_episodes=2, n_envs=2)

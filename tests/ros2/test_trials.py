@@ -242,41 +242,6 @@ def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate
     assert "A setpoint came" in brain.events("result")[0]["message"]
 
 
-def test_after_an_emergency_stop_goals_are_refused_until_a_reset(
-    arm: Side, talk: Callable[..., list[tuple[bool, str]]]
-) -> None:
-    arm.press()
-    [(success, message)] = talk(goal(*ASIDE))
-    assert not success
-    assert "emergency stop" in message
-    arm.reset()
-    assert talk(goal(*ASIDE)) == [(True, REACHED)]
-
-
-def test_an_arm_on_the_network_follows_and_what_it_did_is_recorded(domain: int, tmp_path: Path) -> None:
-    log = tmp_path / "robot.jsonl"
-    move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=3", "--brain.type=random")
-    options = ("--brain.scale=0.02", "--dataset.num_episodes=1")
-    with Peer("ur_driver_standin.py", "--log", log, domain=domain) as robot:
-        robot.wait_event("ready")
-        with Recording("ur5", *move, *options, domain=domain, folder=tmp_path) as recording:
-            assert recording.process.wait() == 0, recording.text
-    assert data(["check", str(recording.root)]) == 0
-    columns = columns_of(recording.root)
-    times = recording.starts[0] + columns["control.time"]
-    states = log_of(log, "state")
-    measured, positions = (np.array([line[key] for line in states]) for key in ("monotonic", "position"))
-    joints = columns["observation.state"][:, :6]
-    assert np.ptp(joints, axis=0).min() > 0.005  # [rad]: they moved
-    # It moves at up to 3 rad/s; between two of its messages, and until one has come, by far less than this.
-    for joint in range(6):
-        then = np.interp(times, measured, positions[:, joint])
-        np.testing.assert_allclose(joints[:, joint], then, atol=0.03)
-    sent = np.array([line["given"] for line in log_of(log, "positions")])
-    applied = columns["control.applied_action"][:, :6]
-    assert np.abs(sent[:, None] - applied[None]).max(axis=2).min(axis=0).max() < 0.02
-
-
 STOPPED = {  # what happens to the driver or to a process of ours; what is printed of it
     "protective stop": (("--on-usr1=safety:3",), "its safety status is STOPPED"),
     "emergency stop": (("--on-usr1=safety:7",), r"Emergency stop \(the robot's own\)"),

@@ -3,11 +3,9 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
-from bhd_lerobot.apps.view.packing import unpack
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
@@ -52,25 +50,6 @@ def test_an_empty_dataset_and_the_name_of_a_dataset(tmp_path, folder, name) -> N
         assert (found := server.json("/api/dataset"))["name"] == name
         assert found["episodes"]["frames"] == []
         assert server.ask("/api/episodes/0")[0] == 409
-
-
-def test_one_frame_and_numbers_that_are_none(tmp_path) -> None:
-    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
-    features["control.age"] = {"dtype": "float32", "shape": (1,), "names": None}
-    recorder = DatasetRecorder.create("t/one", 10, features, robot_type="toy", root=tmp_path / "d", recording={})
-    for age in (np.nan, np.inf):
-        writer = recorder.begin_episode()
-        writer.set_columns({"action": np.zeros((1, 1), np.float32), "control.age": np.full(1, age, np.float32)})
-        recorder.save(writer, task="stand", metadata={"score": float("nan"), "scene": "{broken"})
-    recorder.finalize()
-    dataset = ViewedDataset(tmp_path / "d")
-    header, arrays = unpack(dataset.packed(1))
-    assert header["not_finite"] == {"control.age": 1}
-    assert header["scene"] is None
-    assert header["metadata"]["score"] is None
-    assert np.isinf(arrays["control.age"]).all()
-    with pytest.raises(DatasetError, match="no episode 2"):
-        dataset.packed(2)
 
 
 def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:

@@ -6,7 +6,6 @@ import re
 import shlex
 import shutil
 import signal
-import sys
 import threading
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from bhd_lerobot.datasets.remote.push import is_generated
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
-from bhd_lerobot.hub.transfer import prompt_interrupt
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.hub import FakeHub, Fault, real_client
 from tests.forks import Fork
@@ -161,22 +159,6 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(lesson: Path, tmp_path: Path) -> N
     assert f"Stopped; the dataset at {lesson} is unchanged" in error
     assert f"bhd-data push {lesson} me/d --no_card" in error
     assert "Traceback" not in error
-
-
-def leave_a_thread_waiting() -> int:
-    try:
-        with prompt_interrupt("nothing is lost"):
-            threading.Thread(target=threading.Event().wait).start()
-            signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        print("Stopped", file=sys.stderr)
-    return 130
-
-
-def test_ctrl_c_ends_the_program_though_a_thread_goes_on_waiting_for_the_network(tmp_path: Path) -> None:
-    process = Fork(leave_a_thread_waiting, output=tmp_path / "log")
-    assert process.wait() == 130
-    assert (tmp_path / "log").read_text() == "Stopped\n"
 
 
 # --- what uploads by itself

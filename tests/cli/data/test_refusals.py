@@ -46,7 +46,7 @@ REFUSALS = [
     ("mark d --episodes 0", "Give a mark"),
     ("mark d --episodes 0 --outcome good", "Unknown outcome 'good'"),
     ("mark d --episodes 0 --intervention 3..5", "FIRST-LAST"),
-    ("mark d --episodes 0 --intervention 3-50", "not frames of episode 0; valid: 0 to 4"),
+    ("mark d --episodes 0 --intervention 3-5", "not frames of episode 0; valid: 0 to 4"),
     ("info none", "does not exist"),
     ("timing d", "Its content is in `bhd-data info`"),
     ("info file", "file is not a LeRobot dataset"),

@@ -79,14 +79,6 @@ def test_delete_leaves_the_others(plain: Path, tmp_path: Path) -> None:
         assert not (root / layout.STAGING).exists()
 
 
-def test_merging_the_parts_of_a_split_gives_the_original(plain: Path, video_dataset: Path, tmp_path: Path) -> None:
-    for root in (plain, video_dataset):
-        folder = tmp_path / root.parent.name
-        split(root, {"train": [0, 1], "val": [2], "test": [3]}, folder)
-        merge([folder / name for name in ("train", "val", "test")], folder / "again")
-        assert content(folder / "again") == content(root)[:4]
-
-
 def test_data_are_those_of_lerobots_own_merge(plain: Path, tmp_path: Path) -> None:
     from lerobot.datasets.dataset_tools import merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

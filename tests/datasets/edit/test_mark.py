@@ -126,24 +126,6 @@ def test_a_dataset_of_another_program_gets_the_columns(tmp_path: Path) -> None:
         mark(tmp_path / "d", [0], intervention=(0, 1))
 
 
-def test_bad_requests_change_nothing(tmp_path: Path) -> None:
-    root = recorded(tmp_path / "d")
-    before = content(root)
-    for wanted, error, text in (
-        ({"episodes": [0]}, ConfigError, "Give a mark"),
-        ({"episodes": [], "outcome": "success"}, ConfigError, "Give the episodes"),
-        ({"episodes": [0], "outcome": "sucess"}, ConfigError, "Did you mean 'success'"),
-        ({"episodes": [3], "outcome": "success"}, DatasetError, "no episode 3.*0 to 2"),
-        ({"episodes": [-1], "outcome": "success"}, DatasetError, "no episode -1"),
-        ({"episodes": [0], "intervention": (5, 4)}, ConfigError, "5 to 4 are not frames"),
-        ({"episodes": [0], "intervention": (0, 8)}, ConfigError, "0 to 8 are not frames of episode 0; valid: 0 to 7"),
-    ):
-        with pytest.raises(error, match=text):
-            mark(root, **wanted)
-    assert content(root) == before
-    assert edits_of(root) == []
-
-
 @each_case(
     ("robot", "task", "impossible", "possible"),
     [

@@ -251,20 +251,3 @@ def test_the_fallback_serves_the_same_batches_and_reports_it_once(video_dataset:
         support.assert_same(mine, other)
     assert torch.cat([batch["episode_index"] for batch in held_out]).tolist() == [2, 2, 2, 3, 3, 3]
     assert np.allclose(memory.dataset.meta.stats[FRONT]["mean"].squeeze(), [0.485, 0.456, 0.406])
-
-
-def test_resumed_fallback_continues_at_the_same_sample(video_dataset: Path) -> None:
-    def make() -> Any:
-        config = LoaderConfig(batch_size=3, seed=5, budget_gib=1e-4, episodes=[0])
-        return make_loader("t/t", config, root=video_dataset, report=lambda _: None).train
-
-    loader = make()
-    stream = loader.cycle()
-    for _ in range(len(loader) + 2):
-        next(stream)
-    state = loader.state_dict()
-    wanted = [next(stream)["index"].tolist() for _ in range(4)]
-    again = make()
-    again.load_state_dict(state)
-    stream = again.cycle()
-    assert [next(stream)["index"].tolist() for _ in range(4)] == wanted

@@ -144,13 +144,6 @@ def test_weights_say_how_often_a_sample_is_drawn() -> None:
     assert counts[9] / counts[8] == pytest.approx(3.0, rel=0.1)
 
 
-def test_samples_of_weight_zero_are_left_out_and_the_rest_drawn_once() -> None:
-    weights = (SAMPLES % 2).float() * 2.5
-    assert sorted(flat(epochs(BatchOrder(SAMPLES, 4, 0, weights=weights), 1)[0])) == [
-        sample for sample in SAMPLES.tolist() if sample % 2
-    ]
-
-
 @each_case(
     ("options", "message"),
     [

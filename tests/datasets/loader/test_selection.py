@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -14,7 +13,6 @@ import torch
 from bhd_lerobot.datasets.loader import frame_cache
 from bhd_lerobot.datasets.loader.loader import (
     EpisodeFilter,
-    FrameTable,
     LoaderConfig,
     MemoryBudgetError,
     TableDataset,
@@ -24,11 +22,10 @@ from bhd_lerobot.datasets.loader.loader import (
     split_episodes,
 )
 from bhd_lerobot.datasets.loader.table import open_metadata
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
 from tests.cases import each_case
 from tests.datasets.loader import support
-from tests.datasets.loader.support import FPS, FRONT, WRIST
+from tests.datasets.loader.support import FRONT, WRIST
 
 
 @pytest.fixture(scope="module")
@@ -69,19 +66,6 @@ def test_filters_of_what_was_not_recorded(foreign: Path) -> None:
     with pytest.raises(DatasetError, match=r"has no bhd/outcome .* another program .* outcome 'all'"):
         EpisodeFilter().select(meta)
     assert EpisodeFilter("all").select(meta) == [0, 1, 2]
-
-
-def test_wrong_filters_are_named() -> None:
-    for options, message in (
-        ({"outcome": "sucess"}, "Did you mean 'success'"),
-        ({"outcome": []}, "No outcome is given"),
-        ({"outcome": ["success", "intervention"]}, "Unknown outcome 'intervention'"),
-        ({"min_score": 1.5}, "min_score is 1.5"),
-        ({"min_score": math.nan}, "min_score is nan"),
-    ):
-        values: dict[str, Any] = options
-        with pytest.raises(ConfigError, match=message):
-            EpisodeFilter(**values)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
@@ -162,43 +146,6 @@ def test_a_policy_can_learn_from_a_valid_dataset(plain: Path, video_dataset: Pat
     check(TableDataset("t/t", video_dataset), ["action", FRONT])
     with pytest.raises(DatasetError, match=r"needs the feature 'actions'.* Did you mean 'action'"):
         check(TableDataset("t/t", plain), ["actions"])
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_value_that_is_not_finite_is_named(tmp_path: Path, plain: Path, value: float) -> None:
-    root = support.record_light(tmp_path / "d")
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    rows = [list(row) for row in table["action"].to_pylist()]
-    place = sum(support.length(episode) for episode in range(3)) + 2
-    rows[place][1] = value
-    column = table.schema.get_field_index("action")
-    changed = pa.array(rows, type=table.schema.field(column).type)
-    pq.write_table(table.set_column(column, table.schema.field(column), changed), path)
-    wanted = rf"episode 3, frame 2: 'action' \(theta.vel\) is {value}, and 1 frames"
-    for dataset in (TableDataset("t/t", root), TableDataset("t/t", root, [1, 3]), support.stock(root, episodes=[1, 3])):
-        with pytest.raises(DatasetError, match=wanted):
-            check(dataset, KEYS)
-        check(dataset, ["observation.state"])
-    check(TableDataset("t/t", root).subset([0, 1]), KEYS)
-
-
-def test_an_empty_dataset(tmp_path: Path) -> None:
-    root = tmp_path / "d"
-    DatasetRecorder.create("t/t", FPS, support.FEATURES, robot_type="toy", root=root, recording={}).finalize()
-    with pytest.raises(DatasetError, match="has no episode"):
-        TableDataset("t/t", root)
-    empty = SimpleNamespace(meta=SimpleNamespace(root=root), num_frames=0)
-    with pytest.raises(DatasetError, match="has no frame"):
-        check(empty, ["action"])
-
-
-def test_no_dataset(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="nowhere does not exist, and it could not be fetched"):
-        TableDataset("t/t", tmp_path / "nowhere")
-    assert not (tmp_path / "nowhere").exists()
-    with pytest.raises(DatasetError, match=r"has no meta/info\.json"):
-        FrameTable.open(tmp_path)
 
 
 @each_case(

@@ -140,12 +140,3 @@ def test_a_link_to_the_outside_is_refused(hub: FakeHub, root: Path, tmp_path: Pa
     whole = tmp_path / "whole"
     shutil.copytree(root, whole)  # which follows links, as cp -rL does
     send(whole)
-
-
-def test_a_link_within_the_dataset_is_followed(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    (root / "notes.txt").write_text("mine")
-    (root / "same.txt").symlink_to("notes.txt")
-    root.rename(tmp_path / "real")
-    root.symlink_to(tmp_path / "real")  # the folder itself may be a link
-    send(root)
-    assert stored(hub)["same.txt"] == b"mine"

@@ -226,12 +226,6 @@ def test_what_is_written_there_during_a_pull_is_noticed(
     assert not (tmp_path / "e").exists()
 
 
-def test_episodes_of_a_url_are_not_chosen(root: Path, tmp_path: Path) -> None:
-    push(root, StoreDataset("memory://b/some"))
-    with pytest.raises(ConfigError, match=r"memory://b/some is a URL.*whole datasets"):
-        pull(StoreDataset("memory://b/some"), tmp_path / "e", select=lambda folder: [1])
-
-
 def test_what_did_not_arrive_whole_stays_invisible(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = StoreDataset("memory://b/short")
     with monkeypatch.context() as patch:

@@ -413,21 +413,6 @@ def test_signals_are_deferred(root: Path, monkeypatch: pytest.MonkeyPatch, numbe
     assert seen == [2]
 
 
-def test_ctrl_c_at_the_end_of_an_edit_reports_the_edit(root: Path, monkeypatch, capsys) -> None:
-    swap = Disk.swap
-
-    def disturbed(self: Disk, one: Path, other: Path) -> None:
-        swap(self, one, other)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Disk, "swap", disturbed)
-    assert main.main(["delete", str(root), "--episodes=1"]) == 130
-    message = capsys.readouterr().err
-    assert "had been completed" in message
-    assert "nothing was changed" not in message
-    assert len(content(root)) == 2
-
-
 def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, capsys) -> None:
     def refuse(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)

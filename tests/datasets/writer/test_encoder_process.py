@@ -44,26 +44,6 @@ def test_the_same_file_as_in_this_process(process: EncoderProcess, tmp_path: Pat
         assert encoder.path.read_bytes() == here.path.read_bytes()
 
 
-def test_more_images_than_shared_memory_holds(process: EncoderProcess, tmp_path: Path) -> None:
-    size = (480, 640)
-    encoder = process.encoder(tmp_path / "large.mp4", 10, size, SETTINGS)
-    image = np.zeros((*size, 3), np.uint8)
-    for number in range(100):  # 92 MB
-        image[:8] = number
-        encoder.add(image)
-    assert len(encoder.finish()) == count_frames(tmp_path / "large.mp4") == 100
-
-
-def test_a_cancelled_episode_leaves_the_others_alone(process: EncoderProcess, tmp_path: Path) -> None:
-    kept, dropped = (process.encoder(tmp_path / f"{name}.mp4", 10, SIZE, SETTINGS) for name in ("kept", "dropped"))
-    for image in images(10):
-        kept.add(image)
-        dropped.add(image)
-    dropped.cancel()
-    dropped.cancel()
-    assert len(kept.finish()) == 10
-
-
 def test_what_the_disk_refuses_is_raised_here(process: EncoderProcess, tmp_path: Path) -> None:
     encoder = process.encoder(tmp_path / "missing" / "a.mp4", 10, SIZE, SETTINGS)
 

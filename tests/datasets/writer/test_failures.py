@@ -76,34 +76,6 @@ def test_a_disk_that_fails_at_any_step_of_a_save(tmp_path: Path, monkeypatch: py
     assert support.verify(tmp_path / "d", recorder.num_episodes, video=video, stats=True) == recorder.num_episodes
 
 
-@pytest.mark.thorough(but=1)
-@pytest.mark.parametrize(
-    ("error", "first"), [(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x"), 0), (KeyboardInterrupt(), 1)]
-)
-def test_finalising_that_is_stopped_at_any_step_can_be_done_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, first: int
-) -> None:
-    """At every third step: processes meet all of them in tests/datasets/sweeps."""
-    step, done = first, False
-    while not done:
-        root = tmp_path / str(step)
-        recorder = support.create(root)
-        for _ in range(3):
-            support.record(recorder)
-        expected = DatasetWriteError if isinstance(error, OSError) else KeyboardInterrupt
-        with stop_at(monkeypatch, step, error) as seen, contextlib.suppress(expected):
-            recorder.finalize()
-        done = len(seen) <= step
-        recorder.finalize()
-        assert support.read_back(root) == 3
-        assert dataset_info(root).compact
-        assert len(list((root / "data").rglob("*.parquet"))) == 1
-        assert not (root / ".bhd").exists()
-        step += 3
-    assert step > 10
-    assert support.verify(root, 3, stats=True) == 3
-
-
 @pytest.mark.law
 def test_an_interrupt_at_any_step_of_a_save(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C raises between any two steps; leaving the block must still finalise all that was committed."""

@@ -182,25 +182,6 @@ def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     assert "green box does not fit" in desk.brain.plan(0)["problem"]
 
 
-def test_simulations_do_not_influence_each_other() -> None:
-    """Three at once, each with a story of its own, and the same three alone."""
-    scenes = [scene(CUP), scene(BOX, CUP), scene(CUP, BOX, target=1)]
-    together, alone = Desk(PickBrain(), scenes), [Desk(PickBrain(), [one]) for one in scenes]
-    together.look()
-    for desk in alone:
-        desk.look()
-    rng = np.random.default_rng(0)
-    for _ in range(25):
-        sim = int(rng.integers(3))
-        if alone[sim].brain.subtasks()[0].startswith(("hold", "cannot")):
-            continue
-        opening, success = float(rng.choice([0.02, 0.06])), bool(rng.random() < 0.8)
-        together.state[sim, 1] = alone[sim].state[0, 1] = opening
-        assert together.end(sim, success, "x") == alone[sim].end(0, success, "x")
-        assert together.brain.plan(sim) == alone[sim].brain.plan(0)
-    assert [together.given[sim] for sim in range(3)] == [desk.given[0] for desk in alone]
-
-
 def test_a_new_episode_starts_from_nothing() -> None:
     desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
     desk.look()

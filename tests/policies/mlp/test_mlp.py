@@ -92,23 +92,6 @@ def test_what_is_ignored_changes_nothing_and_everything_else_does(steps: int, sc
         assert torch.equal(chunk, policy.predict_action_chunk(changed)) == (column in ignored)
 
 
-def test_the_preprocessor_hands_the_ranges_over_in_metres(tmp_path: Path) -> None:
-    made = config(scan=ScanConfig(transform="inverse"))
-    MlpPolicy(made)
-    stats = {
-        key: {"mean": np.full(size, 1.5), "std": np.full(size, 0.5)} for key, size in ((OBS_STATE, 10), (ACTION, 2))
-    }
-    before, after = make_pre_post_processors(made, dataset_stats=stats)
-    before.save_pretrained(tmp_path)
-    after.save_pretrained(tmp_path)
-    again, _ = make_pre_post_processors(made, pretrained_path=str(tmp_path))
-    state = torch.rand(4, 10)
-    for one in (before, again):
-        done = one({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(4, 3)})
-        assert torch.equal(done[OBS_SCAN], state[:, 1:9])
-        assert torch.allclose(done[OBS_STATE], (state - 1.5) / 0.5, atol=1e-6)
-
-
 @each_case("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10"])
 @each_case("spread", [0.0, 1e-5, 1.5e-3])
 def test_what_was_constant_in_the_data_has_no_influence(tmp_path: Path, spread: float, mode: str) -> None:
@@ -333,27 +316,6 @@ def told_of_objects(rows: int = 40) -> Tensor:
     return (table * table[..., :1]).flatten(1)
 
 
-def test_objects_are_sorted_whatever_order_they_are_told_in() -> None:
-    start, count, size, fields = object_columns(["other", *ENVIRONMENT, "last"])
-    step = ObjectOrderProcessorStep(start, count, size, fields)
-    told = told_of_objects()
-    extra = torch.arange(2 * len(told), dtype=torch.float32).view(len(told), 2)
-    for order in (torch.arange(5), torch.tensor([4, 2, 0, 3, 1]), torch.tensor([1, 0, 3, 4, 2])):
-        rows = told.view(-1, 5, 16)[:, order].flatten(1)
-        values = torch.cat([extra[:, :1], rows, extra[:, 1:]], dim=1)
-        done = step.observation({OBS_ENV_STATE: values})[OBS_ENV_STATE]
-        table = done[:, 1:-1].view(-1, 5, 16)
-        assert torch.equal(done[:, [0, -1]], extra)
-        assert bool((table[:, 0, 1] == 1).all())  # what is meant is the first
-        apart = (table[..., 3:5] - table[:, :1, 3:5]).norm(dim=-1).masked_fill(table[..., 0] == 0, 1e9)
-        assert bool((apart.diff(dim=1) >= 0).all())  # then the nearest, and what is not there last
-        if bool((order == torch.arange(5)).all()):
-            first = done
-        assert torch.equal(done, first)
-    history = step.observation({OBS_ENV_STATE: values.unsqueeze(1).expand(-1, 3, -1)})[OBS_ENV_STATE]
-    assert torch.equal(history[:, 2], done)
-
-
 def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
     made = config(
         environment=80,
@@ -371,29 +333,6 @@ def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
         for rows in (told, told.view(-1, 5, 16).flip(1).flatten(1))
     ]
     assert torch.equal(*chunks)
-
-
-STATS = {
-    OBS_STATE: {"mean": torch.linspace(-1, 1, 10), "std": torch.linspace(0.1, 2, 10)},
-    ACTION: {"mean": torch.tensor([0.3, -0.2]), "std": torch.tensor([0.5, 1e-9])},
-}
-
-
-def test_a_residual_policy_that_says_nothing_stays_where_it_is() -> None:
-    made = config(residual=["*"], residual_columns=[3, -1])
-    policy = MlpPolicy(made, dataset_stats=STATS)
-    for parameter in policy.net.parameters():
-        nn.init.zeros_(parameter)
-    before, after = make_pre_post_processors(made, dataset_stats=STATS)
-    state = torch.randn(20, 10, generator=torch.Generator().manual_seed(0))
-    chunk = after(policy.predict_action_chunk(before({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(20, 3)})))
-    assert torch.allclose(chunk[..., 0], state[:, 3:4].expand(-1, 4), atol=1e-5)  # in the robot's units
-    assert torch.allclose(chunk[..., 1], STATS[ACTION]["mean"][1].expand(20, 4))  # that which is not observed
-    # What it begins at is in the checkpoint: another policy does the same without any statistics.
-    again = MlpPolicy(made)
-    again.load_state_dict(policy.state_dict())
-    values = before({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(20, 3)})
-    assert torch.equal(again.predict_action_chunk(values), policy.predict_action_chunk(values))
 
 
 def test_actions_are_found_among_the_observations_by_their_names() -> None:
