@@ -76,20 +76,6 @@ def test_an_episode_is_that_of_the_loop_bit_for_bit(name: str) -> None:
     env.close()
 
 
-def test_time_truncates_and_what_happens_terminates() -> None:
-    still = BhdEnv("TurtleBot3Avoid-v0", {"beams": 36}, {"duration_s": 0.5})
-    lasting = BhdEnv("TurtleBot3Avoid-v0", {"beams": 36}, {"duration_s": 0.5, "min_path_m": 0.0})
-    ends = []
-    for env, action in ((still, [0.0, 0.0]), (lasting, [0.1, 0.0])):
-        env.reset(seed=0)
-        last: Any = (None, 0.0, False, False, {})
-        while not (last[2] or last[3]):
-            last = env.step(np.array(action, np.float32))
-        ends.append((last[2], last[3], last[4]["event"], last[4]["is_success"]))
-    # Neither robot did anything that ended its episode: it could have gone on.
-    assert ends == [(False, True, "timeout", False), (False, True, "success", True)]
-
-
 def test_a_success_that_is_an_achievement_terminates() -> None:
     episodes = SteppedEpisodes(make_settings("UR5Reach-v0").robot, make_settings("UR5Reach-v0").task)
     episodes.reset(ONE, [0])

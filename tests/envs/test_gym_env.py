@@ -14,9 +14,8 @@ from bhd_lerobot.envs.episodes import ClosedError, ResetNeededError
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.register import ENVIRONMENTS, register
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.tasks.task import episode_seed
 from tests.cases import each_case
-from tests.envs.support import NAMES, assert_same, short, some_actions
+from tests.envs.support import NAMES, assert_same, short
 
 AVOID = "TurtleBot3Avoid-v0"
 
@@ -43,20 +42,6 @@ def test_registering_twice_changes_nothing() -> None:
     register()
     assert dict(gymnasium.registry) == before
     assert {f"bhd_lerobot/{name}" for name in ENVIRONMENTS} <= before.keys()
-
-
-@pytest.mark.law
-def test_equal_seeds_and_actions_give_equal_episodes_and_so_do_the_next_resets() -> None:
-    first, second = make(seed=7), make(seed=7)
-    assert_same(first.reset(seed=4), second.reset(seed=4))
-    for action in some_actions(AVOID, 5)[:, 0]:
-        assert_same(first.step(action), second.step(action))
-    following = first.reset()
-    assert_same(following, second.reset())
-    index = following[1]["episode_index"]
-    assert index != 4
-    assert following[1]["seed"] == episode_seed(7, index, "train")
-    assert_same(first.reset(seed=index), following)
 
 
 def test_normalised_actions_span_the_bounds() -> None:

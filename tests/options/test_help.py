@@ -1,14 +1,12 @@
 """The help of the programs: every option with a meaning, short until a type is chosen."""
 
-import dataclasses
 import re
 
 import lerobot.policies  # noqa: F401  registers LeRobot's policies
 import pytest
 
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.options.help import help_of, meanings_of
-from bhd_lerobot.options.parse import choices_of, options_of
+from bhd_lerobot.options.help import help_of
 from bhd_lerobot.options.plugins import load_lerobot
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.replay import ReplayConfig
@@ -23,20 +21,6 @@ PROGRAMS = (RecordConfig, ReplayConfig, EvalConfig, BhdTrainConfig, RlConfig)
 @pytest.fixture(autouse=True)
 def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "120")
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_every_option_has_a_meaning(program: type) -> None:
-    def without(config_class: type, prefix: str) -> list[str]:
-        meanings, found = meanings_of(config_class), []
-        for name, kind, _ in options_of(config_class):
-            if dataclasses.is_dataclass(kind) and not choices_of(kind):
-                found += without(kind, f"{prefix}{name}.")
-            elif not meanings.get(name):
-                found.append(f"{prefix}{name}")
-        return found
-
-    assert without(program, "") == []
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

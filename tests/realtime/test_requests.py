@@ -13,7 +13,6 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
-from tests.cases import each_case
 from tests.control import arm_rig, support
 from tests.control.goal_rig import HZ, joints
 
@@ -67,21 +66,6 @@ class Pair:
 
 def goal(name: str, target: float = 0.2, **fields: Any) -> BrainCommand:
     return BrainCommand(name, joint_target=joints(target), **fields)
-
-
-@each_case(
-    ("command", "code", "words"),
-    [(goal("a", 99.0), ResultCode.JOINT_LIMIT, "must be within"), (goal("é" * 33), ResultCode.BAD_TARGET, "66 bytes")],
-)
-def test_a_refusal_is_the_only_result_of_its_goal(command: BrainCommand, code: ResultCode, words: str) -> None:
-    pair = Pair()
-    refusal = pair.client.submit(command)
-    assert refusal is not None
-    assert (refusal.code, refusal.success) == (code, False)
-    assert words in refusal.message
-    pair.tick()
-    assert pair.client.take_results() == [refusal]
-    assert not pair.cerebellum.controller.busy.any()
 
 
 @pytest.mark.parametrize("again", [goal("a"), BrainCommand("a", joint_target=(1.0,))], ids=["fits", "does not fit"])

@@ -1,4 +1,3 @@
-import json
 from dataclasses import asdict
 from multiprocessing.shared_memory import SharedMemory
 
@@ -139,22 +138,6 @@ def test_memory_without_statistics_is_refused() -> None:
             make(bytearray(TimingStatistics.nbytes - 1))
     with pytest.raises(ConfigError, match="period_ns is 0"):
         TimingStatistics(0)
-
-
-def test_a_summary_survives_json() -> None:
-    statistics = on_grid([(10_000, 300_000, 0), (4_000_000, 6_000_000, 3)])
-    summary = statistics.summary(
-        clock="realtime",
-        age=[0.01, 0.03],
-        inference_time=np.array([0.2, 0.1], np.float32),
-        late=[False, True],
-        drops=4,
-        tolerated={"lateness": 0.0025},
-    )
-    assert TimingSummary.from_fields(json.loads(json.dumps(asdict(summary)))) == summary
-    assert (summary.frames, summary.late_frames, summary.drops, summary.age_max) == (2, 1, 4, 0.03)
-    assert summary.inference_p50 == pytest.approx(0.1)
-    assert summary.inference_max == summary.inference_p99 == pytest.approx(0.2)
 
 
 def test_summaries_of_other_versions_can_be_read() -> None:

@@ -7,7 +7,6 @@ import re
 import signal
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,9 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.encoder_process import EncoderProcess
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
-from bhd_lerobot.tasks.task import Event
-from tests.cases import each_case
 from tests.forks import Fork
 from tests.recording.support import saved
 from tests.robots.external.mock_devices import MockArm
@@ -194,18 +190,6 @@ def test_a_rate_is_said_and_a_hiccup_is_none(gaps: dict[int, int], is_said: bool
         number += 1 + gaps.get(frame, 0)
     assert ("The robot keeps 20 of the 30 frames a second" in out.getvalue()) == is_said
     assert ("20 of 30 frames/s" in status.line().plain) == is_said
-
-
-@each_case(("left_out", "kept"), [(range(40, 50), None), (range(1, 120, 3), 20)])
-def test_a_hiccup_is_no_rate_in_the_summary(tmp_path: Path, left_out: range, kept: float | None) -> None:
-    result = RecordResult(tmp_path, tmp_path)
-    time_s = np.setdiff1d(np.arange(120), left_out) / 30
-    outcome = SimpleNamespace(event=Event.TIMEOUT, success=False, score=0.0)
-    columns = {"control.time": time_s, "control.late": np.zeros(len(time_s), np.bool_)}
-    timing = SimpleNamespace(clock="realtime")
-    episode: Any = SimpleNamespace(columns=columns, frames=len(time_s), outcome=outcome, plan={}, timing=timing)
-    result.count(episode, 30)
-    assert result.kept_fps == kept
 
 
 def test_an_encoder_that_is_too_slow_holds_up_no_frame_and_is_named(

@@ -23,8 +23,6 @@ from bhd_lerobot.hub.card import CardOptions, make_card
 from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.registry import make_brain
-from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
 
@@ -249,23 +247,6 @@ def test_a_camera_is_recorded_frame_by_frame(tmp_path):
     images = [dataset[i]["observation.images.front"] for i in (0, 29, 30, len(dataset) - 1)]
     assert all(image.shape == (3, 48, 64) for image in images)
     assert len({image.numpy().tobytes() for image in images}) == 4
-
-
-def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
-    config = parse(RecordConfig, options(tmp_path / "d", dataset__num_episodes=4))
-    simulation = record_module.make_simulation(config.robot, 3)
-    task = record_module.make_task(config.task, 3, 10)
-    loop = EpisodeLoop(simulation, task, make_brain(config.brain))
-    specs = [record_module.EpisodeSpec(i, 2 * i) for i in (3, 0, 2, 1)]
-    assert [episode.spec.index for episode in loop.run(specs)] == [3, 0, 2, 1]
-    count = 0
-
-    def stop() -> bool:
-        nonlocal count
-        count += 1
-        return count > 5
-
-    assert list(loop.run(specs, stop)) == []
 
 
 @pytest.mark.law

@@ -8,7 +8,6 @@ import pytest
 
 from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.rollout.replay import Replay
 from tests.recording.support import data_columns, episode_rows, run_record, start
 
@@ -147,22 +146,3 @@ def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
     start(root, 1, **PICK, **SPOKEN, resume="true").kill()
     record(root, **SPOKEN, n_envs=2, resume="true")
     assert data_columns(root) == data_columns(recorded)
-
-
-def test_cameras_are_recorded(tmp_path):
-    root = tmp_path / "d"
-    try:
-        record(
-            root,
-            robot__camera="true",
-            robot__camera_width=64,
-            robot__camera_height=48,
-            dataset__num_episodes=1,
-            dataset__episode_time_s=1,
-        )
-    except RenderingError as error:
-        pytest.skip(f"no OpenGL here: {error}")
-    features = json.loads((root / "meta" / "info.json").read_text())["features"]
-    for camera in ("scene", "wrist"):
-        assert features[f"observation.images.{camera}"]["shape"] == [48, 64, 3]
-    assert len(list(root.rglob("*.mp4"))) == 2

@@ -13,7 +13,7 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.truth import BaseTruth
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
-from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
+from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask, goal_in_robot
 from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
 from tests.tasks.support import Judged
@@ -101,20 +101,6 @@ def test_turning_and_moving_the_world_changes_nothing_in_the_robots_frame(
         return np.array([[c * x - s * y + shift[0], s * x + c * y + shift[1], yaw + turn]])
 
     np.testing.assert_allclose(goal_in_robot(moved(goal), moved(pose)), goal_in_robot(goal, pose), atol=1e-9)
-
-
-def test_the_goal_is_reported_in_the_robots_frame() -> None:
-    run = Run()
-    truth = BaseTruth(np.array([[2.025, -0.975, math.pi / 2]]), np.array([False]))
-    reported = dict(zip(ENVIRONMENT, run.task.environment_state(truth)[0], strict=True))
-    assert reported == pytest.approx(
-        {
-            "goal_x": 1.0,  # straight ahead of a robot that looks along y
-            "goal_y": 0.0,
-            "goal_cos": math.cos(1.0 - math.pi / 2),
-            "goal_sin": math.sin(1.0 - math.pi / 2),
-        }
-    )
 
 
 @pytest.mark.law

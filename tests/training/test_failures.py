@@ -12,7 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from bhd_lerobot.datasets.loader.check import fingerprint
 from bhd_lerobot.datasets.loader.config import LoaderConfig
@@ -106,23 +106,6 @@ def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, 
     file.write_text(json.dumps({**json.loads(file.read_text()), "units": "degrees"}))
     match = r"values are in SI.*trained on values in degrees"
     refused(options(data, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
-
-
-@pytest.mark.parametrize(("statistics", "shifts"), [("checkpoint", False), ("dataset", True)])
-def test_fine_tuning_keeps_or_renews_the_statistics(
-    trained: Path, tmp_path: Path, statistics: str, shifts: bool
-) -> None:
-    root = make_dataset(tmp_path / "set", episodes=3, shift=5.0)
-    arguments = options(root, tmp_path / "run", {}, fine_tune=trained, fine_tune_statistics=statistics, steps=2)
-    result, _ = run_train([*arguments, "--policy.optimizer_lr=1e-5"])
-    assert result.checkpoint is not None
-    name = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
-    files = [folder / "pretrained_model" / name for folder in (trained / "checkpoints" / "last", result.checkpoint)]
-    old, new = (load_file(file)["action.mean"] for file in files)
-    assert bool(torch.allclose(new, old)) != shifts
-    config = json.loads((result.checkpoint / "pretrained_model" / "config.json").read_text())
-    assert config["optimizer_lr"] == 1e-5
-    assert config["hidden_dims"] == [16, 16]  # from the checkpoint
 
 
 def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(
@@ -388,21 +371,6 @@ def test_what_only_lerobots_loop_does_is_refused(name: str, tmp_path: Path) -> N
         with pytest.raises(ConfigError, match=f"{option} is not for bhd-train"):
             refuse_unsupported(config)
         setattr(owner, option, before)
-
-
-@pytest.mark.parametrize("statistics", ["checkpoint", "dataset"])
-def test_a_checkpoint_whose_statistics_have_other_names_does_not_train_on_with_them(
-    data: Path, trained: Path, tmp_path: Path, statistics: str
-) -> None:
-    folder = Path(shutil.copytree(trained, tmp_path / "trained"))
-    for file in folder.rglob("*normalizer_processor.safetensors"):
-        state = load_file(file)
-        save_file({f"buffer.{key}": value for key, value in state.items()}, file)
-    arguments = options(data, tmp_path / "run", {}, fine_tune=folder, fine_tune_statistics=statistics, steps=2)
-    if statistics == "dataset":
-        run_train(arguments)
-    else:
-        refused(arguments, ConfigError, r"normalises .* statistics of: buffer\.")
 
 
 @pytest.mark.parametrize("camera", [False, True])

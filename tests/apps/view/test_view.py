@@ -20,13 +20,12 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
-from aiohttp import web
 from matplotlib.image import imread
 
 from bhd_lerobot.apps.view.dataset import stamp_of
 from bhd_lerobot.apps.view.guard import TOKEN_HEADER, is_loopback
 from bhd_lerobot.apps.view.server import STATIC
-from bhd_lerobot.cli.data import main, view
+from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.errors import DatasetError
 from tests.apps.view.support import Served, episode, served
@@ -312,20 +311,6 @@ def test_the_command_serves_opens_a_browser_and_ends_with_a_signal(base, capsys,
     printed = capsys.readouterr().out
     assert f"3 episodes at {url}" in printed
     assert url.startswith("http://127.0.0.1:")
-
-
-def test_ctrl_c_before_the_address_ends_in_the_same_way(base, capsys, monkeypatch) -> None:
-    start = web.TCPSite.start
-
-    async def interrupted(site: web.TCPSite) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        await start(site)
-
-    monkeypatch.setattr(web.TCPSite, "start", interrupted)
-    assert main.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
-    monkeypatch.setattr(view, "Terminal", lambda: os.kill(os.getpid(), signal.SIGINT))
-    assert main.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
-    assert "Stopped" in capsys.readouterr().err
 
 
 def test_what_cannot_be_shown_is_refused_with_the_remedy(base, tmp_path, capsys) -> None:

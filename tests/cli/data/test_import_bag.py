@@ -9,8 +9,6 @@ import pytest
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.robots.base_host import observation_names
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from tests.cli.data.import_support import TASK, imported, refused, run
 from tests.ros2.bag import support as bags
 from tests.ros2.bag.support import NANO, START, drive, without, write
@@ -59,21 +57,6 @@ def test_bags_of_humble_and_jazzy_become_what_was_measured(tmp_path, storage, st
     assert (columns["control.mode"] == 3).all()
     assert columns["next.done"].tolist() == [False] * (episode.frames - 1) + [True]
     assert main.main(["check", str(tmp_path / "d")]) == 0
-
-
-def test_the_schema_is_that_of_our_recordings(tmp_path, plain):
-    info = imported(plain, tmp_path / "d", "--odometry", "--beams=36")
-    names = list(observation_names(TurtleBot3Config(beams=36, odometry=True)))
-    assert info.features["observation.state"] == {"dtype": "float32", "shape": [41], "names": names}
-    assert info.features["action"]["names"] == ["x.vel", "theta.vel"]
-    assert (info.fps, info.robot_type, info.tasks) == (10, "turtlebot3", ("Drive around.",))
-    columns = read_episode(tmp_path / "d", 0)
-    state = {name: columns["observation.state"][:, column] for column, name in enumerate(names)}
-    # Odometry starts at the episode's start, ahead is x.
-    assert [state[name][0] for name in ("x.pos", "y.pos", "theta.pos")] == [0, 0, 0]
-    way = np.hypot(state["x.pos"], state["y.pos"])
-    assert np.all(np.diff(way) >= 0)
-    assert way[-1] == pytest.approx(0.1 * columns["control.time"][-1], abs=0.02)
 
 
 def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
@@ -411,21 +394,6 @@ def test_an_outcome_is_given_or_marked_later(tmp_path, plain):
     assert "outcome" not in imported(plain, tmp_path / "e").episodes[0].metadata
     assert main.main(["mark", str(tmp_path / "e"), "--episodes=0", "--outcome=collision"]) == 0
     assert dataset_info(tmp_path / "e").episodes[0].metadata["outcome"] == "collision"
-
-
-def test_an_existing_dataset_stays_and_a_refused_import_leaves_none(tmp_path, plain, capsys):
-    (tmp_path / "d").mkdir()
-    (tmp_path / "d" / "mine").write_text("x")
-    assert run(plain, tmp_path / "d") == 2
-    assert "exists already" in capsys.readouterr().err
-    assert (tmp_path / "d" / "mine").read_text() == "x"
-    assert run(tmp_path / "none", tmp_path / "e") == 2
-    assert "no bag at" in capsys.readouterr().err
-    bad = write(tmp_path / "bad", list(filter(without("/odom"), drive())))
-    arguments = ["import", str(plain), str(bad), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
-    assert main.main(arguments) == 2
-    assert "no topic /odom" in capsys.readouterr().err
-    assert not (tmp_path / "e").exists()
 
 
 @pytest.mark.thorough(but=1)

@@ -4,29 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.errors import FrameError
-
-SHAPES = st.tuples(st.integers(1, 60), st.integers(1, 40))
-VALUES = st.floats(-1e6, 1e6, width=32)
-
-
-@pytest.mark.law
-@given(SHAPES.flatmap(lambda shape: arrays(np.float32, shape, elements=VALUES)), st.booleans())
-def test_columns_against_numpy(values: np.ndarray, double: bool) -> None:
-    values = values.astype(np.float64) if double else values
-    stats = statistics.column_stats({"x": values, "flag": values[:, 0] > 0})
-    exact = values.astype(np.float64)
-    np.testing.assert_array_equal(stats["x"]["min"], exact.min(0))
-    np.testing.assert_array_equal(stats["x"]["max"], exact.max(0))
-    np.testing.assert_allclose(stats["x"]["mean"], exact.mean(0), rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(stats["x"]["std"], exact.std(0), rtol=1e-9, atol=1e-9)
-    for name, share in statistics.QUANTILES.items():
-        np.testing.assert_array_equal(stats["x"][name], np.quantile(exact, share, axis=0, method="inverted_cdf"))
-    assert stats["x"]["count"].tolist() == [len(values)]
-    assert stats["flag"]["mean"] == pytest.approx((exact[:, 0] > 0).mean())
 
 
 def test_values_that_are_not_finite() -> None:

@@ -4,17 +4,15 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.recovery.fix import fix, is_fixable
 from bhd_lerobot.datasets.recovery.repair import repair
-from bhd_lerobot.datasets.storage.atomic import noting_what_is_done
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import RootLock
 from bhd_lerobot.errors import DatasetLockedError
-from tests.datasets.edit_support import assert_valid, content, record
+from tests.datasets.edit_support import content, record
 from tests.datasets.foreign import edit_json
 from tests.datasets.support import snapshot
 
@@ -105,20 +103,3 @@ def test_a_file_that_was_being_written_is_no_unfinished_recording(tmp_path: Path
         part.write_text("{")
         use()
         assert not part.parent.exists()
-
-
-@pytest.mark.law
-def test_everything_is_corrected_in_one_step(tmp_path: Path) -> None:
-    root = record(tmp_path / "d", [0, 1, 2])
-    before = content(root)
-    DAMAGES["frames"](root)
-    DAMAGES["wrong mean"](root)
-    data = next(root.glob("data/*/*.parquet"))
-    table = pq.read_table(data)
-    pq.write_table(table.take(list(reversed(range(table.num_rows)))), data)
-    with noting_what_is_done() as sentences:
-        done = fix(root, check_dataset(root).findings)
-    assert len(done) == 3
-    assert sentences == [f"the correction of {root} had been completed"]
-    assert content(root) == before
-    assert_valid(root)

@@ -251,23 +251,6 @@ def test_workspaces_of_killed_processes_only_are_removed(root: Path) -> None:
     assert leftovers(root.parent) == [".d.bhd-notes"]
 
 
-def test_two_moves_into_one_folder_exclude_each_other(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = root.with_name("parts")
-    (folder / "mine").mkdir(parents=True)
-    write = Disk.write
-
-    def meanwhile(self: Disk, path: Path, content: bytes) -> None:
-        if path.name == "info.json" and "/a/" in str(path):
-            with pytest.raises(DatasetLockedError):
-                split(root.with_name("e"), {"c": [0], "d": [1]}, folder)
-        write(self, path, content)
-
-    record(root.with_name("e"), [4, 5])
-    monkeypatch.setattr(Disk, "write", meanwhile)
-    split(root, {"a": [0], "b": [1]}, folder)
-    assert sorted(os.listdir(folder)) == ["a", "b", "mine"]
-
-
 def half_moved(root: Path) -> None:
     """Leave a dataset as a process does that is killed between the renames of an edit."""
     new = root / atomic.WORK / "new"

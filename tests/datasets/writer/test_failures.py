@@ -263,24 +263,6 @@ def test_a_corrupt_file_is_named_and_nothing_is_overwritten(tmp_path: Path) -> N
         (root / name).write_bytes(origin)
 
 
-def test_a_damaged_value_inside_a_file_is_found_by_repair(tmp_path: Path) -> None:
-    root = make(tmp_path / "d")
-    path = root / "data/chunk-000/file-000.parquet"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 8] ^= 0xFF
-    path.write_bytes(content)
-    # The recorder does not merge damaged pages; the new episode stays in its own file.
-    recorder = support.resume(root)
-    support.record(recorder)
-    with pytest.raises(DatasetCorruptError):
-        recorder.finalize()
-    assert len(dataset_info(root).episodes) == 3
-    report = repair(root)
-    assert report.episodes == 2
-    assert any("file-000.parquet" in line for line in report.lost)
-    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes][-1] == 2
-
-
 def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

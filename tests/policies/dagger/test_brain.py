@@ -105,22 +105,6 @@ def test_the_expert_drives_to_the_end_or_for_hold_s_and_has_seen_everything() ->
     assert len(learner.seen) == len(expert.seen) == 12
 
 
-def test_simulations_have_turns_of_their_own_and_a_new_episode_begins_with_the_learner() -> None:
-    brain, learner, expert = made(n=3, patience_s=0.2)
-    assert learner.seeds == [0, 1, 2]  # as it would have them alone
-    assert not set(expert.seeds) & {0, 1, 2}
-    seen = base(3)
-    seen.running[2] = False  # type: ignore[index]
-    for _ in range(3):
-        brain.act(seen)
-    assert brain.interventions().tolist() == [True, True, False]
-    brain.reset(np.array([1]), [7], 3)
-    wanted = brain.act(seen)[:2]
-    assert brain.interventions().tolist() == [True, False, False]
-    assert wanted[:, 0].tolist() == [0.2, 0.1]
-    assert brain.causes()[1] == ""
-
-
 def test_an_expert_with_a_plan_says_what_it_does_where_it_drives() -> None:
     class Planner(Fake):
         has_plan = True

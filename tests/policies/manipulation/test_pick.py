@@ -182,20 +182,6 @@ def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     assert "green box does not fit" in desk.brain.plan(0)["problem"]
 
 
-def test_a_new_episode_starts_from_nothing() -> None:
-    desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
-    desk.look()
-    grasp(desk, 0, opening=0.02)
-    desk.end(0)
-    old = CommandResult(desk.given[0][-1].task_id, True, ResultCode.SUCCEEDED, "")
-    desk.brain.reset(np.array([0]), [1], 2, ["again"])
-    desk.given[0].clear()
-    assert desk.look({0: [old]})[0].task_id == "1-above"
-    assert desk.brain.plan(0)["attempts"] == 1
-    assert desk.brain.plan(0)["instruction"] == "again"
-    assert desk.steps(1) == ["above"]
-
-
 def test_it_picks() -> None:
     seeds = [episode_seed(11, episode, "train") for episode in range(2)]
     for episode in episodes(PickBrain(), PickTask, PickConfig(), seeds):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.commands import CommandResult, ResultCode
+from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
@@ -94,19 +94,6 @@ def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
     assert set(desk.look()) == {1}
     assert desk.brain.subtasks()[0] == "give up: there is no target pose"
     assert desk.look() == {}
-
-
-def test_simulations_do_not_influence_each_other_and_strange_results_are_ignored() -> None:
-    desk = Desk(3)
-    desk.targets[1, 0] = 0.4
-    goals = desk.look()
-    assert [goals[sim].target_pose.position[0] for sim in range(3)] == [0.5, 0.4, 0.5]  # type: ignore[union-attr]
-    stray = CommandResult("7-reach", False, ResultCode.FAULT, "")
-    assert desk.look({0: [stray], 1: [stray], 9: [stray]}) == {}
-    home = desk.end(1, success=False)
-    assert home is not None
-    assert home.joint_target is not None
-    assert list(desk.brain.subtasks()) == ["move the tool to the target", "go home", "move the tool to the target"]
 
 
 def test_a_new_episode_starts_from_nothing() -> None:

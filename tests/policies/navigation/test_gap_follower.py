@@ -236,24 +236,6 @@ def test_an_obstacle_on_a_path_is_met_where_the_path_comes_to_it() -> None:
             assert table.clear(table.rows(scan), 0)[0, path] * QUANTUM <= length
 
 
-def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
-    n, steps = 7, 60
-    rng = np.random.default_rng(4)
-    scans = np.array([random_scans(n, seed=10 + step // 5) for step in range(steps)])
-    scans[20:25, 2] = np.nan
-    twists = rng.uniform((-0.2, -2), (0.2, 2), (steps, n, 2))
-
-    def drive(ids: list[int]) -> np.ndarray:
-        brain, actions = bound(360, len(ids)), []
-        for scan, twist in zip(scans, twists, strict=True):
-            actions.append(brain.act(Observation(names_of(360), np.hstack([twist, scan])[ids])))
-        return np.array(actions)
-
-    together = drive(list(range(n)))
-    for sim in range(n):
-        assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()
-
-
 def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 40.0) -> list[Outcome]:
     simulation = BaseSimulation(TurtleBot3Config(beams=beams), n)
     loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)

@@ -4,16 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import (
     NANO,
-    ROUNDING_NS,
     apart,
-    clock_jumps,
     frame_times,
     grids,
     message_times,
@@ -31,59 +27,6 @@ assert LIDAR is not None
 
 GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
 REACH = {"range_min": np.array([0.12]), "range_max": np.array([3.5])}
-
-steps = st.lists(st.integers(1, 900), min_size=1, max_size=40)
-
-
-def track(gaps):
-    return np.cumsum(np.array(gaps, np.int64)) * MS
-
-
-def frames(sensors, extra):
-    """Return what each frame sees: time -> places of the newest messages, age, late."""
-    seen = {}
-    for grid in grids(sensors, 10, max_age_ns=300 * MS, max_gap_ns=600 * MS):
-        places = [newest(times, grid.times) for times in (*sensors, extra)]
-        age = grid.ages.max(axis=0)
-        for column, time in enumerate(grid.times.tolist()):
-            seen[time] = (*(int(place[column]) for place in places), int(age[column]), bool(age[column] > 300 * MS))
-    return seen
-
-
-@settings(max_examples=300)
-@given(steps, steps, steps, st.data())
-def test_what_comes_after_t_changes_nothing_until_t(a, b, c, data):
-    tracks = [track(a), track(b), track(c)]
-    t = data.draw(st.integers(0, int(max(one[-1] for one in tracks[:2]))))
-    others = []
-    for one in tracks:
-        before = one[one <= t]
-        later = data.draw(st.lists(st.integers(t + ROUNDING_NS + 1, t + 5000 * MS), max_size=8))
-        others.append(np.array([*before, *sorted(later)], np.int64))
-    # the recording goes on after t in both; what is at its end is another question
-    others[0] = np.append(others[0], max(int(others[0][-1]) if len(others[0]) else 0, t) + ROUNDING_NS + 1)
-    first = {time: seen for time, seen in frames(tracks[:2], tracks[2]).items() if time <= t}
-    second = {time: seen for time, seen in frames(others[:2], others[2]).items() if time <= t}
-    for time in first.keys() & second.keys():
-        assert first[time] == second[time]
-    # A frame that only one of them has is a late one at the end of an episode.
-    for time in first.keys() ^ second.keys():
-        assert {**first, **second}[time][-1]
-
-
-@pytest.mark.law
-@settings(max_examples=200)
-@given(steps, steps)
-def test_a_frame_has_the_newest_message_until_then(a, b):
-    sensors = [track(a), track(b)]
-    for grid in grids(sensors, 10, max_age_ns=300 * MS, max_gap_ns=600 * MS):
-        assert np.abs(np.diff(grid.times) - 100 * MS).max(initial=0) <= 1
-        assert (grid.ages >= 0).all()
-        assert (grid.ages <= 600 * MS).all()
-        assert (grid.ages[:, -1] <= 300 * MS).all()
-        for times, ages in zip(sensors, grid.ages, strict=True):
-            for time, age in zip(grid.times, ages, strict=True):
-                assert age == time - times[times <= time].max()
 
 
 @each_case("fps", [1, 7, 24, 29, 30, 60, 333, 1000])
@@ -112,19 +55,6 @@ def test_years_between_two_messages_cost_nothing():
     assert [len(grid.times) for grid in grids([times], 10, max_age_ns=300 * MS, max_gap_ns=10**9)] == [5, 2]
     assert grids([times, times[:0]], 10, max_age_ns=1, max_gap_ns=1) == []
     assert grids([times[:2], times[2:]], 10, max_age_ns=10**9, max_gap_ns=10**9) == []
-
-
-def test_a_clock_that_jumps_back_is_found_where_it_jumps():
-    steady = np.arange(0, 10, dtype=np.int64) * 100 * MS
-    order = np.arange(0, 20, 2)
-    back = steady.copy()
-    back[6:] -= 5000 * MS
-    assert clock_jumps([steady, steady], [order, order + 1]).tolist() == []
-    assert clock_jumps([back, back], [order, order + 1]).tolist() == [12]
-    # A topic that was silent around the jump did not go back by itself.
-    assert clock_jumps([back, steady[:1]], [order, np.array([19])]).tolist() == [12]
-    # Written topic by topic: nothing jumped.
-    assert clock_jumps([steady, steady], [np.arange(10), np.arange(10, 20)]).tolist() == []
 
 
 def test_clocks_are_compared_at_the_same_time():
