@@ -7,11 +7,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bhd_lerobot.cli.ros2 import main
 from bhd_lerobot.ros2.live.topics import Intervals
@@ -105,16 +102,6 @@ def test_hz_prints_a_rate_and_ctrl_c_ends_it_with_a_summary(run: Callable, robot
         process.send_signal(signal.SIGINT)
         assert "all: " in process.stdout.read()
     assert process.returncode == 0
-
-
-@given(st.lists(st.floats(1e-4, 10), min_size=2, max_size=50))
-def test_intervals_of_all_are_those_of_a_window_that_holds_them(gaps: list[float]) -> None:
-    intervals = Intervals(1e6)
-    times = np.cumsum([0.0, *gaps])
-    for time in times:
-        intervals.add(time)
-    assert intervals.of_all() == intervals.of_window(times[-1])
-    assert f"; {len(times)} messages" in intervals.of_all()
 
 
 def test_a_window_forgets_what_is_older() -> None:

@@ -5,8 +5,7 @@ from typing import Any
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType
-from lerobot.envs.configs import EnvConfig
-from lerobot.envs.factory import make_env, make_env_config
+from lerobot.envs.factory import make_env
 from lerobot.envs.utils import close_envs, env_to_policy_features
 
 from bhd_lerobot.envs.config_env import BhdEnvConfig
@@ -18,15 +17,6 @@ from tests.envs.support import NAMES, assert_same, some_actions
 
 AVOID = "TurtleBot3Avoid-v0"
 SHORT: dict[str, Any] = {"robot": {"beams": 36}, "task_options": {"duration_s": 1.0}}
-
-
-def test_lerobot_finds_it_by_its_type() -> None:
-    config = make_env_config("bhd", task=f"bhd_lerobot/{AVOID}", **SHORT)
-    assert isinstance(config, BhdEnvConfig)
-    assert config.type == "bhd"
-    assert config.gym_id == f"bhd_lerobot/{AVOID}"
-    assert config.split == "held_out"
-    assert EnvConfig.get_choice_class("bhd") is BhdEnvConfig
 
 
 @each_case("name", NAMES)

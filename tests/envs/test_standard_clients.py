@@ -10,37 +10,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
-from tests.cases import each_case
 
 AVOID = "bhd_lerobot/TurtleBot3Avoid-v0"
 FRAMES = 5
 BRIEF: dict[str, Any] = {"robot": {"beams": 8}, "task": {"duration_s": FRAMES / 10}}
-
-
-def starts(envs: VecEnv, resets: int = 3) -> list[list[int]]:
-    """Return the seeds of the first episodes of each environment."""
-    seeds = []
-    for _ in range(resets):
-        envs.reset()
-        seeds.append([info["seed"] for info in envs.reset_infos])
-    return np.transpose(seeds).tolist()
-
-
-@each_case("seed", [3, None])
-def test_environments_of_stable_baselines3_run_different_episodes(seed: int | None) -> None:
-    def make() -> list[list[int]]:
-        envs = make_vec_env(AVOID, n_envs=4, seed=seed, env_kwargs=BRIEF)
-        seeds = starts(envs)
-        envs.close()
-        return seeds
-
-    seeds = make()
-    assert len(set(np.ravel(seeds))) == 12
-    assert (make() == seeds) == (seed is not None)
 
 
 VECTOR: dict[str, Callable[[Any], Any]] = {

@@ -6,34 +6,12 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.options.parse import encode, parse
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
-from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
+from bhd_lerobot.options.parse import parse
 from tests.cases import each_case
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))
 BASE = ["--robot.type=turtlebot3", "--task.type=avoid"]
 TWO = [*BASE, "--brains.old.type=avoidance", "--brains.new.type=gap_follower"]
-
-
-def test_brains_keep_their_names_parameters_and_order():
-    config = parse(EvalConfig, [*TWO, "--brains.old.forward_speed=0.1"])
-    assert list(config.brains) == ["old", "new"]
-    assert isinstance(config.brains["old"], AvoidanceConfig)
-    assert config.brains["old"].forward_speed == 0.1
-    assert isinstance(config.brains["new"], GapFollowerConfig)
-    assert config.reference == "old"
-    assert config.split == "held_out"
-
-
-def test_what_is_written_reads_back(tmp_path):
-    import yaml
-
-    config = parse(EvalConfig, [*TWO, "--episodes=[4,2]", "--baseline=new"])
-    path = tmp_path / "config.yaml"
-    path.write_text(yaml.safe_dump(encode(config), sort_keys=False))
-    assert parse(EvalConfig, [f"--config_path={path}"]) == config
-    assert config.indices == [2, 4]
 
 
 def test_a_command_line_adds_takes_out_and_chooses_brains(tmp_path):

@@ -271,17 +271,6 @@ def test_a_sequential_test_ends_a_run_that_is_certain_and_says_so(tmp_path):
     assert "Newcombe" not in result.report.read_text(encoding="utf-8")
 
 
-def test_a_brain_that_does_not_fit_fails_before_any_episode_and_is_named(tmp_path, monkeypatch):
-    def bind(self, *arguments):
-        raise ConfigError("The brain 'gap_follower' needs the observation feature(s) sonar.pos.")
-
-    monkeypatch.setattr(GapFollowerBrain, "bind", bind)
-    monkeypatch.setattr(AvoidanceBrain, "act", lambda self, seen: pytest.fail("an episode was begun"))
-    with pytest.raises(ConfigError, match=r"^brains\.new: The brain 'gap_follower' needs .* sonar\.pos"):
-        run_eval(tmp_path / "x")
-    assert not (tmp_path / "x").exists()
-
-
 def test_a_signal_keeps_finished_episodes_and_marks_the_results_as_partial(whole, tmp_path, monkeypatch):
     calls = 0
     act = GapFollowerBrain.act

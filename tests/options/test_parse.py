@@ -8,7 +8,7 @@ import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.options.parse import encode, parse
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
 from bhd_lerobot.training.rl.config import RlConfig
 from tests.cases import each_case
@@ -26,16 +26,6 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_
     assert (config.seed, config.n_envs, config.robot.beams, config.dataset.fps) == (7, 4, 36, 20)
     assert config.robot.fps == 20  # the robot acts at the dataset's rate
     assert config.dataset.num_episodes == 50
-
-
-@pytest.mark.law
-def test_encoded_configurations_parse_back(tmp_path):
-    import yaml
-
-    config = parse(RecordConfig, [*REQUIRED, "--brain.safe_distance_m=0.4", "--dataset.tags=[x, y]"])
-    path = tmp_path / "c.yaml"
-    path.write_text(yaml.safe_dump(encode(config)))
-    assert parse(RecordConfig, [f"--config_path={path}"]) == config
 
 
 @pytest.mark.parametrize("text", ["1e-2", "0.01", "1.0e-2"])
@@ -124,14 +114,6 @@ def test_files_that_are_no_configuration(tmp_path, name, content, message):
     assert "\n" not in str(caught.value)
     with pytest.raises(ConfigError, match=r"Is a directory.*--config_path a YAML"):
         parse(RecordConfig, [f"--config_path={tmp_path}"])
-
-
-def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
-    def stopped(config):
-        raise KeyboardInterrupt
-
-    assert run(Program(RecordConfig, stopped), REQUIRED) == 130
-    assert capsys.readouterr().err == "Stopped.\n"
 
 
 @each_case(

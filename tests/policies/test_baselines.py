@@ -10,13 +10,6 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.registry import make_simulation, make_task
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
-from bhd_lerobot.tasks.avoid import AvoidConfig
-from bhd_lerobot.tasks.reach import ReachConfig
 from tests.cases import each_case
 
 BASE = turtlebot3_burger().limits.names
@@ -33,15 +26,6 @@ def actions(brain: Any, names: tuple[str, ...], frames: int, seeds: list[int], f
     return np.array([brain.act(Observation(("other", *names), state + 0.001 * frame)) for frame in range(frames)])
 
 
-def run(kind: str, brain: Any, n: int, episodes: int = 3) -> list[Episode]:
-    if kind != "turtlebot3":
-        config = UR5Config(action_space="tool", tool_pose=True) if kind == "ur5 tool" else UR5Config()
-        simulation, task = make_simulation(config, n), make_task(ReachConfig(duration_s=1), n, 25)
-    else:
-        simulation, task = make_simulation(TurtleBot3Config(beams=12), n), make_task(AvoidConfig(duration_s=2), n, 10)
-    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
-
-
 def test_nothing_is_no_speed_and_the_positions_of_the_beginning() -> None:
     assert np.array_equal(actions(NoopBrain(), BASE, 3, [0, 1]), np.zeros((3, 2, 2)))
     held = actions(NoopBrain(), ARM, 3, [0, 1])
@@ -56,14 +40,6 @@ def test_a_new_episode_is_held_where_it_begins() -> None:
     assert held[0] == pytest.approx(0)
     assert held[1] == pytest.approx(0.01)  # not observed before it runs
     assert brain.act(Observation(("other", *ARM), np.ones((2, 8))))[1] == pytest.approx(1)
-
-
-@each_case("kind", ["ur5", "ur5 tool", "turtlebot3"])
-def test_a_robot_that_does_nothing_stays_where_it_is(kind: str) -> None:
-    for episode in run(kind, NoopBrain(), 2):
-        state = episode.columns["observation.state"]
-        columns = slice(0, 2) if kind == "turtlebot3" else slice(0, 6)
-        assert np.abs(state[:, columns] - state[0, columns]).max() < 1e-3
 
 
 @each_case("names", [BASE, ARM])

@@ -36,15 +36,6 @@ def test_it_behaves_like_a_bounded_queue(posts: list[bool], capacity: int) -> No
         assert mailbox.full == (len(model) == capacity)
 
 
-def test_a_record_is_a_copy_on_both_ways() -> None:
-    mailbox, value = Mailbox(RECORD, 1), record(1)
-    assert mailbox.post(value)
-    value["copies"] = 9
-    taken = mailbox.take()
-    assert mailbox.post(record(2))
-    assert number_of(taken) == 1
-
-
 @pytest.mark.parametrize("ends", [(2**62, 0), (0, 2**62), (-5, 3), (2**62, -(2**62))])
 def test_ends_that_cannot_be_empty_the_mailbox_and_what_is_posted_next_arrives(ends: tuple[int, int]) -> None:
     mailbox = Mailbox(RECORD, 3)

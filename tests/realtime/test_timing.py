@@ -1,4 +1,3 @@
-from dataclasses import asdict
 from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
@@ -31,17 +30,6 @@ def test_overruns_and_maxima_are_exact(ticks: list[tuple[int, int]]) -> None:
     assert summary.lateness_max == max(0, late.max()) / 1e9
     assert summary.duration_max == long.max() / 1e9
     assert 0 <= summary.lateness_p50 <= summary.lateness_p99 <= summary.lateness_max
-
-
-def test_a_punctual_loop_is_punctual() -> None:
-    statistics = TimingStatistics(PERIOD)
-    nothing = asdict(statistics.summary())
-    assert [nothing.pop(name) for name in ("period", "clock", "tolerated")] == [PERIOD / 1e9, "lockstep", {}]
-    assert set(nothing.values()) == {0}
-    statistics.add_punctual(1000)
-    summary = statistics.summary()
-    assert (summary.ticks, summary.overruns) == (1000, 0)
-    assert (summary.lateness_p50, summary.lateness_p99, summary.lateness_max) == (0, 0, 0)
 
 
 TICKS = st.lists(st.tuples(st.integers(0, PERIOD - 1), st.integers(0, 20_000_000), st.integers(0, 4)), max_size=40)

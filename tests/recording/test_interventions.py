@@ -12,10 +12,10 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
-from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
+from bhd_lerobot.policies.brain import ConfiguredBrain
+from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.policies.manipulation.servo import PickServoConfig
-from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -74,31 +74,6 @@ def test_exactly_the_frames_that_the_expert_drove_are_flagged_and_its_actions_ar
         assert [(intervention.first, intervention.end) for intervention in episode.interventions] == [(5, 8), (13, 16)]
         assert {intervention.cause for intervention in episode.interventions} == {"time is up"}
         assert episode.commands is None
-
-
-class Spy(GapFollowerBrain):
-    """Remembers everything that it was shown."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: list[np.ndarray] = []
-
-    def act(self, observation: Any) -> np.ndarray:
-        self.seen.append(observation.state.copy())
-        return super().act(observation)
-
-
-def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_memory() -> None:
-    spy = Spy()
-    settings = DaggerConfig(RandomConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 1.0})
-    (episode,) = run("turtlebot3", DaggerBrain(settings, RandomBrain(RandomConfig()), spy), n=1, episodes=1)
-    np.testing.assert_array_equal(np.array(spy.seen)[:, 0], episode.columns[keys.OBSERVATION_STATE].astype(float))
-    other = GapFollowerBrain()
-    simulation = make_simulation(TurtleBot3Config(beams=36), 1)
-    other.bind(RobotFeatures(simulation.observation_names, simulation.action_names, 10, body=simulation.body))
-    other.reset(np.arange(1), [0], 1)
-    advised = [other.act(Observation(simulation.observation_names, state))[0] for state in spy.seen]
-    np.testing.assert_array_equal(episode.columns[keys.ACTION][10:], np.array(advised, np.float32)[10:])
 
 
 AVOID = {"brain__type": "dagger", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}

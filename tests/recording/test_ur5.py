@@ -9,7 +9,7 @@ import pytest
 from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.rollout.replay import Replay
-from tests.recording.support import data_columns, episode_rows, run_record, start
+from tests.recording.support import data_columns, episode_rows, run_record
 
 PICK = {
     "robot__type": "ur5",
@@ -138,11 +138,3 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
     assert np.abs(state[:, 7:]).max() < 0.1  # nothing moved but by the noise
     assert json.loads(episode.metadata["goals"]) == []
     assert Replay(root, 0).open_loop().identical
-
-
-@pytest.mark.thorough
-def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
-    root = tmp_path / "killed"
-    start(root, 1, **PICK, **SPOKEN, resume="true").kill()
-    record(root, **SPOKEN, n_envs=2, resume="true")
-    assert data_columns(root) == data_columns(recorded)

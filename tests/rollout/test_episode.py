@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.commands import Chunk
-from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import ConfiguredBrain, is_privileged
 from bhd_lerobot.registry import make_robot, make_simulation, make_task
@@ -102,20 +102,6 @@ def test_a_chunk_does_what_its_actions_sent_one_by_one_do(kind: str, length: int
         assert first.columns.keys() == second.columns.keys()
         for key, column in first.columns.items():
             np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
-
-
-@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
-def test_a_chunk_that_is_used_up_means_hold(kind: str) -> None:
-    (episode, *_) = run(kind, Script(script(kind), 4, FRAMES))
-    columns = episode.columns
-    assert len(columns[keys.ACTION]) == FRAMES
-    # The requested setpoint stays the last one.
-    np.testing.assert_array_equal(columns[keys.ACTION][4:], np.tile(columns[keys.ACTION][3], (FRAMES - 4, 1)))
-    assert columns[keys.MODE][3] == Mode.TRACKING
-    assert columns[keys.MODE][-1] == Mode.HOLD
-    assert (columns[keys.WATCHDOG] & Watchdog.COMMAND_AGE).any()
-    steps = np.abs(np.diff(columns[keys.APPLIED_ACTION][-3:], axis=0))
-    assert (steps < 1e-6).all()
 
 
 class Breaker(Script):

@@ -236,13 +236,3 @@ def test_in_the_loop_an_outcome_ends_its_episode_and_no_other() -> None:
         if key not in (keys.EVENT, keys.SUCCESS, keys.DONE, keys.REWARD):
             np.testing.assert_array_equal(marked[1].columns[key], column[:6], err_msg=key)
     assert marked[0].outcome == plain[0].outcome
-
-
-def test_in_the_loop_an_intervention_flags_its_frames() -> None:
-    plain = run({}, 1)
-    marked = run({(0, 4): lambda m: m.intervention(True), (0, 9): lambda m: m.intervention(False)}, 1)
-    expected = [
-        Event.INTERVENTION if 4 <= frame < 9 else event for frame, event in enumerate(plain[0].columns["event"])
-    ]
-    assert marked[0].columns[keys.EVENT].tolist() == expected
-    np.testing.assert_array_equal(marked[0].columns[keys.ACTION], plain[0].columns[keys.ACTION])

@@ -7,16 +7,6 @@ import threading
 from bhd_lerobot.rollout.signals import stop_on_signals
 
 
-def test_the_first_signal_is_a_request_and_the_handlers_come_back() -> None:
-    former = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        with stop_on_signals() as request:
-            assert not request
-            os.kill(os.getpid(), number)
-            assert (request.name, request.exit_status) == (number.name, 128 + number)
-        assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == former
-
-
 def test_the_second_hangup_of_a_closed_session_does_not_kill() -> None:
     with stop_on_signals() as request:
         os.kill(os.getpid(), signal.SIGHUP)

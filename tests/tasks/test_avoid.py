@@ -69,16 +69,6 @@ def test_the_path_is_walked_not_the_way_from_the_start() -> None:
     assert run.outcome().details["path_m"] == pytest.approx(200 * 0.02)
 
 
-@each_case("when", [1, 7, 200])
-def test_a_touch_is_a_collision_at_once_even_in_the_last_frame(when: int) -> None:
-    run = Run(AvoidConfig(duration_s=20.0))
-    for frame in range(1, when + 1):
-        run.frame(on_circle(frame, 0.2), frame == when)
-    assert run.events[0] == Event.COLLISION
-    assert run.frames[0] == when
-    assert not run.outcome().success
-
-
 @each_case(("step", "stuck_after"), [(0.0, 100), (0.0009, 100), (0.0011, None)])
 def test_less_than_a_tenth_of_a_metre_in_ten_seconds_is_stuck(step: float, stuck_after: int | None) -> None:
     run = Run(AvoidConfig())

@@ -152,15 +152,6 @@ def test_the_tolerances_are_the_borders(off: tuple[float, float, float], event: 
     assert run.events[0] == event
 
 
-def test_a_touch_is_a_collision_before_all_else() -> None:
-    run = Run(NavigateConfig(hold_s=0.1))
-    drive_to_goal(run)
-    run.frame(GOAL)
-    run.frame(GOAL, touched=True)
-    assert run.events[0] == Event.COLLISION
-    assert run.outcome().score == 0
-
-
 def test_the_end_of_time_is_a_time_out_and_standing_still_is_stuck() -> None:
     run = Run(NavigateConfig(duration_s=5.0))
     for frame in range(50):

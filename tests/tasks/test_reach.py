@@ -9,14 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene, Variation
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event
-from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.tasks.support import Judged
 
 FPS = 20
@@ -85,28 +84,8 @@ def test_targets_are_in_the_workspace_of_the_arm_and_starts_around_its_home() ->
         assert scene.posture[6] == 0.05
 
 
-def test_randomisation_changes_the_world_and_not_the_task() -> None:
-    plain = ReachTask(ReachConfig(), 1, FPS)
-    wild = ReachTask(ReachConfig(randomisation=RandomisationConfig(enabled=True)), 1, FPS)
-    for seed in range(5):
-        one, two = plain.sample(seed), wild.sample(seed)
-        assert (one.target_pose, one.posture) == (two.target_pose, two.posture)
-        assert one.variation == Variation() != two.variation
-
-
 def test_without_spread_it_starts_at_home() -> None:
     assert ReachTask(ReachConfig(start_spread_rad=0.0), 1, FPS).sample(3).posture == ARM.arm.home
-
-
-def test_the_target_is_reported_to_the_brain() -> None:
-    task = ReachTask(ReachConfig(), 2, FPS)
-    scenes = [task.sample(seed) for seed in (1, 2)]
-    task.begin(np.array([1, 0]), scenes)
-    state = task.environment_state(None)  # type: ignore[arg-type]
-    assert state.tolist() == [list(scenes[1].target_pose or ()), list(scenes[0].target_pose or ())]
-    assert state.shape[1] == len(task.environment_names)
-    state[:] = 0  # a copy
-    assert task.environment_state(None).any()  # type: ignore[arg-type]
 
 
 def test_orientation_counts_and_its_quaternion_s_sign_does_not() -> None:

@@ -1,6 +1,5 @@
 """What is wrong with what tasks tell: as noisy, late and incomplete as it is set to be, and otherwise the truth."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import Drive
-from bhd_lerobot.bodies.scenes import scene_from_json, scene_to_json
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.truth import ArmTruth, BaseTruth
 from bhd_lerobot.errors import ConfigError
@@ -108,19 +106,6 @@ def test_the_trail_is_drawn_around_a_wrong_pose_on_true_ground() -> None:
     noisy = told("avoid", 120, noise_m=0.3).reshape(120, 16, 8)
     assert 0.02 < (noisy != true).mean() < 0.5
     assert set(np.unique(noisy)) == {0.0, 1.0}
-
-
-@each_case("name", TASKS)
-def test_the_seed_decides_and_the_scene_is_that_without(name: str) -> None:
-    assert np.array_equal(told(name, 50, **WRONG), told(name, 50, **WRONG))
-    plain, wrong = make(name), make(name, **WRONG)
-    scenes = [(plain.sample(seed), wrong.sample(seed)) for seed in range(10)]
-    for one, other in scenes:
-        assert one.report_seed == 0
-        assert dataclasses.replace(other, report_seed=0) == one
-        assert scene_from_json(scene_to_json(other)) == other
-    assert len({other.report_seed for _, other in scenes}) == 10
-    assert not np.array_equal(told(name, 50, noise_m=0.1), told(name, 50, seed=8, noise_m=0.1))
 
 
 @each_case("name", TASKS)

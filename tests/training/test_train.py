@@ -18,9 +18,7 @@ from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.log import MetricsFile
 from tests.fake_hub.hub import FakeHub
-from tests.forks import Fork
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
-from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -127,20 +125,6 @@ def test_a_resumed_run_continues_to_the_same_bits(
     assert curve(tmp_path / "cut") == curve(tmp_path / "whole")
     weights = "checkpoints/last/pretrained_model/model.safetensors"
     assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
-
-
-def test_sigkill_anywhere_and_resuming_gives_the_undisturbed_curve(data: Path, tmp_path: Path) -> None:
-    run = tmp_path / "cut"
-    # A constant learning rate, because another one depends on the number of steps.
-    common = {"log_freq": 7, "save_freq": 10, "policy": {**MLP, "policy.scheduler": "constant"}}
-    process = Fork(main, options(data, run, steps=5000, **common), output=tmp_path / "output")
-    until(lambda: len(list((run / "checkpoints").glob("0*"))) > 3 or process.poll() is not None)
-    assert process.kill() == -signal.SIGKILL, (tmp_path / "output").read_text()
-    done = json.loads((run / "checkpoints" / "last" / "training_state" / "training_step.json").read_text())["step"]
-    assert 0 < done < 5000
-    run_train(["--resume=true", f"--config_path={run}", f"--steps={done + 25}"])
-    run_train(options(data, tmp_path / "whole", steps=done + 25, **common))
-    assert curve(run) == curve(tmp_path / "whole")
 
 
 def test_ctrl_c_saves_and_prints_the_resume_command(

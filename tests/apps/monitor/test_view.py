@@ -1,6 +1,5 @@
 """The display of `bhd-monitor`: everything fits, nothing jumps, and what matters is shown."""
 
-import dataclasses
 import io
 from typing import Any
 
@@ -11,8 +10,7 @@ from rich.console import Console
 from bhd_lerobot.apps.monitor import state as monitor_state
 from bhd_lerobot.apps.monitor.state import Count, Dimension, MonitorState, Spread
 from bhd_lerobot.apps.monitor.view import KEYS, render, unit
-from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
+from bhd_lerobot.control.messages import Mode
 from tests.cases import each_case
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
@@ -174,21 +172,3 @@ def test_a_latched_mode_is_written_in_white_on_red_and_no_other_is() -> None:
 
     red = {mode.name for mode in Mode if styles(mode.name) == {"bold white on red"}}
     assert red == {"ESTOP", "FAULT"}
-
-
-def test_the_names_are_those_of_what_the_states_count() -> None:
-    assert tuple(limit.name for limit in LIMITS) == monitor_state.LIMITS
-    assert tuple(watchdog.name for watchdog in WATCHDOGS) == monitor_state.WATCHDOGS
-    assert len(monitor_state.REASONS) == len(Reason)
-    assert set(monitor_state.LIMITS) == {one.name for one in Limit} - {"NONE"}
-    assert set(monitor_state.WATCHDOGS) == {one.name for one in Watchdog} - {"NONE"}
-
-
-def test_as_json_there_is_nothing_that_json_does_not_know() -> None:
-    plain = dataclasses.replace(
-        state(), command_age=float("nan"), dimensions=(Dimension("a", None, float("inf"), 1.0),)
-    )
-    plain_values = plain.as_dict()
-    assert plain_values["command_age"] is None
-    assert plain_values["dimensions"] == [{"name": "a", "requested": None, "applied": None, "measured": 1.0}]
-    assert plain_values["limits"]["VELOCITY"] == {"count": 0, "per_second": 0.0}

@@ -7,7 +7,6 @@ import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
 from bhd_lerobot.datasets.storage.disk import RootLock
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
 from tests.apps.view.support import served
 from tests.datasets.loader.support import FRONT, record_ours
@@ -39,17 +38,6 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
             lock.release()
         assert status == 409
         assert "being recorded, repaired or edited" in content.decode()
-
-
-@pytest.mark.parametrize(("folder", "name"), [("pick/d", "d"), ("pick/dataset", "pick")])
-def test_an_empty_dataset_and_the_name_of_a_dataset(tmp_path, folder, name) -> None:
-    root = tmp_path / folder
-    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
-    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=root, recording={}).finalize()
-    with served(root) as server:
-        assert (found := server.json("/api/dataset"))["name"] == name
-        assert found["episodes"]["frames"] == []
-        assert server.ask("/api/episodes/0")[0] == 409
 
 
 def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:

@@ -107,16 +107,6 @@ def test_a_dataset_is_named_in_one_of_three_ways(recorded, monkeypatch):
         assert main.main(["repair", *arguments]) == 0
 
 
-def test_repair_reports_what_it_dropped(recorded, tmp_path, capsys):
-    root = tmp_path / "d"
-    shutil.copytree(recorded, root)
-    leftover = root / "data" / "chunk-000" / "file-007.parquet"
-    leftover.write_bytes(b"half an episode")
-    assert main.main(["repair", str(root)]) == 0
-    assert "file-007.parquet" in capsys.readouterr().out
-    assert not leftover.exists()
-
-
 def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, capsys):
     root = tmp_path / "d"
     shutil.copytree(recorded, root)

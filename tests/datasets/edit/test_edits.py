@@ -20,7 +20,6 @@ from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import (
     ConfigError,
-    DatasetCorruptError,
     DatasetError,
     DatasetExistsError,
     DatasetLockedError,
@@ -214,17 +213,6 @@ def test_a_dataset_that_is_being_recorded_is_refused(tmp_path: Path) -> None:
     recorder._lock.release()  # as after a kill
     with pytest.raises(DatasetError, match="bhd-data repair"):
         merge([root, tmp_path / "open"], tmp_path / "all")
-
-
-def test_a_damaged_source_is_named(plain: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(plain, tmp_path / "d")
-    path = next(root.glob("data/*/*.parquet"))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    path.write_bytes(bytes(data))
-    with pytest.raises(DatasetCorruptError, match=str(path)):
-        delete(root, [0])
-    assert path.read_bytes() == bytes(data)
 
 
 def stock(root: Path) -> Path:

@@ -71,6 +71,8 @@ def test_an_outcome_is_written_to_every_column(tmp_path: Path) -> None:
 def test_marks_can_be_undone(tmp_path: Path) -> None:
     root = recorded(tmp_path / "d")
     before = content(root)
+    with pytest.raises(ConfigError, match="Give the episodes"):
+        mark(root, [], outcome="success")
     mark(root, [0, 2], outcome="success")
     mark(root, [0], intervention=(1, 3))
     assert content(root) != before

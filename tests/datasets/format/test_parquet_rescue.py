@@ -77,16 +77,6 @@ def test_without_the_footer_everything_is_found(tmp_path: Path, rows: list[int],
     assert (found.problem, found.lost_bytes) == ("it has no footer", 0)
 
 
-def test_a_file_with_a_footer_is_read(tmp_path: Path) -> None:
-    tables = [table(5, 0), table(6, 1)]
-    with pq.ParquetWriter(tmp_path / "f.parquet", SCHEMA) as writer:
-        for one in tables:
-            writer.write_table(one)
-    found = rescue(tmp_path / "f.parquet", SCHEMA)
-    assert [group.to_pydict() for group in found.groups] == [one.to_pydict() for one in tables]
-    assert not found.problem
-
-
 @pytest.mark.law
 def test_only_whole_row_groups_of_a_truncated_file_are_found(tmp_path: Path) -> None:
     tables = [table(5 + seed, seed) for seed in range(4)]

@@ -49,16 +49,3 @@ def test_images_against_numpy(size: tuple[int, int]) -> None:
         np.testing.assert_allclose(stats[name].ravel(), wanted, atol=1e-9)
     assert stats["count"].tolist() == [len(chosen)]
     assert stats["mean"].shape == (3, 1, 1)
-
-
-@pytest.mark.law
-@given(st.lists(st.integers(1, 30), min_size=1, max_size=5), st.integers(0, 1000))
-def test_aggregation_is_exact_where_it_can_be(lengths: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    episodes = [rng.normal(rng.normal() * 5, 2, (length, 3)) for length in lengths]
-    stats = [statistics.column_stats({"x": episode})["x"] for episode in episodes]
-    total = statistics.aggregate({name: np.stack([s[name] for s in stats]) for name in statistics.STATISTICS})
-    together = np.concatenate(episodes)
-    for name in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(total[name], getattr(together, name)(axis=0), rtol=1e-9, atol=1e-9)
-    assert total["count"].tolist() == [len(together)]

@@ -129,14 +129,6 @@ def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> No
         frame_weights(open_metadata(foreign), None, intervention=0.0)
 
 
-def test_selected_and_split_episodes_reach_the_loaders(plain: Path) -> None:
-    config = LoaderConfig(batch_size=64, selection=EpisodeFilter(), eval_split=0.4)
-    loaders = make_loader("t/t", config, root=plain)
-    assert loaders.held_out is not None
-    assert set(next(iter(loaders.train))["episode_index"].tolist()) == {0}
-    assert set(next(iter(loaders.held_out))["episode_index"].tolist()) == {1, 4}
-
-
 KEYS = ["observation.state", "action"]
 
 

@@ -10,8 +10,6 @@ from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.recovery.fix import fix, is_fixable
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
-from bhd_lerobot.datasets.writer.recorder import RootLock
-from bhd_lerobot.errors import DatasetLockedError
 from tests.datasets.edit_support import content, record
 from tests.datasets.foreign import edit_json
 from tests.datasets.support import snapshot
@@ -71,15 +69,6 @@ def test_nothing_is_fixed_while_there_is_another_error(tmp_path: Path) -> None:
     assert any(is_fixable(one) for one in found)
     assert fix(root, found) == []
     assert snapshot(root) == before
-
-
-def test_not_while_it_is_recorded(tmp_path: Path) -> None:
-    root = record(tmp_path / "d", [0, 1, 2])
-    DAMAGES["gone"](root)
-    lock = RootLock(root)
-    with pytest.raises(DatasetLockedError):
-        fix(root, check_dataset(root).findings)
-    lock.release()
 
 
 @pytest.mark.parametrize("ours", [True, False])

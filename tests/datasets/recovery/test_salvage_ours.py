@@ -268,16 +268,3 @@ def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None
     assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
     assert edits_of(root)[-1]["episodes"] == [0, 2]
     assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == 2
-
-
-def test_an_invalid_info_is_refused(recorded: Path, tmp_path: Path) -> None:
-    root = copied(recorded, tmp_path / "d")
-    (root / "meta/bhd.json").unlink()
-    cut(1000)(root / DATA)
-    info = json.loads((root / "meta/info.json").read_text())
-    for change in ({"features": {"a": 1}}, {"features": {"a": {}}}, {"fps": 0}, {"codebase_version": None}):
-        (root / "meta/info.json").write_text(json.dumps(info | change))
-        before = support.snapshot(root)
-        with pytest.raises(DatasetError, match=r"info\.json|format"):
-            repair(root)
-        assert support.snapshot(root) == before

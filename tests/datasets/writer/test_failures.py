@@ -103,16 +103,6 @@ def file_size_limit(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_the_kernel_refuses_a_data_file(tmp_path: Path) -> None:
-    with support.create(tmp_path / "d") as recorder:
-        support.record(recorder)
-        with file_size_limit(2000), pytest.raises(DatasetWriteError, match="file-size limit"):
-            support.record(recorder)
-        assert recorder.num_episodes == 1
-        support.record(recorder)
-    assert support.verify(tmp_path / "d", 2, stats=True) == 2
-
-
 def test_the_kernel_refuses_a_video(tmp_path: Path) -> None:
     """The encoder runs in a thread; its error arrives at the next image or at save, and nobody waits forever."""
     root = tmp_path / "d"

@@ -133,14 +133,3 @@ def test_only_the_loss_of_the_ranges_depends_on_them() -> None:
     assert torch.equal(policy.forward(ready)[0], policy.forward(other)[0])
     policy.config.range_weight = 0.5
     assert policy.forward(ready)[0] != policy.forward(other)[0]
-
-
-def test_it_knows_the_statistics_as_a_perceptron_does() -> None:
-    stats = {
-        OBS_STATE: {"mean": torch.zeros(len(NAMES)), "std": torch.full((len(NAMES),), 2.0)},
-        ACTION: {"mean": torch.zeros(2), "std": torch.ones(2)},
-    }
-    policy = CnnPolicy(config(residual=["*.vel"], residual_columns=[0, 1]), dataset_stats=stats)
-    assert policy.residual is not None
-    state = torch.randn(5, len(NAMES))
-    assert torch.equal(policy.residual(state)[:, 0], 2 * state[:, :2])

@@ -1,6 +1,5 @@
 """The brain `dagger`: who drives when, and what learner and expert see."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.baselines import NoopConfig, RandomConfig
+from bhd_lerobot.policies.baselines import NoopConfig
 from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.dagger.takeover import (
@@ -166,15 +165,6 @@ def test_a_robot_whose_collisions_it_cannot_foresee_is_refused() -> None:
         collision_watch(0.5, RobotFeatures(("a.pos",), ("a.pos",), 10))
     with pytest.raises(ConfigError, match=r"not known of tool\.x"):
         DisagreementWatch(0.1, 1, RobotFeatures(("tool.x",), ("tool.x",), 10))
-
-
-def test_the_parameters_name_both_and_are_plain() -> None:
-    brain = make_brain(DaggerConfig(RandomConfig(scale=0.5), GapFollowerConfig(), hold_s=2.0))
-    parameters = json.loads(json.dumps(brain.parameters()))
-    assert parameters["type"] == "dagger"
-    assert parameters["hold_s"] == 2.0
-    assert parameters["learner"] == {"type": "random", "period_s": 1.0, "scale": 0.5}
-    assert parameters["expert"]["type"] == "gap_follower"
 
 
 @pytest.mark.law

@@ -55,14 +55,6 @@ def test_a_relation_chooses_the_most_extreme_of_those_that_fit_without_it(
         assert max(without, key=MOST[relation]) in found
 
 
-@given(scenes(), st.sampled_from(Relation), st.data())
-def test_the_order_of_the_objects_does_not_count(
-    scene: list[SceneObject], relation: Relation, data: st.DataObject
-) -> None:
-    what = Description(relation=relation)
-    assert fitting(what, data.draw(st.permutations(scene))) == fitting(what, scene)
-
-
 @given(scenes())
 def test_mirroring_the_table_swaps_left_and_right_and_nothing_else(scene: list[SceneObject]) -> None:
     swap = {Relation.LEFT: Relation.RIGHT, Relation.RIGHT: Relation.LEFT}

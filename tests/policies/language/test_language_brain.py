@@ -113,17 +113,6 @@ def test_an_object_that_was_not_seen_is_not_on_the_table() -> None:
     assert place(one, 1) == pytest.approx((CUP.x, CUP.y))
 
 
-def test_to_hand_over_is_to_bring_it_beside_the_table_and_keep_it() -> None:
-    one = desk("hand me the red cup")
-    one.look()
-    assert carry_out(one) == ["above", "down", "close", "lift", "hand_over"]
-    pose = one.given[0][-1].target_pose
-    assert pose is not None
-    assert abs(pose.position[1]) > 0.3
-    assert one.given[0][-1].gripper is None
-    assert one.brain.subtasks()[0] == "done"
-
-
 def planned(*skills: Skill) -> TextPlanner:
     """Return a planner on top of a language model that always answers these skills, with the blue box."""
     answer = {"target": 1, "steps": [{"skill": skill.value, "object": 1} for skill in skills]}

@@ -35,19 +35,6 @@ def drive(brain: LearnedBrain, seen: list[Observation], seeds: list[int]) -> NDA
     return np.array(actions)
 
 
-@pytest.mark.thorough(but=4)
-@pytest.mark.parametrize("kind", KINDS)
-def test_alone_its_actions_are_those_of_lerobot_to_the_bit(checkpoints: dict[str, Path], kind: str) -> None:
-    brain, stock = make_brain(checkpoints[kind]), Stock(checkpoints[kind])
-    for seed in (5, 6):  # a second episode begins in the middle of the first one's chunk
-        seen = list(observations(1, FRAMES, seed))
-        stock.reset(seed)
-        wanted = np.array([stock.act(one) for one in seen])
-        actions = drive(brain, seen, [seed])[:, 0]
-        assert np.array_equal(actions, wanted.astype(np.float64))
-        assert len(np.unique(actions, axis=0)) == FRAMES  # something was there to compare
-
-
 @pytest.mark.parametrize("kind", ["mlp_history", "act_average", "diffusion", "mlp_sample", "pixels_image", "cnn_image"])
 def test_any_policy_runs_as_copies_with_the_actions_of_lerobot(checkpoints: dict[str, Path], kind: str) -> None:
     brain, stock = make_brain(checkpoints[kind]), Stock(checkpoints[kind])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
-from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
+from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, read_objects
 from tests.cases import each_case
 
 angles = st.floats(-math.pi, math.pi)
@@ -130,25 +130,6 @@ def test_fingers_never_stand_in_a_neighbour_when_another_way_has_room(seed: int)
     if best > 0:
         for tip in fingers(grasp):
             assert min(np.linalg.norm(tip - other.position[:2]) for other in others) > 0.025
-
-
-def test_a_box_is_taken_across_its_wide_side_when_the_narrow_one_is_blocked() -> None:
-    target = box(0.07, 0.05)  # both sides fit
-    beside = cup(0.06, y=0.085, index=1)
-    free, blocked = plan_grasp(target, [], MAX_OPENING), plan_grasp(target, [beside], MAX_OPENING)
-    assert free is not None
-    assert blocked is not None
-    assert between_lines(blocked.yaw, 0.0) < 1e-9  # along x, away from the neighbour at +y
-    assert blocked.room > 0
-
-
-@given(st.floats(0.3, 0.7), st.floats(-0.4, 0.4), st.floats(0.1, 0.5), st.floats(-10, 10))
-def test_the_tool_points_straight_down_with_its_fingers_on_the_line(x: float, y: float, z: float, yaw: float) -> None:
-    matrix = pointing_down(x, y, z, yaw).matrix()
-    assert matrix[:3, 3].tolist() == [x, y, z]
-    assert np.allclose(matrix[:3, 2], [0, 0, -1], atol=1e-12)
-    assert np.allclose(matrix[:3, 1], [math.cos(yaw), math.sin(yaw), 0], atol=1e-9)
-    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
 
 
 @given(st.floats(0.005, 0.3))

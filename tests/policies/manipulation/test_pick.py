@@ -165,15 +165,6 @@ def test_without_a_target_it_does_nothing_and_reports_why(what: str) -> None:
     assert desk.brain.plan(0)["target"] is None
 
 
-@pytest.mark.parametrize("column", [0, 3])
-def test_a_target_that_vanishes_is_given_up(column: int) -> None:
-    desk = Desk(PickBrain(), [scene(CUP)])
-    desk.look()
-    desk.table[0, 0, column] = np.nan if column else 0.0
-    assert desk.end() is None
-    assert desk.brain.subtasks()[0] == "cannot: the object is gone"
-
-
 def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     with pytest.raises(ConfigError, match="'pick' needs the environment feature"):
         PickBrain().bind(RobotFeatures(OBSERVED, OBSERVED, 25, (), body=ur5()))

@@ -45,14 +45,6 @@ def test_it_asks_for_the_target_once_and_holds() -> None:
     assert desk.look() == {}
 
 
-def test_a_known_camera_error_is_subtracted() -> None:
-    desk = Desk(camera_error_m=[0.02, -0.01, 0.1])
-    goal = desk.look()[0]
-    assert goal.target_pose is not None
-    assert goal.target_pose.position == pytest.approx(TARGET[:3] - (0.02, -0.01, 0.1), abs=1e-15)
-    assert goal.target_pose.quaternion == pytest.approx(tuple(TARGET[3:]))
-
-
 def test_a_quaternion_in_single_precision_is_made_a_unit_again() -> None:
     desk = Desk()
     desk.targets[0, 3:] = np.array([0.1, 0.7, 0.7, 0.1]).astype(np.float32)
@@ -96,17 +88,6 @@ def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
     assert desk.look() == {}
 
 
-def test_a_new_episode_starts_from_nothing() -> None:
-    desk = Desk(attempts=1)
-    desk.look()
-    desk.end(success=False)
-    desk.brain.reset(np.array([0]), [0], 1)
-    desk.given[0].clear()
-    assert desk.look()[0].task_id == "1-reach"
-    assert desk.end() is None
-    assert desk.brain.subtasks()[0] == "hold"
-
-
 def test_a_speed_that_no_joint_of_the_arm_has_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"brain\.max_velocity is 3\.2; .* 3\.14159 rad/s"):
         ReachBrain(ReachBrainConfig(max_velocity=3.2)).bind(RobotFeatures((), (), 25, ENVIRONMENT, body=ur5()))
@@ -115,16 +96,6 @@ def test_a_speed_that_no_joint_of_the_arm_has_is_refused() -> None:
 def test_a_task_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
         ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, (), body=ur5()))
-
-
-@pytest.mark.parametrize("randomised", [False, True])
-def test_it_reaches(randomised: bool) -> None:
-    config = ReachConfig(randomisation=RandomisationConfig(enabled=randomised))
-    seeds = [episode_seed(3, index, "train") for index in range(8)]
-    for episode in episodes(ReachBrain(), ReachTask, config, seeds, n=4):
-        assert episode.outcome.success, episode.results
-        assert episode.outcome.details["error_m"] <= config.tolerance_m
-        assert [result.task_id for _, result in episode.results] == ["1-reach"]
 
 
 def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not() -> None:

@@ -9,9 +9,7 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.baselines import NoopBrain
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.manipulation.servo import (
     PickServoBrain,
     PickServoConfig,
@@ -152,17 +150,6 @@ def test_without_an_object_or_a_target_it_stays_where_it_is() -> None:
     reach.bind(features(POSE))
     for told in (np.zeros((5, 7)), np.full((5, 7), np.nan)):
         assert np.allclose(reach.act(Observation(TOOL_NAMES, state, {}, told)), state)
-
-
-def test_as_an_expert_it_says_in_every_frame_what_it_would_do() -> None:
-    brain = DaggerBrain(DaggerConfig(learner=None, expert=None, collision_s=None, stall_s=None), NoopBrain(), pick())  # type: ignore[arg-type]
-    brain.bind(features(ENVIRONMENT))
-    brain.reset(np.arange(3), [1, 2, 3], 3)
-    state, told = tools(3, np.random.default_rng(4)), tables(3)
-    seen = Observation(TOOL_NAMES, state, {}, told)
-    driven = brain.act(seen)
-    assert np.allclose(driven, state)  # the learner drives
-    assert np.array_equal(brain.advice(), pick().act(seen))
 
 
 def test_an_error_of_the_camera_that_cannot_be_is_refused() -> None:

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bhd_lerobot.options.parse import decode
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -11,7 +9,6 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceC
 from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
-NAMES = tuple(f"scan_{beam:03d}.pos" for beam in range(360))
 AHEAD, LEFT, STOP = (0.2, 0.0), (0.0, 0.5), (0.0, 0.0)
 
 
@@ -76,28 +73,6 @@ def test_any_number_of_beams(beams: int) -> None:
     assert tuple(decide(scan)[0]) == AHEAD
     scan[0] = 0.2
     assert tuple(decide(scan)[0]) == LEFT
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
-def test_many_robots_decide_like_each_alone(seed: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    scan = rng.choice(
-        [np.nan, 0.0, 0.12, 0.4, 0.5, 1.0, 3.5, 9.0], (n, 360), p=[0.1, 0.1, 0.01, 0.01, 0.1, 0.3, 0.3, 0.08]
-    )
-    together = decide(scan)
-    assert np.array_equal(together, np.vstack([decide(row) for row in scan]))
-    # Left and right count the same: a mirrored scan gives the same decision.
-    assert np.array_equal(together, decide(np.roll(scan[:, ::-1], 1, axis=1)))
-
-
-def test_the_observation_is_left_alone_and_nothing_is_remembered() -> None:
-    scan = np.random.default_rng(1).uniform(0.3, 1.0, (3, 360))
-    scan.flags.writeable = False
-    brain = AvoidanceBrain()
-    brain.bind(RobotFeatures(NAMES, ACTIONS, 10))
-    first = brain.act(Observation(NAMES, scan))
-    for _ in range(3):
-        assert np.array_equal(brain.act(Observation(NAMES, scan)), first)
 
 
 def test_parameters_are_used_under_the_names_of_the_articles_nodes_too() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
@@ -107,16 +106,6 @@ def test_a_new_look_at_held_out_images_replaces_the_calibration(trained: Percept
         trained.factor.fill_(before)
     assert before > 0
     assert len({before, added, alone}) == 3
-
-
-def test_nothing_is_normalised() -> None:
-    made = config()
-    PerceptionPolicy(made)
-    before, _ = make_pre_post_processors(made, dataset_stats={})
-    given = batch(2)
-    after = before(dict(given))
-    assert torch.equal(after[IMAGE], given[IMAGE])
-    assert torch.equal(after[OBS_ENV_STATE], given[OBS_ENV_STATE])
 
 
 def test_a_quarter_of_a_turn_is_all_that_the_yaw_of_a_square_can_be_wrong_by() -> None:

@@ -166,16 +166,6 @@ def test_it_looks_at_the_first_image_only_and_says_what_it_learned_to_say() -> N
     assert loss["action"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_chunks_are_carried_out_and_then_predicted_anew() -> None:
-    policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
-    chunk = policy.predict_action_chunk(samples)
-    assert torch.equal(torch.stack([policy.select_action(samples) for _ in range(2)], 1), chunk[:, :2])
-    moved = {**samples, OBS_STATE: samples[OBS_STATE] + 1}
-    third = policy.select_action(moved)
-    assert not torch.equal(third, chunk[:, 2])
-    assert torch.equal(third, policy.predict_action_chunk(moved)[:, 0])
-
-
 def test_words_count_and_what_is_ignored_does_not() -> None:
     policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
 

@@ -13,7 +13,6 @@ from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.exporter.episode import scan_stream
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.base import ScanPart
-from bhd_lerobot.ros2.messages.base import odometry as odometry_of
 from bhd_lerobot.ros2.messages.parts import Frames, header, header_stamps
 from bhd_lerobot.ros2.messages.serialize import decode, encode
 from bhd_lerobot.ros2.messages.split import parts_of
@@ -87,18 +86,6 @@ def test_of_an_unknown_robot_everything_is_plain_numbers():
     assert (part.msgtype, part.topic, part.names) == (types.NUMBERS, "/bhd/observation_state", tuple(names))
     kinds = [one.kind for one in parts_of("observation.state", names, "ur5", lidar=None)]
     assert kinds == ["OdometryPart", "JointsPart"]
-
-
-def test_a_yaw_that_goes_on_turning_comes_back():
-    values = np.zeros((200, 5))
-    values[:, 4] = np.cumsum(np.random.default_rng(0).uniform(-0.1, 0.28, 200)).astype(np.float32)
-    names = ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"]
-    (part,) = parts_of("observation.state", names, "turtlebot3", lidar=None)
-    index = np.arange(200)
-    assert values[-1, 4] > 4 * np.pi
-    messages = [decode(part.msgtype, one) for one in part.encode(Frames(0, index, index * 10**8 + 10**18), values)]
-    _, pose = odometry_of(messages)
-    assert np.array_equal(pose[:, 2].astype(np.float32), values[:, 4].astype(np.float32))
 
 
 def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):

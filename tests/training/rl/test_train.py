@@ -139,20 +139,6 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: 
     assert weights(other.checkpoint) != weights(finished.checkpoint)
 
 
-def test_a_run_goes_on_where_it_was(finished: RlResult, tmp_path: Path) -> None:
-    first = run(tmp_path / "run", steps=64)
-    assert first.checkpoint is not None
-    with pytest.raises(ConfigError, match="has done 64 of 64"):
-        train(parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true"]), Console(file=io.StringIO()))
-    command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=128"]
-    second = train(parse_rl(command), Console(file=io.StringIO()))
-    assert second.step == 128
-    steps = [row["step"] for row in rows(second.output_dir)]
-    assert steps == sorted(steps)
-    assert steps[0] == 0
-    assert json.loads((second.checkpoint / "training_state/run.json").read_text())["next_episode"] > 4  # type: ignore[operator]
-
-
 def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded(tmp_path: Path) -> None:
     run(tmp_path / "run", steps=32)
     command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"]
@@ -405,12 +391,3 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: p
     with pytest.raises(BhdError, match=r"No space left on device.*intact.*--resume=true"):
         run(tmp_path / "run")
     assert (tmp_path / "run" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
-
-
-def test_ctrl_c_before_the_run_began_is_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module, "Run", stopped)
-    assert main(options(tmp_path / "run")) == 130
-    assert "Stopped" in capsys.readouterr().err
