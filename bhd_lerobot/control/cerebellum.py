@@ -99,6 +99,7 @@ class Cerebellum:
             *(states[name] for name in ("busy", "follows_goal", "protective_stop", "stamp_ns")),
             numbers["has_stamps"],
         )
+        self._has_effort = controller.arm_limits["has_effort"]
         if controller.is_compiled:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
             if sensors < needed:  # compiled code would read beyond them
@@ -123,7 +124,9 @@ class Cerebellum:
         states, queues, words = self.states, self.fifo.queues, self.estop.words
         sensors = self.reading.sensors, self.reading.sensors_ns
         if self._is_compiled:
-            self._run = tick_all.bind(states, queues, words, self.controller.monitors, self.numbers, *sensors)
+            own = self.controller
+            records = own.arms, self.numbers, own.arm_limits, own.geometries
+            self._run = tick_all.bind(states, queues, words, own.monitors, *records, *sensors)
         else:
             self._begin = begin_all.bind(states, queues, words, self.numbers, sensors[1])
             self._end = end_all.bind(states, self.numbers)
@@ -176,7 +179,10 @@ class Cerebellum:
         self._now_ns = now_ns
         self._read()
         if self._is_compiled:
-            self._run(now_ns)
+            is_over = self._run(self.controller.rows, now_ns, False)
+            while not is_over:
+                self.serve()
+                is_over = self._run(self.controller.rows, now_ns, True)
         else:
             self._run_controller(self.controller, now_ns)
         if np.count_nonzero(self._mode_is_new):
@@ -185,11 +191,17 @@ class Cerebellum:
         if self._may_write:
             self.plant.write(self.written)
 
+    def serve(self) -> None:
+        """Let the controller do what ticks wait for."""
+        for sim in np.flatnonzero(self.controller.arms["stage"]).tolist():
+            self.controller.serve(sim)
+
     def _read(self) -> None:
         reading = self.reading
         self.plant.read(reading)
         self._stamp_ns[:] = self._now_ns if reading.stamp_ns is None else reading.stamp_ns
         self._has_stamps[0] = reading.stamp_ns is not None
+        self._has_effort[0] = reading.has_effort
 
     def _run_controller(self, controller: Any, now_ns: int) -> None:
         """Run a tick with a controller that is no part of the compiled one."""
@@ -204,8 +216,11 @@ class Cerebellum:
         self._tell_controller()
 
     def _tell_controller(self) -> None:
-        """Tell a controller that is no part of the compiled tick what it is to do."""
+        """Tell the controller outside of a tick what it is to do."""
         if self._is_compiled:
+            news = self._goes_back | (self._entered != 0) | self._is_distrusted | self._has_setpoint
+            for sim in np.flatnonzero(news).tolist():
+                self.controller.tell(sim)
             return
         controller: Any = self.controller
         goes_back, entered, has_setpoint = self._goes_back, self._entered, self._has_setpoint
@@ -388,9 +403,11 @@ class Cerebellum:
         self._drop(chosen)
         if not self.estop.is_shared:
             self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
-        taken = self.states["setpoints_taken"][ids]
+        kept = ("setpoints_taken", "command", "actuators") if self.body.arm is not None else ("setpoints_taken",)
+        values = [self.states[name][ids] for name in kept]  # servos that take positions stay where they are
         self.states[ids] = new_states(1)
-        self.states["setpoints_taken"][ids] = taken
+        for name, value in zip(kept, values, strict=True):
+            self.states[name][ids] = value
         self.controller.restart(ids)
         self.readings.forget(ids)
         self._start_writing(ids)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.arm.step import Stage, has_to_be_told, is_arm_at_rest, move_arm
 from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
@@ -24,18 +25,31 @@ _ACCEPTED, _STALE, _NOT_ACTIVE = int(Reason.ACCEPTED), int(Reason.STALE), int(Re
 _OUT_OF_ORDER, _BEYOND_HORIZON = int(Reason.OUT_OF_ORDER), int(Reason.BEYOND_HORIZON)
 _ESTOP_REASON, _FAULT_REASON = int(Reason.ESTOP), int(Reason.FAULT)
 _COMMAND_AGE, _PLANT, _GUARD = int(Watchdog.COMMAND_AGE), int(Watchdog.PLANT), int(Watchdog.GUARD)
+_NONE, _BEGUN, _ENDED = int(Stage.NONE), int(Stage.BEGUN), int(Stage.ENDED)
 _NORMAL, _EMERGENCY_STOP = int(SafetyStatus.NORMAL), int(SafetyStatus.EMERGENCY_STOP)
 _LEAST, _MOST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 _MOST_TAKEN = 3  # commands in one tick, while another process fills the queue
 
 Numbers = NDArray[np.float64]
 Counts = NDArray[np.int64]
+Trajectories = NDArray[np.float64]
 
 
 @kernel()
 def tick(  # noqa: PLR0917
-    state: Any, queue: Any, estop: Counts, monitor: Any, limits: Any, sensors: Numbers, sensors_ns: int, now_ns: int
-) -> None:
+    state: Any,
+    queue: Any,
+    estop: Counts,
+    monitor: Any,
+    arm: Any,
+    limits: Any,
+    arm_limits: Any,
+    geometry: Any,
+    rows: Trajectories,
+    sensors: Numbers,
+    sensors_ns: int,
+    now_ns: int,
+) -> bool:
     """Run one tick of a robot whose controller is compiled, between reading its plant and writing to it.
 
     The reference advances by one period, also after ticks that were skipped: it is late then, and what is written to
@@ -46,14 +60,39 @@ def tick(  # noqa: PLR0917
         queue: its commands.
         estop: the word of its emergency stop, see `EstopWord`.
         monitor: its collision monitor; one without beams if there is none.
+        arm: its arm; any record if it has none.
         limits: the numbers of its body.
+        arm_limits: the numbers of its arm.
+        geometry: what its arm is kept clear with.
+        rows: the trajectories that arms play.
         sensors: further values that the plant measures.
         sensors_ns: when the oldest of them was measured [ns].
         now_ns: the time that the tick is for [ns].
+
+    Returns:
+        False if the tick waits for `Controller.serve`, and is to be continued by the same call.
     """
-    begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
-    drive(state, limits, monitor, sensors, sensors_ns)
-    end_tick(state, limits)
+    if limits.is_drive:
+        begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+        drive(state, limits, monitor, sensors, sensors_ns)
+        end_tick(state, limits)
+        return True
+    if arm.stage == _NONE:
+        if state.mode == _STOPPING:
+            state.is_at_rest = is_arm_at_rest(state, arm, arm_limits)
+        begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+        arm.stage = _BEGUN
+        if has_to_be_told(state, arm, arm_limits):
+            return False
+    if arm.stage < _ENDED:
+        if not move_arm(state, arm, arm_limits, geometry, rows, limits.has_stamps):
+            return False
+        end_tick(state, limits)
+        arm.stage = _ENDED
+        if state.entered != 0 or state.goes_back:
+            return False
+    arm.stage = _NONE
+    return True
 
 
 @kernel()
@@ -223,21 +262,47 @@ def follow_controller(state: Any) -> None:
             set_mode(state, _HOLD)
 
 
-@kernel("void(state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], i8)")
+@kernel(
+    "b1(state[::1], queue[::1], i8[:,:], monitor[::1], arm[::1], limits[::1], arm_limits[::1], geometry[::1], f8[:,:], "
+    "i8[:], f8[:,:,:], i8, b1)"
+)
 def tick_all(  # noqa: PLR0917
     states: Any,
     queues: Any,
     estop: Counts,
     monitors: Any,
+    arms: Any,
     limits: Any,
+    arm_limits: Any,
+    geometries: Any,
     sensors: Numbers,
     sensors_ns: Counts,
+    rows: Trajectories,
     now_ns: int,
-) -> None:
-    """Run one tick of n robots; a monitor without beams may be one for all."""
+    goes_on: bool,
+) -> bool:
+    """Run one tick of n robots; monitors and arms of robots that have none may be one for all.
+
+    Args:
+        goes_on: continue the ticks that have waited for the controller.
+
+    Returns:
+        Whether none waits.
+    """
+    is_over = True
     for sim in range(len(states)):
-        monitor = monitors[sim % len(monitors)]
-        tick(states[sim], queues[sim], estop[:, sim], monitor, limits[0], sensors[sim], sensors_ns[sim], now_ns)
+        arm = arms[sim % len(arms)]
+        if goes_on and arm.stage == _NONE:
+            continue
+        if not goes_on:
+            arm.stage = _NONE
+        geometry = geometries[arm.geometry]
+        queue, word, monitor = queues[sim], estop[:, sim], monitors[sim % len(monitors)]
+        seen, seen_ns = sensors[sim], sensors_ns[sim]
+        own = limits[0], arm_limits[0]
+        if not tick(states[sim], queue, word, monitor, arm, own[0], own[1], geometry, rows, seen, seen_ns, now_ns):
+            is_over = False
+    return is_over
 
 
 @kernel("void(state[::1], queue[::1], i8[:,:], limits[::1], i8[:], i8)")

@@ -10,7 +10,6 @@ from bhd_lerobot.bodies.body import Arm, Body, without_jerk_limits
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
@@ -96,19 +95,23 @@ class ArmHost(Host):
         if config.control == "impedance":
             self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks, config.max_force)
         else:
-            self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
-            self.controller.set_latency(np.arange(plant.n), plant.latency_s)
-            if not config.held_clearance:
-                self.controller.held = None
-            if body.mjcf:  # without inertias it is not known what torques a motion needs
-                self.controller.limit_force(
-                    ForceLimit(body, plant.n, config.control_hz, config.max_force, wrench=config.wrench)
-                )
-            elif config.wrench:
+            if config.wrench and not body.mjcf:
                 raise ConfigError(
                     f"robot.wrench is true, and the body {body.name!r} says nothing of its inertias (Body.mjcf): what "
                     "its surroundings put on it cannot be told from its motors' efforts. Leave robot.wrench false."
                 )
+            self.controller = ArmController(
+                body,
+                plant.n,
+                config.control_hz,
+                ticks,
+                planning,
+                holds=config.held_clearance,
+                # Without inertias it is not known what torques a motion needs.
+                max_force=config.max_force if body.mjcf else None,
+                wrench=config.wrench,
+            )
+            self.controller.set_latency(np.arange(plant.n), plant.latency_s)
         self._taken = np.zeros((plant.n, 3))  # where the tool was to be by the last action that was not refused [m]
         self._refused = np.zeros(plant.n, np.bool_)  # the last action
         super().__init__(

@@ -36,7 +36,7 @@ class GoalStreamer:
         self._rates = rates
         with never_compiled():  # LeRobot's loop has begun
             self._controller = ArmController(body, 1, rates.control_hz, rates.ticks_per_frame)
-        self._reading = PlantReading(1, self._controller.joints)
+        self._reading = PlantReading(1, self._controller.joints, states=self._controller.states)
         self._reading.position[0] = start
         self._controller.configure(np.zeros(1, np.intp), self._reading)
 
@@ -59,7 +59,7 @@ class GoalStreamer:
         for _ in range(self._rates.ticks_per_frame):
             reading.velocity[0] = controller.velocity[0]
             reading.position[0] = controller.command[0] + behind
-            controller.run(reading)
+            controller.advance()
         # A refusal is among the results, too, unless another goal has its name.
         ended = controller.take_results(0)
         return controller.command[0].copy(), [name for name in refused if name not in ended] + ended

@@ -1,31 +1,34 @@
-"""The controller of arms with position servos: setpoints and goals to servo positions."""
+"""The controller of arms with position servos: what a tick leaves to it, see `move_arm`."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.control.arm.clearance import SetpointClearance
-from bhd_lerobot.control.arm.force_limit import ForceLimit
-from bhd_lerobot.control.arm.held import HeldObjects
+from bhd_lerobot.control.arm.clearance import LOOKS, fill_geometry, new_geometries
+from bhd_lerobot.control.arm.force_limit import explain_force, forget_force, put_force_limit
+from bhd_lerobot.control.arm.held import held_capsule
+from bhd_lerobot.control.arm.record import ARM_LIMITS, new_arms
 from bhd_lerobot.control.arm.relief import ContactRelief, Sensed
-from bhd_lerobot.control.arm.setpoints import SetpointFilter
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.controller import SteppedController
+from bhd_lerobot.control.arm.setpoints import leave_setpoints, put_setpoint_limits, take_setpoint
+from bhd_lerobot.control.arm.step import Stage, is_arm_at_rest, move_arm
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
+from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.guard import WireLimits
-from bhd_lerobot.control.kernels import kernel, largest_change
+from bhd_lerobot.control.kernels import as_objects, largest_change
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.motion.supervision import most_away, put_goal_limits
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.record import put
 
 Array = NDArray[np.float64]
 
-_CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
-_EFFORT = int(Limit.EFFORT)
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
 _BACK, _BACK_TOOL = 0.5, 0.25  # [rad/s, m/s] of joints and tool that a stop brings back, unless they were faster
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
@@ -41,373 +44,366 @@ _LOST = (
     "there is no limit of force. Repair them, or let the plant leave PlantReading.has_effort false."
 )
 _DEAF = "The arm has not moved since it was activated: it takes no commands, its brakes are on, or something holds it."
-_REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
+_STOP_CODES = {
+    Mode.STOPPING: ResultCode.CANCELLED,
+    Mode.ESTOP: ResultCode.ESTOP,
+    Mode.FAULT: ResultCode.FAULT,
+}
+_ENTERED = (Mode.STOPPING, Mode.INACTIVE, Mode.HOLD, Mode.SAFE_OFF, Mode.ESTOP, Mode.FAULT)
 
 
-@kernel("b1(f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[:,:], f8[:,:])")
-def lead_commands(  # noqa: PLR0917
-    reference: Array,
-    speed: Array,
-    actuators: Array,
-    limits: NDArray[np.int64],
-    lead: Array,
-    largest_error: Array,
-    position: Array,
-    velocity: Array,
-) -> bool:
-    """Lead the servos' commands by their damping; return whether any servo gives its largest effort."""
-    any_limited = False
-    for sim in range(len(reference)):
-        for k in range(len(lead)):
-            actuators[sim, k] = speed[sim, k] * lead[k] + reference[sim, k]
-            # A servo beyond its effort gives its largest: that is flagged, and the command stays as it is. Holding the
-            # command near the joint, to ask for no more, would be a second loop around the servo, which a few
-            # milliseconds of latency turn into a brake.
-            if abs(velocity[sim, k] * lead[k] + position[sim, k] - actuators[sim, k]) > largest_error[k]:
-                limits[sim] |= _EFFORT
-                any_limited = True
-    return any_limited
-
-
-class ArmController(SteppedController):
+class ArmController(Controller):
     """Joint positions and the gripper's opening, from setpoints or from goals.
 
     A command is the position of each joint [rad] and the gripper's opening [m]. What goes to the servos is the
     reference plus the lead that makes up for the servos' damping, so that they follow a moving reference without a lag.
 
     Attributes:
-        force: what stops an arm that presses too hard, if the plant measures efforts; nothing does if None.
-        held: finds out what the grippers hold, which is then kept away from things like the arm; nothing does if None.
+        goals: the goals.
 
     Args:
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
         planning: who plans goals; they are planned in the tick that they start in if None.
+        holds: find out what the grippers hold, which is then kept away from things like the arm.
+        keeps_clear: slow setpoints down that would bring the arm too near to itself or the table.
+        max_force: force with which a tool may press, if the plant measures efforts [N]; any if None.
+        wrench: estimate what the surroundings put on the tools; with `max_force`.
     """
 
-    def __init__(  # noqa: PLR0915
-        self, body: Body, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None
+    is_compiled = True
+
+    def __init__(
+        self,
+        body: Body,
+        n: int,
+        control_hz: int,
+        frame_ticks: int,
+        planning: Planning | None = None,
+        *,
+        holds: bool = True,
+        keeps_clear: bool = True,
+        max_force: float | None = None,
+        wrench: bool = False,
     ) -> None:
         super().__init__(n)
-        self._cause = ""
+        self._cause, self._body = "", body
         arm, limits = body.need(Arm), body.limits
-        self.arm = arm
-        self.width = self.joints = width = len(limits.names)
-        self.goals = GoalManager(body, n, control_hz, planning)
+        self.arm, self.width = arm, len(limits.names)
+        self.joints, self._dof = self.width, len(arm.chain.joints)
+        width, dof = self.width, self._dof
+        self.arms, self.arm_limits = new_arms(n), np.zeros(1, ARM_LIMITS)
+        self.geometries = new_geometries(arm.chain, n)
+        self._limits = self.arm_limits[0]
         share = acceleration_share(body)  # setpoints are not planned: their torques have to suffice in any posture
         calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
-        clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)
-        self.setpoints = SetpointFilter(calm, n, control_hz, frame_ticks, clearance)
-        self.held: HeldObjects | None = HeldObjects(arm, n, control_hz)
-        self.command = np.tile(np.asarray(arm.home), (n, 1))
-        self.velocity: NDArray[np.float64] = np.zeros((n, width))
-        self.acceleration: NDArray[np.float64] = np.zeros((n, width))
-        self.actuators = self.command.copy()
-        self.protective_stop = np.zeros(n, np.int64)
-        self._any_stopped = False
-        self.force: ForceLimit | None = None
-        self.contact_wrench = np.zeros((n, 0))
-        self.busy = self.goals.busy  # the same array
-        self._half_tick = 0.5 / control_hz  # [s]
-        # Ticks for which a joint has been too far from its reference.
-        self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._settled_ticks, self._most_yield_ticks = round(_SETTLED_S * control_hz), round(_YIELD_S * control_hz)
-        self._stopped = np.zeros(n, np.bool_)  # hard, since it was last reset
-        self._rest_ticks: NDArray[np.int64] = np.zeros(n, np.int64)  # for which its reference has followed nothing
-        self._blind = np.zeros(n, np.bool_)  # it is not known where it is
-        self._wrong = np.zeros((n, width - 1), np.bool_)  # joints whose encoders were found wrong since the stop
-        self._driven = np.zeros(n, np.bool_)  # their motors are on: before, and after SAFE_OFF, that is not known
-        self._relief = ContactRelief(arm, n, control_hz)
-        self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
+        put_setpoint_limits(self._limits, calm, control_hz, frame_ticks)
+        put_goal_limits(self._limits, arm, control_hz)
+        self._put_limits(calm, control_hz, frame_ticks)
+        self._limits["holds"], self._limits["keeps_clear"] = holds, keeps_clear
+        if max_force is not None:
+            put_force_limit(self._limits, body, control_hz, max_force, wrench=wrench)
+        states, arms = self.states, self.arms
+        self.command: Array = states["command"][:, :width]
+        self.command[:] = arm.home
+        self.actuators: Array = states["actuators"][:, :width]
+        self.actuators[:] = self.command
+        self.velocity: Array = arms["speed"][:, :width]
+        self.acceleration: Array = arms["change"][:, :width]
+        self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
+        self.force: NDArray[np.float64] = arms["force"]
+        self.contact_wrench = arms["wrench"][:, : 6 if wrench else 0]
+        self.goals = GoalManager(body, states, arms, control_hz, planning)
+        self._hz, self._forward = control_hz, ForwardKinematics(arm.chain)
+        self._most_yield_ticks = round(_YIELD_S * control_hz)
+        self._reliefs = [ContactRelief(arm, 1, control_hz) for _ in range(n)]
         self._yield_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._blind = np.zeros(n, np.bool_)  # it is not known where it is
         # Where a protective stop brings the servos' commands, and how fast. Both are fixed when it begins: a reading
         # that is wrong moves an arm no farther.
-        self._aim, self._top = (np.zeros((n, width - 1)) for _ in range(2))
-        self._forward = ForwardKinematics(arm.chain)
-        self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
-        self._speed = np.asarray(limits.velocity)
-        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:-1]
-        self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
-        self._stamp_ns, self._silent_ticks, self._late_s = 0, 0, self._relief.late_s  # the same array
+        self._aim, self._top = np.zeros((2, n, dof))
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
+        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:-1]
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (
             f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
             "encoder is wrong."
         )
-        self._lead = np.asarray(arm.lead_s)
+        self._lead, self._stiffness = np.asarray(arm.lead_s), np.asarray(arm.servo_stiffness)
         # [rad] so far a joint may be from its reference when it is found that it does not follow
-        self._reach = (arm.blocked_rad + self._speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:-1]
-        self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
-        self._effort = np.asarray(limits.effort)
-        self._lowest_effort = -self._effort
-        self._largest_error = self._effort / self._stiffness
-        self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
-        self.limits = self.setpoints.limits  # the same array
-        self._work, self._before = np.zeros((2, n, width))  # the latter: the servos' commands of the tick before
-        state = self.command, self.velocity, self.actuators, self.limits
-        self._lead_commands = lead_commands.bind(*state, self._lead, self._largest_error)
+        speed = np.asarray(limits.velocity)
+        self._reach = (arm.blocked_rad + speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:-1]
+        self._damping, self._effort = np.asarray(arm.servo_damping), np.asarray(limits.effort)
+        self._lower, self._upper, self._speed = np.asarray(limits.lower), np.asarray(limits.upper), speed
+        # As the functions of a tick take them.
+        self._state_of, self._arm_of = as_objects(states), as_objects(arms)
+        self._geometry_of, [self._limits_of] = as_objects(self.geometries), as_objects(self.arm_limits)
+        self.set_latency(np.arange(n), 0.0)
 
-    def limit_force(self, force: ForceLimit) -> None:
-        """Stop an arm that presses too hard, from now on."""
-        self.force, self.contact_wrench = force, force.wrench
+    def _put_limits(self, limits: Any, control_hz: int, frame_ticks: int) -> None:
+        """Write what clearance, servos and stops go by."""
+        row, arm, dof = self._limits, self.arm, self._dof
+        row["look_ticks"] = max(1, frame_ticks // LOOKS)
+        row["look_s"], row["least"] = row["look_ticks"] / control_hz, arm.chain.min_distance
+        acceleration = np.asarray(limits.acceleration[:dof])
+        # A brake that changes its acceleration gradually begins so much later; what speeds an arm up ends first.
+        row["ramp_s"][:dof] = acceleration / (2 * np.asarray(limits.jerk[:dof]))
+        row["ramp_s"][:dof] += 2 * acceleration / np.asarray(limits.setpoint_jerk[:dof])
+        put(row, "lead", arm.lead_s)
+        put(row, "largest_error", np.asarray(limits.effort) / arm.servo_stiffness)
+        row["largest_error"][dof] = np.inf  # a gripping gripper is always commanded more than its effort
+        row["blocked_ticks"] = max(1, round(arm.blocked_s * control_hz))
+        row["settled_ticks"] = round(_SETTLED_S * control_hz)
+
+    @property
+    def rows(self) -> Array:
+        """What is played."""
+        return self.goals.player.rows
 
     def set_latency(self, ids: NDArray[np.intp], latency_s: ArrayLike) -> None:
         """Set by how much the servos of some arms are late, beyond the body's latency [s].
 
         An arm that is behind by so much is not blocked. Commands are not led by it.
         """
-        self._late_s[ids] = latency_s
-        self.goals.limit.set_latency(ids, latency_s)
+        self.arms["late_s"][ids] = latency_s
+        self.arms["latency_s"][ids] = self.arms["late_s"][ids] + self.arm.latency_s
 
-    def _wait_for_readings(self, stamp_ns: int) -> None:
-        """Count for how long nothing has been read: an arm that follows is behind what is read by so much more."""
-        silent, self._silent_ticks = self._silent_ticks, 0 if stamp_ns != self._stamp_ns else self._silent_ticks + 1
-        self._stamp_ns = stamp_ns
-        if silent or self._silent_ticks:
-            late = self._late_s + 2 * self._half_tick * self._silent_ticks
-            self.goals.limit.set_latency(np.arange(len(late)), late)
+    # --- what a tick leaves to its controller ------------------------------------------------------------------------
 
-    # --- motion ------------------------------------------------------------------------------------------------------
+    def advance(self) -> None:
+        """Advance the references by a tick, outside of a cerebellum."""
+        for sim in range(len(self.states)):
+            state, arm = self._state_of[sim], self._arm_of[sim]
+            arm.stage = Stage.NONE
+            while not move_arm(state, arm, self._limits_of, self._geometry_of[arm.geometry], self.rows, False):
+                self.serve(sim)
+            arm.stage = Stage.NONE
 
-    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
-        """Head for new setpoints; goals that are still followed end, because the newer command counts."""
+    def serve(self, sim: int) -> None:
+        """Do what the tick of an arm waits for."""
+        stage = self.arms["stage"][sim]
+        if stage in (Stage.BEGUN, Stage.ENDED):
+            self.tell(sim)
+        elif stage == Stage.HELD:
+            self._hold(sim)
+        elif stage == Stage.GOALS:
+            self.goals.serve(sim)
+        elif stage == Stage.STOPPED:
+            if self.arms["yields"][sim]:
+                self._yield(sim)
+            self._give_way(sim)
+        else:
+            self._look(sim)
+
+    def tell(self, sim: int) -> None:
+        """Take the modes that a robot has entered, and its setpoint."""
+        state = self.states[sim]
+        if state["goes_back"]:
+            self._go_back(sim)
+            state["goes_back"] = False
+        if entered := int(state["entered"]):
+            state["entered"] = 0
+            for mode in _ENTERED:
+                if entered & (1 << mode):
+                    self._stop(sim, mode)
+        if state["is_distrusted"]:
+            state["is_distrusted"] = False
+            self._blind[sim] = True
+            if self._limits["feels"] and not self.arms["wrong"][sim, : self._dof].all():
+                forget_force(self.arms[sim])
+        if state["has_setpoint"]:
+            state["has_setpoint"] = False
+            self._set_setpoint(sim)
+
+    def _set_setpoint(self, sim: int) -> None:
+        """Head for a new setpoint; goals that are still followed end, because the newer command counts."""
         # Commands are checked when they are sent; a queue in shared memory is written by another process.
-        if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
-            self.limits[bad] |= int(Limit.NON_FINITE)
-            self.stop(bad, Mode.FAULT)
-            mask = mask & ~bad
-        if np.count_nonzero(self.busy & mask):
-            left = mask & self.goals.following & ~self.setpoints.active
-            # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at one
-            # speed. Going on from the speed at the end would change the command's own by half a tick's acceleration
-            # on top of what is allowed.
-            self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
+        if not np.isfinite(self.states["requested"][sim, : self.width]).all():
+            self.limits[sim] |= int(Limit.NON_FINITE)
+            self._stop(sim, Mode.FAULT)
+            return
+        if self.busy[sim]:
+            if self.goals.following[sim] and not self.arms["follows_setpoints"][sim]:
+                # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at
+                # one speed. Going on from the speed at the end would change the command's own by half a tick's
+                # acceleration on top of what is allowed.
+                self.velocity[sim] -= self.acceleration[sim] * (0.5 / self._hz)
             message = "A setpoint came, and the newer command counts."
-            self.goals.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, message)
-        self.setpoints.set_setpoint(values, mask, self.command)
+            self.goals.end_all(sim, ResultCode.REPLACED_BY_SETPOINT, message)
+        take_setpoint(self._state_of[sim], self._arm_of[sim], self._limits_of)
 
-    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
-        """Decelerate to rest; all goals of these arms end, with the cause as their result."""
-        if cause not in _STOP_CODES:
-            self._stopped &= ~mask
-            self._relief.restart(mask)
-            self._wrong &= ~mask[:, None]
-            self._driven[mask] = cause == Mode.HOLD
-            return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
+    def _stop(self, sim: int, cause: Mode) -> None:
+        """Decelerate to rest; all goals end, with the cause as their result."""
+        arm = self.arms[sim]
+        if cause not in _STOP_CODES:  # HOLD, INACTIVE and SAFE_OFF are entered at rest
+            arm["is_stopped"] = arm["gives_way"] = arm["wrong"] = False
+            arm["is_driven"] = cause == Mode.HOLD
+            self._reliefs[sim].restart(np.ones(1, np.bool_))
+            return
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
-            self._rest_ticks[mask & ~self._stopped] = 0
-            self._stopped |= mask
-            mask = mask & ~self._yields  # they stop already, and goals have ended
-        self._leave_setpoints(mask)
-        self.goals.stop(mask, _STOP_CODES[cause], hard, (self.command, self.velocity, self.acceleration))
+            if not arm["is_stopped"]:
+                arm["rest_ticks"] = 0
+            arm["is_stopped"] = True
+            if arm["yields"]:
+                return  # it stops already, and goals have ended
+        leave_setpoints(self._arm_of[sim])
+        self.goals.stop(sim, _STOP_CODES[cause], hard=hard)
 
-    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
+    def _go_back(self, sim: int) -> None:
         """Make the reference again what the servos have, at the speed of their commands; play nothing any more."""
-        where = mask[:, None]
-        self.setpoints.drop(mask)
-        self.goals.let_go(mask)
-        self._yields &= ~mask
-        speed = rate / (2 * self._half_tick)
-        np.copyto(self.velocity, np.minimum(np.maximum(speed, -self._speed), self._speed), where=where)
-        np.copyto(self.acceleration, 0.0, where=where)
-        reference = actuators - self.velocity * self._lead
-        np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
+        arm, state = self._arm_of[sim], self.states[sim]
+        arm.follows_setpoints, arm.share = False, 1.0
+        self.goals.let_go(sim)
+        arm.yields = False
+        speed = np.clip(state["written_rate"][: self.width] * self._hz, -self._speed, self._speed)
+        self.velocity[sim], self.acceleration[sim] = speed, 0.0
+        reference = state["written"][: self.width] - speed * self._lead
+        self.command[sim] = np.clip(reference, self._lower, self._upper)
 
-    def distrust(self, mask: NDArray[np.bool_]) -> None:
-        """Take some arms, as long as they are stopped, to be where their servos were commanded to hold them."""
-        self._blind |= mask
-        if self.force is not None:
-            self.force.restart(np.flatnonzero(mask & ~self._wrong.all(axis=1)))
+    def _hold(self, sim: int) -> None:
+        """Note what a gripper holds now."""
+        held = held_capsule(self.arm.chain, self._forward, self.states[sim], self.arms[sim])
+        self.goals.hold(sim, held)
+        arm = self.arms[sim]
+        arm["geometry"] = 0 if held is None else 1 + sim
+        arm["distances"] = -1.0  # they are of other pairs
+        if held is not None:
+            self.geometries[1 + sim] = 0
+            fill_geometry(self.geometries[1 + sim], self.arm.chain.holding(held))
 
-    def run(self, reading: PlantReading) -> None:
-        """Advance by one tick."""
-        for sim, held in self.held.update(reading, self.command) if self.held is not None else ():
-            self.goals.hold(sim, held)
-            if self.setpoints.clearance is not None:
-                self.setpoints.clearance.hold(sim, held)
-        if reading.stamp_ns is not None:
-            self._wait_for_readings(int(reading.stamp_ns[0]))
-        reference = self.command, self.velocity, self.acceleration
-        if np.count_nonzero(self.setpoints.active):
-            # A goal that came after them takes over; both in one tick would move the reference twice.
-            if np.count_nonzero(self.busy):
-                self._leave_setpoints(self.busy)
-            self.setpoints.run(*reference)
-        self.goals.tick(reference, (reading.position, reading.velocity))
-        if np.count_nonzero(self._stopped):
-            if self._any_yields:
-                self._yield(reading)
-            self._give_way(reading)
-        if self._any_stopped:
-            self.protective_stop[:] = self._any_stopped = False
-        np.copyto(self._before, self.actuators)
-        if self._lead_commands(reading.position, reading.velocity):
-            self._watch(reading)
-        elif np.count_nonzero(self._off_ticks):
-            self._off_ticks[:] = 0
-        if self.force is not None and self._feel(self.force, reading):
-            # One that gives way does what it can.
-            hard = self.force.exceeded & ~self._yields & (~self._stopped | self.goals.following)
-            misread = hard & self._misread_joints(reading).any(axis=1)  # it is the force in another posture
-            self._protect(misread, reading, Watchdog.BLOCKED, self._misread, follows=True)
-            self._protect(hard & ~misread, reading, Watchdog.FORCE, self.force.explain())
-            lost = self.force.lost & self._driven & ~self._stopped
-            self._protect(lost, reading, Watchdog.PLANT, _LOST, follows=True)
+    def _where(self, sim: int) -> Array:
+        """Return where the joints are, shape (dof,): the servo of a wrong encoder holds what it was commanded to."""
+        dof = self._dof
+        return np.where(self.arms["wrong"][sim, :dof], self.command[sim, :dof], self.states["position"][sim, :dof])
 
-    def _feel(self, force: ForceLimit, reading: PlantReading) -> bool:
-        """Estimate with what the arms press; return whether any presses too hard, or is not known to press."""
-        position = self._where(reading) if np.count_nonzero(self._wrong) else None
-        return force.update(reading, self._rest_ticks > 0, position) or bool(np.count_nonzero(force.lost))
-
-    def _where(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return where the joints are, shape (n, dof): the servo of a wrong encoder holds what it was commanded to."""
-        dof = self.width - 1
-        return np.where(self._wrong, self.command[:, :dof], reading.position[:, :dof])
-
-    def _give_way(self, reading: PlantReading) -> None:
-        """Let go of what stopped arms press on, once they have come to rest."""
-        self._rest_ticks += self._stopped
-        self._rest_ticks *= ~self._stopped | ~(self._yields | self.goals.following)
-        settled = self._stopped & (self._rest_ticks > self._settled_ticks)
-        position, force = reading.position[:, : self.width - 1], self.force
-        if force is None:
-            none = np.zeros(len(settled), np.bool_)
-            sensed = Sensed(position, np.zeros_like(position), np.zeros(len(settled)), none, none)
+    def _give_way(self, sim: int) -> None:
+        """Let go of what a stopped arm presses on, once it has come to rest."""
+        arm, dof = self.arms[sim], self._dof
+        arm["rest_ticks"] = 0 if arm["yields"] or self.goals.following[sim] else arm["rest_ticks"] + 1
+        settled = bool(arm["rest_ticks"] > self._limits["settled_ticks"])
+        if self._limits["feels"]:
+            measured = self._is_measured(sim)
+            wrong = (self._misread_joints(sim) | self._blind[sim]) & (settled & measured) & (arm["wrong"][:dof] == 0)
+            if wrong.any():
+                arm["wrong"][:dof] |= wrong
+                forget_force(arm)  # what was felt was felt in another posture
+            torque, pressing, doubtful = arm["torque"][:dof], float(arm["pressing"]), bool(arm["wrong"].any())
+            sensed = Sensed(self._where(sim)[None], torque[None], *(np.array([v]) for v in (pressing, measured, doubtful)))
         else:
-            measured = self._measured(reading)
-            wrong = self._misread_joints(reading) | self._blind[:, None]
-            wrong &= (settled & measured)[:, None] & ~self._wrong
-            if np.count_nonzero(wrong):
-                self._wrong |= wrong
-                force.restart(np.flatnonzero(wrong.any(axis=1)))  # what was felt was felt in another posture
-            doubtful = np.asarray(self._wrong.any(axis=1))
-            sensed = Sensed(self._where(reading), force.torque, force.pressing, measured, doubtful)
-        known = settled & (sensed.measured | ~self._blind)
-        self._blind[:] = False
-        self._relief.run(self._stopped & (self._rest_ticks > 0), known, sensed, self.command, self.velocity)
+            position, none = self.states["position"][sim : sim + 1, :dof], np.zeros(1, np.bool_)
+            sensed = Sensed(position, np.zeros_like(position), np.zeros(1), none, none)
+        known = np.array([settled & bool(sensed.measured[0] | ~self._blind[sim])])
+        self._blind[sim] = False
+        one, relief = slice(sim, sim + 1), self._reliefs[sim]
+        relief.late_s[:] = arm["late_s"]
+        relief.run(np.array([bool(arm["rest_ticks"] > 0)]), known, sensed, self.command[one], self.velocity[one])
+        arm["gives_way"] = relief.active()[0]
 
-    def _watch(self, reading: PlantReading) -> None:
-        """Find arms that do not go where they are commanded to, and stop pressing on with them.
-
-        A servo goes on with its full torque for as long as its command is out of reach. The command is brought back to
-        where the arm is: what it pressed against is let go of.
-        """
-        dof = self.width - 1
-        away = np.abs(self.command[:, :dof] - reading.position[:, :dof])
-        limit = self.goals.limit.of(self.velocity[:, :dof])
-        off = (away > limit).any(axis=1)
-        self._off_ticks = (self._off_ticks + 1) * (off & ~self._stopped)
-        blocked = self._off_ticks >= self._most_off_ticks
-        if np.count_nonzero(blocked):
+    def _look(self, sim: int) -> None:
+        """Stop an arm that does not go where it is commanded to, or that presses too hard, or is not known to press."""
+        arm, dof = self.arms[sim], self._dof
+        if arm["is_blocked"]:
+            state, one = self._state_of[sim], self._arm_of[sim]
+            away = np.abs(self.command[sim, :dof] - self.states["position"][sim, :dof])
+            limit = np.array([most_away(one, self._limits_of, k) for k in range(dof)])
             # Without efforts nothing says whether it is the joint or the encoder that stays behind.
-            measured = self._measured(reading)
-            unsure = blocked & (((away > limit) & self._misread_joints(reading)).any(axis=1) | ~measured)
-            deaf = blocked & (np.abs(reading.position - self._first) < _STANDS).all(axis=1)
-            self._protect(deaf & unsure, reading, Watchdog.BLOCKED, _DEAF, follows=True)
-            self._protect(deaf & ~unsure, reading, Watchdog.BLOCKED, _DEAF)
-            self._protect(unsure & ~deaf & measured, reading, Watchdog.BLOCKED, self._misread, follows=True)
-            self._protect(unsure & ~deaf & ~measured, reading, Watchdog.BLOCKED, self._blocked, follows=True)
-            self._protect(blocked & ~deaf & ~unsure, reading, Watchdog.BLOCKED, self._blocked)
+            measured = self._is_measured(sim)
+            is_misread = bool(((away > limit) & self._misread_joints(sim)).any())
+            moved = np.abs(np.asarray(state.position[: self.width]) - self._first[sim])
+            if (moved < _STANDS).all():
+                message = _DEAF
+            else:
+                message = self._misread if is_misread and measured else self._blocked
+            self._protect(sim, Watchdog.BLOCKED, message, follows=is_misread or not measured)
+        # One that gives way does what it can.
+        if arm["presses"] and not arm["yields"] and (not arm["is_stopped"] or self.goals.following[sim]):
+            if arm["ticks"] == 0 and self._limits["has_effort"]:  # a new estimate
+                if self._misread_joints(sim).any():  # it is the force in another posture
+                    self._protect(sim, Watchdog.BLOCKED, self._misread, follows=True)
+                else:
+                    self._protect(sim, Watchdog.FORCE, explain_force(self._body, arm, self._limits), follows=False)
+        if arm["is_lost"] and arm["is_driven"] and not arm["is_stopped"]:
+            self._protect(sim, Watchdog.PLANT, _LOST, follows=True)
 
-    def _misread_joints(self, reading: PlantReading) -> NDArray[np.bool_]:
-        """Return the joints that are far from where they are commanded to, and not pulled there, shape (n, dof).
+    def _misread_joints(self, sim: int) -> NDArray[np.bool_]:
+        """Return the joints that are far from where they are commanded to, and not pulled there, shape (dof,).
 
         A servo gives all it has then. If it does not, the encoder is wrong.
         """
-        dof = self.width - 1
-        wanted = self._stiffness * (self.actuators - reading.position) - self._damping * reading.velocity
-        torque = reading.effort[:, :dof] if self.force is None else self.force.torque
-        wrong = torque * np.sign(wanted[:, :dof]) < _GIVES * self._effort[:dof]
-        wrong &= np.abs(wanted[:, :dof]) > _SURE * self._effort[:dof]
-        return wrong & self._measured(reading)[:, None]
+        dof, state = self._dof, self.states[sim]
+        off = self.actuators[sim] - state["position"][: self.width]
+        wanted = (self._stiffness * off - self._damping * state["velocity"][: self.width])[:dof]
+        torque = self.arms["torque"][sim, :dof] if self._limits["feels"] else state["effort"][:dof]
+        wrong = torque * np.sign(wanted) < _GIVES * self._effort[:dof]
+        wrong &= np.abs(wanted) > _SURE * self._effort[:dof]
+        return np.asarray(wrong & self._is_measured(sim))
 
-    def _measured(self, reading: PlantReading) -> NDArray[np.bool_]:
-        """Return whether the efforts of each arm are measurements, shape (n,)."""
-        if self.force is None or not reading.has_effort:
-            return np.full(len(self.busy), reading.has_effort)
-        return self.force.measured
+    def _is_measured(self, sim: int) -> bool:
+        """Return whether the efforts of an arm are measurements."""
+        has_effort = bool(self._limits["has_effort"])
+        return has_effort and (not self._limits["feels"] or bool(self.arms["is_measured"][sim]))
 
-    def _protect(
-        self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str, *, follows: bool = False
-    ) -> None:
+    def _protect(self, sim: int, cause: Watchdog, message: str, *, follows: bool) -> None:
         """Begin a protective stop: at once, or if it `follows` the reference as any other hard stop does."""
-        if not mask.any():
-            return
-        self.protective_stop[mask] = int(cause)
-        self._any_stopped, self._cause = True, message
-        self._off_ticks[mask] = 0
-        self._rest_ticks[mask & ~self._stopped] = 0
-        self._stopped |= mask
-        self._leave_setpoints(mask)
+        arm, dof = self.arms[sim], self._dof
+        self.protective_stop[sim], self._cause = int(cause), message
+        arm["off_ticks"] = 0
+        if not arm["is_stopped"]:
+            arm["rest_ticks"] = 0
+        arm["is_stopped"] = True
+        leave_setpoints(self._arm_of[sim])
         if follows:
-            reference = self.command, self.velocity, self.acceleration
-            self.goals.stop(mask, ResultCode.PATH_TOLERANCE, True, reference, message)
+            self.goals.stop(sim, ResultCode.PATH_TOLERANCE, hard=True, message=message)
             return
-        self.goals.end_all(mask, ResultCode.PATH_TOLERANCE, message)
-        dof = self.width - 1
-        now, speed = self.actuators[mask, :dof], self.velocity[mask, :dof]
-        off = np.minimum(np.maximum(reading.position[mask, :dof] - now, -self._reach), self._reach)
-        self._aim[mask] = now + off
+        self.goals.end_all(sim, ResultCode.PATH_TOLERANCE, message)
+        now, speed = self.actuators[sim, :dof], self.velocity[sim, :dof]
+        off = np.clip(self.states["position"][sim, :dof] - now, -self._reach, self._reach)
+        self._aim[sim] = now + off
         # On a straight line, on which no joint is faster than it was, nor the tool.
-        fast, way = (self._forward.tool_speed(self.command[mask, :dof], one) for one in (speed, off))
-        joints = (np.maximum(np.abs(speed), _BACK) / np.maximum(np.abs(off), _TINY)).min(axis=1)
-        rate = np.minimum(joints, np.maximum(fast, _BACK_TOOL) / np.maximum(way, _TINY))
-        self._top[mask] = np.abs(off) * rate[:, None]
-        self._yields |= mask
-        self._yield_ticks[mask] = 0
-        self._any_yields = True
+        posture = self.command[sim : sim + 1, :dof]
+        fast, way = (float(self._forward.tool_speed(posture, one[None])[0]) for one in (speed, off))
+        joints = float((np.maximum(np.abs(speed), _BACK) / np.maximum(np.abs(off), _TINY)).min())
+        self._top[sim] = np.abs(off) * min(joints, max(fast, _BACK_TOOL) / max(way, _TINY))
+        arm["yields"], self._yield_ticks[sim] = True, 0
 
-    def _yield(self, reading: PlantReading) -> None:
+    def _yield(self, sim: int) -> None:
         """Bring the servos' commands to where the joints were, until these are at rest.
 
         The reference would take its way to brake, against what the joints cannot go through. A servo that is so far
         from its command that it gives its largest torque gives no other on the way back, and one that is where it is
         commanded to brakes with all that it has.
         """
-        dof, mask = self.width - 1, self._yields
-        off = self._aim - self.actuators[:, :dof]
+        dof, arm = self._dof, self.arms[sim]
+        now, position = self.actuators[sim, :dof], self.states["position"][sim, :dof]
+        off = self._aim[sim] - now
         step = largest_change(np.abs(off) / self._bend) * self._bend
-        step = np.copysign(np.minimum(step, self._top * 2 * self._half_tick), off)
+        step = np.copysign(np.minimum(step, self._top[sim] / self._hz), off)
         # Towards where a joint is it may go at once. A joint that bounces back is on the other side of its command.
-        rate, way = self.actuators[:, :dof] - self._before[:, :dof], reading.position[:, :dof] - self.actuators[:, :dof]
+        rate, way = now - arm["before"][:dof], position - now
         gradual = np.minimum(np.maximum(step, rate - self._bend), rate + self._bend)
         step = np.where((step * way > 0.0) & (np.abs(step) <= np.abs(way)), step, gradual)
-        np.copyto(self.command[:, :dof], self.actuators[:, :dof] + step, where=mask[:, None])
-        np.copyto(self.velocity, 0.0, where=mask[:, None])
-        np.copyto(self.acceleration, 0.0, where=mask[:, None])
-        there = (np.abs(off) <= self._largest_error[:dof]) & (np.abs(reading.velocity[:, :dof]) < _SLOW)
+        self.command[sim, :dof] = now + step
+        self.velocity[sim] = self.acceleration[sim] = 0.0
+        largest = self._effort[:dof] / self._stiffness[:dof]
+        there = (np.abs(off) <= largest) & (np.abs(self.states["velocity"][sim, :dof]) < _SLOW)
         there &= np.abs(step) <= self._bend  # then it may stand still in the next tick
-        self._yield_ticks += 1
-        waits = (self._yield_ticks < self._most_yield_ticks) | (np.abs(off) > _ARRIVED_RAD).any(axis=1)
-        self._yields &= ~there.all(axis=1) & waits
-        self._any_yields = bool(self._yields.any())
-        inside = np.minimum(np.maximum(self.command, self._lower), self._upper)
-        np.copyto(self.command, inside, where=(mask & ~self._yields)[:, None])
+        self._yield_ticks[sim] += 1
+        waits = self._yield_ticks[sim] < self._most_yield_ticks or (np.abs(off) > _ARRIVED_RAD).any()
+        arm["yields"] = not there.all() and bool(waits)
+        if not arm["yields"]:
+            self.command[sim] = np.clip(self.command[sim], self._lower, self._upper)
 
-    def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
-        """Follow no setpoints any more; what comes next starts without speeding up.
-
-        Goals and brakes change their acceleration more gradually than setpoints: one that went on from the acceleration
-        of a setpoint near the limit of speed would exceed it.
-        """
-        left = mask & self.setpoints.active
-        if left.any():
-            self.goals.leave_setpoints(left)
-            self.setpoints.drop(left)
+    # --- between ticks -----------------------------------------------------------------------------------------------
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        still: NDArray[np.bool_] = np.all(np.abs(self.velocity) < _REST, axis=1)
-        still &= ~self._stopped | (self._rest_ticks > self._settled_ticks)  # and it is known what it presses with
-        return still & ~self.busy & ~self._yields & ~self._relief.active()
+        pairs = zip(self._state_of, self._arm_of, strict=True)
+        return np.array([is_arm_at_rest(state, arm, self._limits_of) for state, arm in pairs])
 
-    def pressed(self) -> NDArray[np.float64]:
+    def pressed(self) -> Array:
         """Return the forces on the tools [N] that are above 30 N, shape (n,), see `Controller.pressed`."""
-        if self.force is None:
-            return np.zeros(len(self.busy))
-        return np.where(self.force.force > _PRESSED_N, self.force.force, 0.0)
+        return np.where(self.force > _PRESSED_N, self.force, 0.0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -423,18 +419,13 @@ class ArmController(SteppedController):
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else."""
+        late_s = self.arms["late_s"][ids]
         self.goals.restart(ids)
-        self.setpoints.restart(ids)
-        self.velocity[ids] = self.acceleration[ids] = 0.0
-        self._off_ticks[ids] = 0
-        self._yields[ids] = self._stopped[ids] = self._wrong[ids] = self._driven[ids] = False
-        self._rest_ticks[ids] = 0
-        self._relief.restart(ids)
-        self.protective_stop[ids] = 0
-        if self.force is not None:
-            self.force.restart(ids)
-        if self.held is not None:
-            self.held.restart(ids)
+        self.arms[ids] = new_arms(1)
+        self.set_latency(ids, late_s)
+        self._blind[ids] = False
+        for sim in np.asarray(ids).tolist():
+            self._reliefs[sim] = ContactRelief(self.arm, 1, self._hz)
 
     # --- reports -----------------------------------------------------------------------------------------------------
 
@@ -443,19 +434,12 @@ class ArmController(SteppedController):
         """Why the last stop of its own was, as text."""
         return self._cause
 
-    @property
-    def following(self) -> NDArray[np.bool_]:
-        """Whether each arm follows a goal, shape (n,)."""
-        phase = self.goals.phase
-        return np.asarray((phase == _CONVERTING) | (phase == _EXECUTING))
-
-    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
+    def efforts(self, reading: PlantReading) -> Array:
         """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
         effort = np.subtract(self.actuators, reading.position)
         effort *= self._stiffness
-        effort -= np.multiply(reading.velocity, self._damping, out=self._work)
-        np.maximum(effort, self._lowest_effort, out=effort)
-        return np.minimum(effort, self._effort, out=effort)
+        effort -= reading.velocity * self._damping
+        return np.minimum(np.maximum(effort, -self._effort), self._effort)
 
     # --- goals -------------------------------------------------------------------------------------------------------
 
@@ -474,10 +458,3 @@ class ArmController(SteppedController):
     def feedback(self, sim: int) -> Feedback | None:
         """Return how far the goal is that one arm follows, or None."""
         return self.goals.feedback(sim)
-
-
-_STOP_CODES = {
-    Mode.STOPPING: ResultCode.CANCELLED,
-    Mode.ESTOP: ResultCode.ESTOP,
-    Mode.FAULT: ResultCode.FAULT,
-}

@@ -1,13 +1,23 @@
-"""How hard an arm presses, from its motors' efforts: what it may do no more than for a moment."""
+"""How hard an arm presses, from its motors' efforts: what it may do no more than for a moment.
+
+The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs, and explained by a
+force on the tool, and by a force with a moment; the larger force counts. Of a force on the tool 98 % are found in the
+median, and 71 % in 99 of 100 postures and directions. A force elsewhere on the arm counts with the force on the tool
+that would load the joints alike: half-way to the tool, about half of it is felt. What is not modelled counts too:
+friction, and the weight of a load that was not declared. Of that no more than 20 N is permitted: an arm at rest whose
+tool is pulled down by more has another load than its motions were planned with.
+"""
+
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.control.arm.wrench import tool_wrench
+from bhd_lerobot.control.geometry.chain import find_jacobian, find_torques, solve
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -31,158 +41,179 @@ _CARRIES = 4.0
 _LOST_S = 0.1  # without any effort that was measured
 
 
-class ForceLimit:
-    """Estimates the forces on the tools of n arms, and states which are too large.
-
-    The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs, and explained
-    by a force on the tool, and by a force with a moment; the larger force counts. Of a force on the tool 98 % are found
-    in the median, and 71 % in 99 of 100 postures and directions. A force elsewhere on the arm counts with the force on
-    the tool that would load the joints alike: half-way to the tool, about half of it is felt. What is not modelled
-    counts too: friction, and the weight of a load that was not declared. Of that no more than 20 N is permitted: an arm
-    at rest whose tool is pulled down by more has another load than its motions were planned with.
-
-    Attributes:
-        force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
-        torque: what the motors give more than the posture and its motion need [N m], shape (n, dof).
-        wrench: what the surroundings put on the tools, in the base frame: forces [N] and moments about the tool centre
-            points [N m], shape (n, 6); shape (n, 0) if it is not asked for.
-        pressing: the forces that are more than a load which need not be declared, shape (n,); 0 for the others.
-        exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
-        measured: whether the newest efforts were measurements, shape (n,): of the others nothing is known.
-        lost: whether they have been none for 0.1 s though the motors carry the arm's weight, shape (n,).
+def put_force_limit(row: Any, body: Body, control_hz: int, largest: float, *, wrench: bool) -> None:
+    """Write into a record of `ARM_LIMITS` with what an arm may press.
 
     Args:
         control_hz: ticks a second [Hz].
-        largest: with which the tool may press [N].
-        wrench: estimate also the wrenches.
+        largest: force with which the tool may press [N].
+        wrench: estimate also the wrench on the tool.
 
     Raises:
         ConfigError: the largest force is not positive.
     """
+    if not largest > 0.0:
+        raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
+    period = max(1, round(_PERIOD_S * control_hz))
+    row["feels"], row["has_wrench"], row["most_force"] = True, wrench, largest
+    row["felt_ticks"], row["felt_hz"], row["most_hung"] = period, control_hz / period, round(_LOAD_S / _PERIOD_S)
+    row["most_lost"] = max(1, round(_LOST_S * control_hz / period))
+    dynamics = ArmDynamics(body)
+    dof = dynamics.dof
+    effort = np.asarray(body.need(Arm).limits.effort[:dof])
+    row["certain"][:dof] = effort.max() / effort  # weights: torques are as wrong as their motors are large
+    dynamics.fill(row)
 
-    def __init__(self, body: Body, n: int, control_hz: int, largest: float, *, wrench: bool = False) -> None:
-        arm = body.need(Arm)
-        if not largest > 0.0:
-            raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
-        self.largest, self._load = largest, arm.load
-        self._hung: NDArray[np.int64] = np.zeros(n, np.int64)  # estimates at rest with a load that was not declared
-        self._most_hung = round(_LOAD_S / _PERIOD_S)
-        self._pull = np.zeros(n)
-        self._dynamics, self._forward = ArmDynamics(body), ForwardKinematics(arm.chain)
-        self._dof = dof = self._dynamics.dof
-        effort = np.asarray(arm.limits.effort[:dof])
-        self._certain = effort.max() / effort  # weights: torques are as wrong as their motors are large
-        self._period = max(1, round(_PERIOD_S * control_hz))
-        self._hz = control_hz / self._period
-        self._sum, self._ticks = np.zeros((n, dof)), 0
-        self._zeros: NDArray[np.int64] = np.zeros(n, np.int64)  # readings of this period without any effort
-        self._lost_periods: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._most_lost = max(1, round(_LOST_S * control_hz / self._period))
-        self._position, self._velocity, self.torque = (np.zeros((n, dof)) for _ in range(3))
-        self._fresh = np.ones(n, np.bool_)
-        self.force, self.pressing = np.zeros((2, n))
-        self.wrench: Array = np.zeros((n, 6 if wrench else 0))
-        self.exceeded, self.measured, self.lost = np.zeros((3, n), np.bool_)
 
-    def update(
-        self, reading: PlantReading, resting: NDArray[np.bool_] | bool = False, position: Array | None = None
-    ) -> bool:
-        """Take one tick into account; return whether there is a new estimate that is too large for any arm.
-
-        Args:
-            resting: the arms that are at rest whatever speeds are read, shape (n,).
-            position: where the joints are, if not where they are read to be [rad], shape (n, dof).
-        """
-        if not reading.has_effort:
-            self.measured[:] = False
-            return False
-        dof = self._dof
-        position = reading.position[:, :dof] if position is None else position
-        effort = reading.effort[:, :dof]
-        self._sum += effort
-        if np.count_nonzero(effort) < effort.size:
-            self._zeros += ~effort.any(axis=1)
-        self._ticks += 1
-        if self._ticks < self._period:
-            return False
-        velocity = reading.velocity[:, :dof]
-        middle, speed = (position + self._position) / 2, (velocity + self._velocity) / 2
-        change = (velocity - self._velocity) * self._hz
-        moving = np.logical_not(resting).reshape(-1, 1)
-        speed, change = speed * moving, change * moving
-        given = self._sum / np.maximum(self._ticks - self._zeros, 1)[:, None]
-        residual = given - self._dynamics.torque(middle, speed, change)
-        self._position[:], self._velocity[:] = position, velocity
-        ticks, self._sum[:], self._ticks = self._ticks, 0.0, 0
-        residual[self._fresh] = 0.0  # where they came from is not known yet
-        self._fresh[:] = False
-        torque = self.torque
-        if self._zeros.any() or self._lost_periods.any():
-            self._judge_zeros(ticks, position, residual)
-        else:
-            self.measured[:] = True
-        torque += _SHARE * (residual - torque)
-        if self.wrench.size:
-            every = np.ascontiguousarray(self._forward.jacobian(position))
-            np.negative(tool_wrench(every, torque, _DAMPING), out=self.wrench)
-        self.force[:] = self.pressing[:] = self._pull[:] = 0.0
-        self.exceeded[:] = False
-        felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
-        if not np.count_nonzero(felt):
-            self._hung[:] = 0
-            return False
-        # Products of matrices that lie otherwise in memory round otherwise: with it the number of arms would count.
-        jacobian = np.ascontiguousarray(self._forward.jacobian(position[felt]))
-        both = tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3], self._tool_force(jacobian, torque[felt])
-        sizes = [np.linalg.norm(force, axis=1) for force in both]
-        force = np.where((sizes[0] > sizes[1])[:, None], *both)
-        self.force[felt] = np.maximum(*sizes)
-        np.greater(self.force, self.largest, out=self.exceeded)
-        self._pull[felt] = force[:, 2]  # the tool pulls it up
-        hangs = (self._pull > _LOAD_N) & (self._pull > _DOWN * self.force) & (np.abs(velocity) < _STILL).all(axis=1)
-        self.pressing[:] = self.force
-        self.pressing[(self._pull > _DOWN * self.force) & (self.force < _LOAD_N)] = 0.0
-        self._hung += 1
-        self._hung *= hangs
-        self.exceeded |= self._hung >= self._most_hung
-        return bool(np.count_nonzero(self.exceeded))
-
-    def _judge_zeros(self, ticks: int, position: Array, residual: Array) -> None:
-        """Keep the estimates of arms without efforts in this period; forget them of those without for longer."""
-        none = self._zeros == ticks
-        self._zeros[:] = 0
-        self._lost_periods += 1
-        self._lost_periods *= none
-        self.measured |= ~none
-        self.measured &= self._lost_periods < self._most_lost
-        self.torque[~self.measured] = 0.0
-        np.copyto(residual, self.torque, where=none[:, None])
-        weight = np.abs(self._dynamics.torque(position, np.zeros_like(position), np.zeros_like(position)))
-        self.lost[:] = (self._lost_periods >= self._most_lost) & (weight.max(axis=1) > _CARRIES)
-
-    def _tool_force(self, jacobian: Array, torque: Array) -> Array:
-        """Return the forces on the tools alone, without moments, that torques amount to [N], shape (k, 3)."""
-        lever = jacobian[:, :3] * self._certain
-        square = lever @ np.swapaxes(lever, 1, 2) + _FORCE_DAMPING**2 * np.eye(3)
-        return np.asarray(np.linalg.solve(square, lever @ (torque * self._certain)[..., None])[..., 0])
-
-    def explain(self) -> str:
-        """Return as text which force was too large."""
-        if (self._hung >= self._most_hung).any():
-            return (
-                f"About {self._load + self._pull.max() / _GRAVITY:.1f} kg hang on the tool, or it presses upwards; "
-                f"declared are {self._load:g} kg. Declare what it carries with robot.payload."
-            )
+def explain_force(body: Body, arm: Any, limits: Any) -> str:
+    """Return as text which force of an arm was too large."""
+    if arm["hung"] >= limits["most_hung"]:
+        load = body.need(Arm).load
         return (
-            f"The tool pressed with {self.force.max():.0f} N; {self.largest:g} N is the most. Find out what is in its "
-            "way, or allow more with robot.max_force."
+            f"About {load + arm['pull'] / _GRAVITY:.1f} kg hang on the tool, or it presses upwards; "
+            f"declared are {load:g} kg. Declare what it carries with robot.payload."
         )
+    return (
+        f"The tool pressed with {arm['force']:.0f} N; {limits['most_force']:g} N is the most. Find out what is in its "
+        "way, or allow more with robot.max_force."
+    )
 
-    def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget arms that were put somewhere else."""
-        self._fresh[ids] = True
-        self._hung[ids] = 0
-        self._zeros[ids] = 0
-        self._sum[ids] = self.torque[ids] = self.force[ids] = self.pressing[ids] = 0.0
-        self.wrench[ids] = 0.0
-        self.exceeded[ids] = False
+
+def forget_force(arm: Any) -> None:
+    """Forget what an arm felt: it was somewhere else."""
+    for name in ("hung", "zeros", "force", "pressing", "presses"):
+        arm[name] = 0
+    for name in ("sum", "torque", "wrench"):
+        arm[name][:] = 0.0
+    arm["is_fresh"] = True
+
+
+@kernel()
+def feel(state: Any, arm: Any, limits: Any, geometry: Any) -> bool:
+    """Take one tick into account; return whether there is a new estimate that is too large.
+
+    To the arm's `force` [N], 0 where the joints feel too little to ask, `torque`, what the motors give more than the
+    posture and its motion need [N m], `pressing`, the force that is more than a load which need not be declared [N],
+    and `wrench`, what the surroundings put on the tool, in the base frame, if it is asked for [N, N m].
+    """
+    if not limits.has_effort:
+        arm.is_measured = False
+        return False
+    is_none = True
+    for k in range(limits.dof):
+        arm.sum[k] += state.effort[k]
+        is_none = is_none and state.effort[k] == 0.0
+    arm.zeros += is_none
+    arm.ticks += 1
+    if arm.ticks < limits.felt_ticks:
+        return False
+    find_residual(state, arm, limits)
+    for k in range(limits.dof):
+        # What is felt, found again as what it needs of motors.
+        arm.torque[k] += _SHARE * (arm.needs[k] - arm.torque[k])
+    if limits.has_wrench:
+        find_jacobian(arm, geometry, arm.felt_position)
+        find_wrench(arm, limits)
+        for k in range(6):
+            arm.wrench[k] = -arm.side[k]
+    find_force(arm, limits, geometry)
+    return arm.presses
+
+
+@kernel()
+def find_residual(state: Any, arm: Any, limits: Any) -> None:
+    """Write what the motors gave in this period more than its motion needs to the arm's `needs` [N m].
+
+    Where nothing was measured it is what it was.
+    """
+    is_resting = arm.rest_ticks > 0  # whatever speeds are read
+    for k in range(limits.dof):
+        # The joint of a wrong encoder is where its servo was commanded to hold it.
+        position = state.command[k] if arm.wrong[k] != 0 else state.position[k]
+        velocity = state.velocity[k]
+        arm.room[0, k] = (position + arm.felt_position[k]) / 2
+        arm.room[1, k] = 0.0 if is_resting else (velocity + arm.felt_velocity[k]) / 2
+        arm.room[2, k] = 0.0 if is_resting else (velocity - arm.felt_velocity[k]) * limits.felt_hz
+        arm.felt_position[k], arm.felt_velocity[k] = position, velocity
+    find_torques(arm, limits, arm.room[0], arm.room[1], arm.room[2])
+    given_ticks = max(arm.ticks - arm.zeros, 1)
+    for k in range(limits.dof):
+        # Where it came from is not known yet.
+        arm.needs[k] = 0.0 if arm.is_fresh else arm.sum[k] / given_ticks - arm.needs[k]
+        arm.sum[k] = 0.0
+    is_none = arm.zeros == arm.ticks
+    arm.is_fresh, arm.ticks, arm.zeros = False, 0, 0
+    arm.is_lost = False
+    if not is_none:
+        arm.lost_periods, arm.is_measured = 0, True
+        return
+    arm.lost_periods += 1
+    if arm.lost_periods >= limits.most_lost:
+        arm.is_measured = False
+        for k in range(limits.dof):
+            arm.room[0, k] = 0.0
+        find_torques(arm, limits, arm.felt_position, arm.room[0], arm.room[0])
+        for k in range(limits.dof):
+            arm.is_lost = arm.is_lost or abs(arm.needs[k]) > _CARRIES
+    for k in range(limits.dof):
+        if not arm.is_measured:
+            arm.torque[k] = 0.0
+        arm.needs[k] = arm.torque[k]
+
+
+@kernel()
+def find_wrench(arm: Any, limits: Any) -> None:
+    """Write the force and moment on the tool that torques amount to, by damped least squares, to the arm's `side`.
+
+    Near zero in directions that a singular posture can feel nothing from.
+    """
+    for i in range(6):
+        arm.side[i] = 0.0
+        for j in range(i + 1):
+            arm.square[i, j] = _DAMPING * _DAMPING if i == j else 0.0
+        for k in range(limits.dof):
+            arm.side[i] += arm.jacobian[i, k] * arm.torque[k]
+            for j in range(i + 1):
+                arm.square[i, j] += arm.jacobian[i, k] * arm.jacobian[j, k]
+    solve(arm.square, arm.side, 6)
+
+
+@kernel()
+def find_lone_force(arm: Any, limits: Any) -> None:
+    """Write the force on the tool alone, without a moment, that torques amount to [N], to the arm's `side`."""
+    for i in range(3):
+        arm.side[i] = 0.0
+        for j in range(i + 1):
+            arm.square[i, j] = _FORCE_DAMPING * _FORCE_DAMPING if i == j else 0.0
+        for k in range(limits.dof):
+            certain = limits.certain[k] * limits.certain[k]
+            arm.side[i] += arm.jacobian[i, k] * arm.torque[k] * certain
+            for j in range(i + 1):
+                arm.square[i, j] += arm.jacobian[i, k] * arm.jacobian[j, k] * certain
+    solve(arm.square, arm.side, 3)
+
+
+@kernel()
+def find_force(arm: Any, limits: Any, geometry: Any) -> None:
+    """Find the force with which an arm presses, and whether that is too much."""
+    arm.force = arm.pressing = arm.pull = 0.0
+    arm.presses = False
+    felt, is_still = 0.0, True
+    for k in range(limits.dof):
+        felt = max(felt, abs(arm.torque[k]))
+        is_still = is_still and abs(arm.felt_velocity[k]) < _STILL
+    if felt <= _LEAST_TORQUE:
+        arm.hung = 0
+        return
+    find_jacobian(arm, geometry, arm.felt_position)
+    find_wrench(arm, limits)
+    size, arm.pull = math.sqrt(arm.side[0] ** 2 + arm.side[1] ** 2 + arm.side[2] ** 2), arm.side[2]
+    find_lone_force(arm, limits)
+    alone = math.sqrt(arm.side[0] ** 2 + arm.side[1] ** 2 + arm.side[2] ** 2)
+    arm.force = max(size, alone)
+    if alone >= size:
+        arm.pull = arm.side[2]  # the tool pulls it up
+    is_up = arm.pull > _DOWN * arm.force
+    arm.pressing = 0.0 if is_up and arm.force < _LOAD_N else arm.force
+    arm.hung = arm.hung + 1 if is_up and arm.pull > _LOAD_N and is_still else 0
+    arm.presses = arm.force > limits.most_force or arm.hung >= limits.most_hung

@@ -1,6 +1,7 @@
 """How far an arm is from itself and from the table, with capsules for its links."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +38,27 @@ class CollisionModel:
         self._frame = np.array([capsule.frame for capsule in chain.capsules] * 2, np.intp)
         self._segments = np.concatenate((starts, ends - starts)).T[:, :, None]
         self._first, self._second = pairs.T
-        squares = np.maximum(np.sum((ends - starts) ** 2, axis=1), _TINY)[:, None]
+        self._squares = np.maximum(np.sum((ends - starts) ** 2, axis=1), _TINY)
+        squares = self._squares[:, None]
         self._square1, self._square2 = squares[self._first], squares[self._second]
         self._radii = (radii[self._first] + radii[self._second])[:, None]
         below = [[c.radius if _is_lifted(chain, c, end) else -np.inf for c in chain.capsules] for end in (0, 1)]
         self._below_start, self._below_end = np.array(below)[:, :, None]
+
+    def fill(self, row: Any) -> None:
+        """Write the capsules and their pairs into the record that a tick finds distances with."""
+        count, pairs = self._count, len(self._first)
+        for name, values in (
+            ("frame", self._frame[:count]),
+            ("start", self._segments[:, :count, 0].T),
+            ("way", self._segments[:, count:, 0].T),
+            ("long", self._squares),
+            ("below_start", self._below_start[:, 0]),
+            ("below_end", self._below_end[:, 0]),
+        ):
+            row[name][:count] = values
+        for name, values in (("first", self._first), ("second", self._second), ("radii", self._radii[:, 0])):
+            row[name][:pairs] = values
 
     def distances(self, q: Array) -> tuple[Array, Array]:
         """Return the smallest self distance and the smallest table distance of postures.

@@ -4,6 +4,7 @@ import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio
@@ -95,6 +96,19 @@ class ArmDynamics:
             lever = self.model.frames[self._tool].placement.translation
             self.model.inertias[last] += pinocchio.Inertia(arm.load, lever, np.zeros((3, 3)))
         self._data = self.model.createData()
+
+    def fill(self, row: Any) -> None:
+        """Write the rigid bodies into the record of limits that a tick finds torques with."""
+        model = self.model
+        for k in range(self.dof):
+            joint, placed, inertia = model.joints[k + 1], model.jointPlacements[k + 1], model.inertias[k + 1]
+            axes = {"JointModelRX": (1, 0, 0), "JointModelRY": (0, 1, 0), "JointModelRZ": (0, 0, 1)}
+            if joint.shortname() not in axes:
+                raise ConfigError(f"Joint {model.names[k + 1]!r} of the MJCF turns about none of its body's axes x, y, z.")
+            row["axis"][k] = axes[joint.shortname()]
+            row["turn"][k], row["offset"][k] = placed.rotation, placed.translation
+            row["mass"][k], row["centre"][k], row["inertia"][k] = inertia.mass, inertia.lever, inertia.inertia
+        row["rotor"][: self.dof] = model.armature
 
     def terms(self, position: Array, velocity: Array) -> DynamicsTerms:
         """Return the dynamics in a state of n arms.

@@ -1,6 +1,7 @@
 """Goals of n arms: the queue, the state machine, and exactly one result for every goal."""
 
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,11 @@ from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
-from bhd_lerobot.control.motion.supervision import Supervisor
+from bhd_lerobot.control.motion.supervision import Verdict, begin_goal, explain_verdict
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State, Trajectory, eased
 
 Array = NDArray[np.float64]
-Reference = tuple[Array, Array, Array]
-"""Position [rad, and m for the gripper], velocity and acceleration, each of shape (n, dof + 1)."""
+_CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)
 
 
 class _Motion(IntEnum):
@@ -31,41 +31,41 @@ class _Motion(IntEnum):
 class GoalManager:
     """Follows goals, one after the other, for each of n arms.
 
-    The owner keeps the reference and calls `tick`, which writes it where a goal is followed or a brake is played.
+    A tick judges what is followed and plays it, see `judge_goal` and `play`; it comes here to start, to end and to
+    brake: `serve`.
 
     Attributes:
         phase: a `GoalPhase` for each arm, shape (n,).
         busy: whether a goal is followed or waits, or a brake is played, shape (n,).
-        following: whether `tick` writes the reference, shape (n,).
-        limit: how far joints may be from their references.
+        following: whether a trajectory is what the reference follows, shape (n,).
+        player: what is played.
 
     Args:
+        states: the records of the robots.
+        arms: the records of the arms.
         control_hz: ticks a second [Hz].
         planning: who plans; planned in the tick that a goal starts in if None.
     """
 
-    def __init__(self, body: Body, n: int, control_hz: int, planning: Planning | None = None) -> None:
-        arm = body.need(Arm)
+    def __init__(
+        self, body: Body, states: NDArray[Any], arms: NDArray[Any], control_hz: int, planning: Planning | None = None
+    ) -> None:
+        self._arm, n = body.need(Arm), len(arms)
+        self._hz, self._dof = control_hz, dof = control_hz, len(self._arm.chain.joints)
         self.planner = GoalPlanner(body, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
-        self.busy: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.busy: NDArray[np.bool_] = states["busy"]
         self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self._hz, self._dof = control_hz, len(arm.chain.joints)
-        self._player = TrajectoryPlayer(n, self._dof + 1)
+        self.player = TrajectoryPlayer(arms, dof + 1)
+        self._states, self._arms, self._follows = states, arms, states["follows_goal"]
+        self._reference = states["command"][:, : dof + 1], arms["speed"][:, : dof + 1], arms["change"][:, : dof + 1]
         self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
-        self._supervisor = Supervisor(arm, n, control_hz)
-        self.limit = self._supervisor.limit
         self._books = [GoalBook() for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is
         self._held: list[Capsule | None] = [None] * n
         self._planned = np.ones(n, np.int64)  # ticks of the trajectory of the goal that is followed
         self._motion = np.full(n, _Motion.NONE, np.int8)
-        self._waiting: set[int] = set()  # simulations in which something is to be started or to be stopped
-        self._is_judged = np.zeros(n, np.bool_)
-        self._judged = np.flatnonzero(self._is_judged)  # simulations whose goal is followed
-        self._braking = self._judged  # simulations that a brake is played for
-        self._idle = True
-        self._left, self._setpoint_jerk = np.zeros(n, np.bool_), np.asarray(arm.limits.setpoint_jerk)
+        self._setpoint_jerk = np.asarray(self._arm.limits.setpoint_jerk)
 
     # --- requests of a brain -----------------------------------------------------------------------------------------
 
@@ -101,8 +101,8 @@ class GoalManager:
         book, phase = self._books[sim], GoalPhase(int(self.phase[sim]))
         if book.followed is None:
             return Feedback(book.waiting[0].task_id, phase, 0.0, 0.0, 0.0) if book.waiting else None
-        left = self._player.remaining(sim)
-        error = self._supervisor.error(sim)
+        left = self.player.remaining(sim)
+        error = float(self._arms["away"][sim].max())
         progress = 1.0 - min(1.0, left / int(self._planned[sim]))
         return Feedback(book.followed.task_id, phase, progress, left / self._hz, error)
 
@@ -112,47 +112,30 @@ class GoalManager:
         """Plan with something in an arm's gripper from now on; with nothing if None."""
         self._held[sim] = held
 
-    def stop(
-        self, mask: NDArray[np.bool_], code: ResultCode, hard: bool, reference: Reference, message: str = ""
-    ) -> None:
-        """End all goals of some arms at once, and brake from the next tick on.
+    def stop(self, sim: int, code: ResultCode, *, hard: bool, message: str = "") -> None:
+        """End all goals of an arm at once, and brake from the next tick on.
 
         Args:
-            mask: the arms, shape (n,).
-            code: how their goals end.
+            sim: the arm.
+            code: how its goals end.
             hard: whether to brake with the limits of a stop; a stop that has begun hard stays so.
-            reference: where they are.
             message: why; from the code if it is empty.
         """
-        for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, code, message or REASONS.get(code, "The arm was stopped."))
-            wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
-            if self._motion[sim] < wanted:
-                self._brake(sim, reference, wanted)
-            self._changed(sim)
+        self._end_all(sim, code, message or REASONS.get(code, "The arm was stopped."))
+        wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
+        if self._motion[sim] < wanted:
+            self._brake(sim, wanted)
+        self._changed(sim)
 
-    def leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
-        """Go on from setpoints in this tick, which change accelerations faster than goals; `mask` has shape (n,)."""
-        self._left |= mask
+    def end_all(self, sim: int, code: ResultCode, message: str) -> None:
+        """End all goals of an arm, with a result and the reason, and let the owner have the reference as it is."""
+        self._end_all(sim, code, message)
+        self.let_go(sim)
 
-    def end_all(self, mask: NDArray[np.bool_], code: ResultCode, message: str) -> None:
-        """End all goals of some arms, and let the owner have the reference, which stays as it is.
-
-        Args:
-            mask: the arms, shape (n,).
-            code: how their goals end.
-            message: why.
-        """
-        for sim in np.flatnonzero(mask).tolist():
-            self._end_all(sim, code, message)
-            self._rest(sim)
-            self._changed(sim)
-
-    def let_go(self, mask: NDArray[np.bool_]) -> None:
-        """Play nothing any more for some arms; a stop, which ends their goals, follows. `mask` has shape (n,)."""
-        for sim in np.flatnonzero(mask).tolist():
-            self._rest(sim)
-            self._changed(sim)
+    def let_go(self, sim: int) -> None:
+        """Play nothing any more for an arm."""
+        self._rest(sim)
+        self._changed(sim)
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else, results included."""
@@ -163,63 +146,54 @@ class GoalManager:
             self.phase[sim] = GoalPhase.IDLE
             self._changed(sim)
 
-    def tick(self, reference: Reference, measured: tuple[Array, Array]) -> None:
-        """Judge what is followed, start what is next, and advance the reference by one tick, in place.
-
-        Args:
-            reference: where the arms are commanded to be.
-            measured: what the reference before this tick led to: positions and velocities, each of shape (n, dof + 1).
-        """
-        if self._idle:
-            return
-        self._orders.tick += 1
-        if len(self._judged):
-            for verdict in self._supervisor.judge(self._judged, self._player.active, reference[:2], measured):
-                self._end(verdict.sim, verdict.code, verdict.message)
-                self._brake(verdict.sim, reference, _Motion.BRAKE)
-                self._changed(verdict.sim)
-        if len(self._braking):
-            for sim in self._braking[~self._player.active[self._braking]].tolist():
-                self._rest(sim)
-                if self._books[sim].followed is not None:
-                    self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm has come to rest.")
+    def serve(self, sim: int) -> None:
+        """Do in the middle of a tick what the arm's record asks for: end, brake, start what is next."""
+        arm = self._arms[sim]
+        self._orders.tick = int(arm["at_tick"])
+        if verdict := int(arm["verdict"]):
+            arm["verdict"] = Verdict.NONE
+            self._end(sim, *explain_verdict(verdict, self._arm, self._states[sim], arm, self._hz))
+            self._brake(sim, _Motion.BRAKE)
+            self._changed(sim)
+        if arm["brakes"] and not self.player.is_playing(sim):
+            self._rest(sim)
+            if self._books[sim].followed is not None:
+                self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm has come to rest.")
+            self._changed(sim)
+        if arm["waits"]:
+            if self._serve(sim):
                 self._changed(sim)
-        if self._waiting:
-            for sim in sorted(self._waiting):
-                if self._serve(sim, reference):
-                    self._changed(sim)
-        self._left[:] = False
-        self._player.tick(*reference)
+            self._note_phase(sim)
 
     # --- the state machine -------------------------------------------------------------------------------------------
 
-    def _serve(self, sim: int, reference: Reference) -> bool:
+    def _serve(self, sim: int) -> bool:
         """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may."""
         book, motion = self._books[sim], self._motion[sim]
         if motion == _Motion.HARD_BRAKE:
             return False
         if book.followed is not None:
-            self._brake(sim, reference, _Motion.BRAKE)
+            self._brake(sim, _Motion.BRAKE)
             if self._motion[sim] == _Motion.NONE:
                 self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm was at rest.")
         elif book.waiting and (motion != _Motion.BRAKE or book.waiting[0].preempt or self._orders.wanted(sim)):
-            return self._prepare(sim, book, reference)
+            return self._prepare(sim, book)
         elif motion == _Motion.GOAL:
             # The goal that took the last one's place was cancelled before it began.
-            self._brake(sim, reference, _Motion.BRAKE)
+            self._brake(sim, _Motion.BRAKE)
         return True
 
-    def _prepare(self, sim: int, book: GoalBook, reference: Reference) -> bool:
+    def _prepare(self, sim: int, book: GoalBook) -> bool:
         """Have the next goal planned, and start it; return whether it was started or has failed."""
         self.phase[sim] = GoalPhase.CONVERTING
-        before, now = self._begin(sim, reference)
+        before, now = self._begin(sim)
         if self._orders.deferred and self._motion[sim] == _Motion.NONE and now.moving:
             # It has followed setpoints. Where it is going to be is known only after a stop.
-            self._brake(sim, reference, _Motion.BRAKE)
+            self._brake(sim, _Motion.BRAKE)
             self._changed(sim)
 
         def ahead(ticks: int) -> State:
-            return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*vars(now).values())
+            return (self.player.ahead(sim, ticks) if ticks else None) or State.of(*vars(now).values())
 
         command = book.waiting[0]
         plan = self._orders.ask(sim, command, now, ahead, self._opening[sim], self._held[sim])
@@ -229,35 +203,36 @@ class GoalManager:
         if isinstance(plan, PlanFailure):
             self._end(sim, plan.code, plan.message)
             if self._motion[sim] < _Motion.BRAKE:
-                self._brake(sim, reference, _Motion.BRAKE)
+                self._brake(sim, _Motion.BRAKE)
             return True
         self._planned[sim] = plan.trajectory.ticks
         self._opening[sim] = float(plan.target[self._dof])
         if plan.rows is None:
-            self._player.start(sim, plan.trajectory if before is None else before.then(plan.trajectory))
+            self.player.start(sim, plan.trajectory if before is None else before.then(plan.trajectory))
         else:
-            self._player.borrow(plan.rows)
-        self._supervisor.begin(sim, command, plan.target)
+            self.player.borrow(plan.rows)
+        begin_goal(self._arms[sim], command, plan.target, self._hz)
         self._motion[sim] = _Motion.GOAL
         self.phase[sim] = GoalPhase.EXECUTING
         return True
 
-    def _brake(self, sim: int, reference: Reference, motion: _Motion) -> None:
+    def _brake(self, sim: int, motion: _Motion) -> None:
         """Brake an arm; one that is at rest stays there."""
         self._rest(sim)
-        before, state = self._begin(sim, reference)
+        before, state = self._begin(sim)
         if state.moving:
             brake = self.planner.brake(state, hard=motion == _Motion.HARD_BRAKE)
-            self._player.start(sim, brake if before is None else before.then(brake))
+            self.player.start(sim, brake if before is None else before.then(brake))
             self._motion[sim] = motion
 
-    def _begin(self, sim: int, reference: Reference) -> tuple[Trajectory | None, State]:
+    def _begin(self, sim: int) -> tuple[Trajectory | None, State]:
         """Return from where a motion of an arm begins, and what has to be played before."""
-        state = State.of(*(array[sim] for array in reference))
-        return eased(state, self._setpoint_jerk, self._hz) if self._left[sim] else (None, state)
+        state = State.of(*(array[sim] for array in self._reference))
+        # Setpoints change accelerations faster than goals.
+        return eased(state, self._setpoint_jerk, self._hz) if self._arms["has_left"][sim] else (None, state)
 
     def _rest(self, sim: int) -> None:
-        self._player.stop(sim)
+        self.player.stop(sim)
         self._motion[sim] = _Motion.NONE
         self._opening[sim] = None
 
@@ -276,13 +251,13 @@ class GoalManager:
         if self._orders.wanted(sim) is not (book.waiting[0] if book.waiting else None):
             self._orders.drop(sim)
         on_the_way = motion == _Motion.GOAL
-        self._is_judged[sim] = followed and on_the_way and not cancelled
+        arm = self._arms[sim]
+        arm["is_judged"] = followed and on_the_way and not cancelled
+        arm["brakes"] = motion >= _Motion.BRAKE
+        arm["waits"] = (not followed and (bool(book.waiting) or on_the_way)) or (followed and cancelled and on_the_way)
         self.following[sim] = motion != _Motion.NONE
         self.busy[sim] = self.following[sim] or followed or bool(book.waiting)
-        if (not followed and (book.waiting or on_the_way)) or (followed and cancelled and on_the_way):
-            self._waiting.add(sim)
-        else:
-            self._waiting.discard(sim)
-        self._judged = np.flatnonzero(self._is_judged)
-        self._braking = np.flatnonzero(self._motion >= _Motion.BRAKE)
-        self._idle = not self.busy.any()
+        self._note_phase(sim)
+
+    def _note_phase(self, sim: int) -> None:
+        self._follows[sim] = self.phase[sim] in (_CONVERTING, _EXECUTING)

@@ -1,113 +1,92 @@
-"""Plays trajectories back, one tick at a time, for n simulations at once."""
+"""Plays trajectories back, one tick at a time."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.motion.trajectory import State, Trajectory
+
+Array = NDArray[np.float64]
 
 
 class TrajectoryPlayer:
-    """One trajectory for each simulation, or none.
-
-    The rows of all trajectories lie in one block, so that a tick is one gather however many are played.
+    """One trajectory for each arm, or none: rows of one block, from the next to the end, in the arms' records.
 
     Attributes:
-        active: which simulations a trajectory is played for, shape (n,).
+        rows: position, velocity and acceleration at each tick, shape (T, 3, dof).
+
+    Args:
+        arms: the records of the arms.
+        dof: numbers of a position.
     """
 
-    def __init__(self, n: int, dof: int) -> None:
-        self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self._rows: NDArray[np.float64] = np.zeros((4096, 3, dof))
-        self._source = self._rows  # what the only trajectory is played from: the block, or borrowed rows
-        self._used = 0
-        # The row that is next is the number of ticks so far and this.
-        self._offset, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
-        self._ticks = 0
-        self._ids = np.flatnonzero(self.active)
-        self._only: tuple[int, int] | None = None  # the simulation and its offset, if there is one only
-        self._soonest = 0  # ticks until the first of the trajectories ends
+    def __init__(self, arms: NDArray[Any], dof: int) -> None:
+        self._next, self._end = arms["row"], arms["end"]
+        self._block: Array = np.zeros((4096, 3, dof))
+        self.rows, self._used = self._block, 0
 
     def start(self, sim: int, trajectory: Trajectory) -> None:
         """Play a trajectory from the next tick on; it takes the place of the one that is being played."""
-        self.active[sim] = False
-        if self._used + trajectory.ticks > len(self._rows):
+        self.stop(sim)
+        if self._used + trajectory.ticks > len(self._block):
             self._make_room(trajectory.ticks)
         begin, end = self._used, self._used + trajectory.ticks
-        rows = self._rows[begin:end]
+        rows = self._block[begin:end]
         rows[:, 0], rows[:, 1], rows[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
-        self._offset[sim], self._end[sim], self._used = begin - self._ticks, end, end
-        self._source = self._rows
-        self.active[sim] = True
-        self._changed()
+        self._next[sim], self._end[sim], self._used, self.rows = begin, end, end, self._block
 
-    def borrow(self, rows: NDArray[np.float64]) -> None:
-        """Play rows of another owner from the next tick on, without copying them; for one simulation.
+    def borrow(self, rows: Array) -> None:
+        """Play rows of another owner from the next tick on, without copying them; for one arm.
 
         Args:
-            rows: position, velocity and acceleration at each tick, shape (T, 3, dof). They must stay as they are until
-                something else is played.
+            rows: as the attribute. They must stay as they are until something else is played.
         """
-        if len(self.active) != 1:
-            raise ValueError(f"Rows of {len(self.active)} simulations lie in one block; only a single one may borrow.")
-        self._offset[0], self._end[0] = -self._ticks, len(rows)
-        self._source = rows
-        self.active[0] = True
-        self._changed()
+        if len(self._next) != 1:
+            raise ValueError(f"Rows of {len(self._next)} arms lie in one block; only a single one may borrow.")
+        self._next[0], self._end[0], self.rows = 0, len(rows), rows
 
     def stop(self, sim: int) -> None:
-        """Play nothing for a simulation: its reference stays as it is."""
-        self.active[sim] = False
-        self._changed()
+        """Play nothing for an arm: its reference stays as it is."""
+        self._next[sim] = self._end[sim] = 0
+        if not (self._next < self._end).any():
+            self._used = 0
+
+    def is_playing(self, sim: int) -> bool:
+        """Return whether anything is left to be played for an arm."""
+        return bool(self._next[sim] < self._end[sim])
 
     def remaining(self, sim: int) -> int:
         """Return how many ticks are left."""
-        return int(self._end[sim] - self._offset[sim]) - self._ticks if self.active[sim] else 0
+        return max(int(self._end[sim] - self._next[sim]), 0)
 
     def ahead(self, sim: int, ticks: int) -> State | None:
         """Return the state after so many more ticks, at least one, or at the end; None if nothing is played."""
-        if not self.active[sim]:
+        if not self.is_playing(sim):
             return None
-        rows = self._source if len(self.active) == 1 else self._rows
-        last = min(int(self._offset[sim]) + self._ticks + ticks, int(self._end[sim])) - 1
-        return State.of(*rows[last])
-
-    def tick(
-        self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
-    ) -> None:
-        """Write the next row of each trajectory; who plays none keeps what is there. The arrays have shape (n, dof)."""
-        if not self._soonest:
-            return
-        if self._only is not None:
-            sim, offset = self._only
-            position[sim], velocity[sim], acceleration[sim] = self._source[offset + self._ticks]
-        else:
-            ids = self._ids
-            rows = self._rows[self._offset[ids] + self._ticks]
-            position[ids], velocity[ids], acceleration[ids] = rows[:, 0], rows[:, 1], rows[:, 2]
-        self._ticks += 1
-        self._soonest -= 1
-        if not self._soonest:
-            ids = self._ids
-            self.active[ids] = self._offset[ids] + self._ticks < self._end[ids]
-            self._changed()
-
-    def _changed(self) -> None:
-        self._ids = ids = np.flatnonzero(self.active)
-        self._soonest = int((self._end[ids] - self._offset[ids]).min()) - self._ticks if len(ids) else 0
-        self._only = (int(ids[0]), int(self._offset[ids[0]])) if len(ids) == 1 else None
-        if not len(ids):
-            self._used = 0
+        return State.of(*self.rows[min(int(self._next[sim]) + ticks, int(self._end[sim])) - 1])
 
     def _make_room(self, ticks: int) -> None:
         """Move the rows that are still to be played to the front of a block that holds `ticks` more."""
-        ids = np.flatnonzero(self.active)
-        lengths = self._end[ids] - self._offset[ids] - self._ticks
+        ids = np.flatnonzero(self._next < self._end)
+        lengths = self._end[ids] - self._next[ids]
         needed = int(lengths.sum()) + ticks
         # Half of the block stays free, so that rows are moved seldom.
-        rows = np.zeros((max(len(self._rows), 2 * needed), *self._rows.shape[1:]))
+        block = np.zeros((max(len(self._block), 2 * needed), *self._block.shape[1:]))
         used = 0
         for sim, length in zip(ids, lengths, strict=True):
-            rows[used : used + length] = self._rows[self._end[sim] - length : self._end[sim]]
-            self._offset[sim], self._end[sim] = used - self._ticks, used + length
+            block[used : used + length] = self._block[self._end[sim] - length : self._end[sim]]
+            self._next[sim], self._end[sim] = used, used + length
             used += length
-        self._rows, self._used = rows, used
+        self._block, self._used = block, used
+
+
+@kernel()
+def play(state: Any, arm: Any, limits: Any, rows: Array) -> None:
+    """Write the next row of an arm's trajectory to its reference; it stays as it is if none is left."""
+    if arm.row >= arm.end:
+        return
+    for k in range(limits.width):
+        state.command[k], arm.speed[k], arm.change[k] = rows[arm.row, 0, k], rows[arm.row, 1, k], rows[arm.row, 2, k]
+    arm.row += 1
