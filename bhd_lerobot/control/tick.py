@@ -296,7 +296,7 @@ def tick_all(  # noqa: PLR0917
             continue
         if not goes_on:
             arm.stage = _NONE
-        geometry = geometries[arm.geometry]
+        geometry = geometries[arm.geometry % len(geometries)]
         queue, word, monitor = queues[sim], estop[:, sim], monitors[sim % len(monitors)]
         seen, seen_ns = sensors[sim], sensors_ns[sim]
         own = limits[0], arm_limits[0]

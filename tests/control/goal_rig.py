@@ -7,10 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
-from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.motion.player import play
+from bhd_lerobot.control.motion.supervision import has_goals_to_serve
 from bhd_lerobot.control.motion.trajectory import MotionLimits
 
 Array = NDArray[np.float64]
@@ -79,10 +82,17 @@ class Rig:
 
     def __init__(self, n: int = 1, planning: Planning | None = None) -> None:
         self.n = n
-        self.manager = GoalManager(ARM, n, HZ, planning)
-        self.position = np.tile(HOME, (n, 1))
-        self.velocity, self.acceleration = np.zeros((n, 7)), np.zeros((n, 7))
-        self.measured_position, self.measured_velocity = self.position.copy(), self.velocity.copy()
+        controller = ArmController(ARM, n, HZ, 20, planning)
+        self.manager, states = controller.goals, controller.states
+        self.position, self.velocity, self.acceleration = (
+            controller.command,
+            controller.velocity,
+            controller.acceleration,
+        )
+        self.measured_position, self.measured_velocity = states["position"][:, :7], states["velocity"][:, :7]
+        self.measured_position[:] = HOME
+        [self._limits] = as_objects(controller.arm_limits)
+        self._records = list(zip(as_objects(states), as_objects(controller.arms), strict=True))
         self.hard = np.zeros(n, np.bool_)
         self.disturb: Callable[[Rig], None] | None = None  # changes what is measured
         self._rows, self._stopped = [np.stack(self.reference)], list[NDArray[np.bool_]]()
@@ -94,7 +104,10 @@ class Rig:
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
-            self.manager.tick(self.reference, (self.measured_position, self.measured_velocity))
+            for sim, (state, arm) in enumerate(self._records):
+                if has_goals_to_serve(state, arm, self._limits):
+                    self.manager.serve(sim)
+                play(state, arm, self._limits, self.manager.player.rows)
             self._stopped.append(self.hard.copy())
             if self.hard.any():
                 self.hard &= self.velocity.any(axis=1) | self.acceleration.any(axis=1)
@@ -133,7 +146,8 @@ class Rig:
 
     def stop(self, code: ResultCode, hard: bool, mask: NDArray[np.bool_] | None = None) -> None:
         mask = np.ones(self.n, np.bool_) if mask is None else mask
-        self.manager.stop(mask, code, hard, self.reference)
+        for sim in np.flatnonzero(mask):
+            self.manager.stop(int(sim), code, hard=hard)
         self.hard |= mask & hard
 
     def results(self, sim: int = 0) -> list[tuple[str, ResultCode]]:

@@ -17,7 +17,7 @@ from bhd_lerobot.control.arm.setpoints import follow_setpoint, leave_setpoints, 
 from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.control.motion.player import play
-from bhd_lerobot.control.motion.supervision import judge_goal, most_away
+from bhd_lerobot.control.motion.supervision import has_goals_to_serve, most_away
 
 Array = NDArray[np.float64]
 
@@ -95,12 +95,8 @@ def move_arm(state: Any, arm: Any, limits: Any, geometry: Any, rows: Array, has_
             else:
                 follow_setpoint(state, arm, limits, geometry)
         arm.stage = _GOALS
-        if state.busy:
-            arm.at_tick += 1
-            if arm.is_judged:
-                arm.verdict = judge_goal(state, arm, limits)
-            if arm.verdict != 0 or arm.waits or (arm.brakes and arm.row >= arm.end):
-                return False
+        if has_goals_to_serve(state, arm, limits):
+            return False
     if arm.stage == _GOALS:
         arm.has_left = False
         play(state, arm, limits, rows)

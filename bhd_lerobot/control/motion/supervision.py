@@ -66,6 +66,17 @@ def most_away(arm: Any, limits: Any, joint: int) -> float:
 
 
 @kernel()
+def has_goals_to_serve(state: Any, arm: Any, limits: Any) -> bool:
+    """Judge the goal that is followed; return whether one, or a brake, is to be started or to be ended."""
+    if not state.busy:
+        return False
+    arm.at_tick += 1
+    if arm.is_judged:
+        arm.verdict = judge_goal(state, arm, limits)
+    return arm.verdict != _NONE or arm.waits or (arm.brakes and arm.row >= arm.end)
+
+
+@kernel()
 def judge_goal(state: Any, arm: Any, limits: Any) -> int:
     """Judge a goal by what is measured; return a `Verdict`."""
     arm.age += 1

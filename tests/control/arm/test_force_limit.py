@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.arm.force_limit import ForceLimit
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.force_limit import explain_force, feel, forget_force
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.errors import ConfigError
 
 HZ = 500
@@ -16,32 +17,43 @@ DYNAMICS = ArmDynamics(ARM)
 HOME = np.array(ARM.arm.home[:6])
 
 
-def reading_of(forces: np.ndarray, postures: np.ndarray = HOME) -> PlantReading:
-    """Return arms at rest whose tools press with forces [N], base frame, shape (n, 3)."""
-    n = len(forces)
-    reading = PlantReading(n, 7)
-    reading.position[:, :6] = postures
-    terms = DYNAMICS.terms(reading.position[:, :6], reading.velocity[:, :6])
-    jacobian = terms.jacobian[:, :3]
-    reading.effort[:, :6] = terms.gravity + np.einsum("nij,ni->nj", jacobian, forces)
-    reading.has_effort = True
-    return reading
+class Felt:
+    """Arms at rest whose tools press with forces [N], base frame, shape (n, 3)."""
+
+    def __init__(self, forces: np.ndarray, postures: np.ndarray = HOME, largest: float = 150.0) -> None:
+        n = len(forces)
+        self.controller = controller = ArmController(ARM, n, HZ, 20, max_force=largest)
+        position, velocity, effort = (controller.states[name][:, :6] for name in ("position", "velocity", "effort"))
+        position[:] = postures
+        terms = DYNAMICS.terms(position, velocity)
+        effort[:] = terms.gravity + np.einsum("nij,ni->nj", terms.jacobian[:, :3], forces)
+        self.arms, self.limits = controller.arms, controller.arm_limits[0]
+        self.limits["has_effort"] = True
+        [geometry, *_], [limits] = as_objects(controller.geometries), as_objects(controller.arm_limits)
+        pairs = zip(as_objects(controller.states), as_objects(self.arms), strict=True)
+        self._records = [(state, arm, limits, geometry) for state, arm in pairs]
+
+    def update(self, ticks: int = 1) -> int:
+        """Let ticks go by; return the first in which any force was too large, or -1."""
+        for tick in range(ticks):
+            if any([feel(*records) for records in self._records]):
+                return tick
+        return -1
 
 
 def test_forces_are_estimated_and_compared_with_the_largest() -> None:
     forces = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -100.0), (0.0, 0.0, -200.0), (0.0, 160.0, 160.0)])
-    limit = ForceLimit(ARM, 4, HZ, 150.0)
-    reading = reading_of(forces)
-    hits = [limit.update(reading) for _ in range(100)]
-    np.testing.assert_allclose(
-        limit.force, np.linalg.norm(forces, axis=1), rtol=0.12
-    )  # singular directions are left out
-    assert limit.exceeded.tolist() == [False, False, True, True]
-    assert hits.index(True) * 1000 / HZ < 80  # [ms]
-    assert "150 N is the most" in limit.explain()
-    limit.restart(np.array([2]))
-    assert limit.force[2] == 0.0
-    assert not limit.exceeded[2]
+    felt = Felt(forces)
+    assert 0 <= felt.update(100) * 1000 / HZ < 80  # [ms]
+    for _ in range(100):
+        felt.update()
+    # Singular directions are left out.
+    np.testing.assert_allclose(felt.arms["force"], np.linalg.norm(forces, axis=1), rtol=0.12)
+    assert felt.arms["presses"].tolist() == [False, False, True, True]
+    assert "150 N is the most" in explain_force(ARM, felt.arms[2], felt.limits)
+    forget_force(felt.arms[2])
+    assert felt.arms["force"][2] == 0.0
+    assert not felt.arms["presses"][2]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -49,42 +61,26 @@ def test_forces_in_random_postures_and_directions_are_found_as_the_page_says(see
     rng, kinematics = np.random.default_rng(seed), ArmKinematics(ARM.arm.chain, ARM.limits)
     postures = np.array(ARM.arm.home)[:6] + rng.uniform(-1.5, 1.5, (1000, 6))
     free = np.min(kinematics.collision.distances(postures), axis=0) > 0.02
-    postures = np.repeat(postures[free][:160], 20, axis=0)
+    postures = np.repeat(postures[free][:60], 8, axis=0)
     forces = rng.normal(size=(len(postures), 3))
     forces *= 150.0 / np.linalg.norm(forces, axis=1)[:, None]
-    limit, reading = ForceLimit(ARM, len(postures), HZ, 150.0), reading_of(forces, postures)
+    felt = Felt(forces, postures)
     for _ in range(100):
-        limit.update(reading)
-    share = limit.force / 150.0
+        felt.update()
+    share = felt.arms["force"] / 150.0
     assert np.median(share) > 0.97
     assert np.quantile(share, 0.05) > 0.85
     assert np.quantile(share, 0.01) > 0.68
     assert share.max() < 1.02
 
 
-def test_what_is_estimated_does_not_depend_on_how_many_arms_there_are() -> None:
-    forces = np.array([(3.0, 0.0, -90.0), (0.0, 20.0, -200.0), (0.0, 160.0, 1.0)])
-    together = ForceLimit(ARM, 3, HZ, 150.0)
-    reading = reading_of(forces)
-    for _ in range(50):
-        together.update(reading)
-    for sim in range(3):
-        alone, one = ForceLimit(ARM, 1, HZ, 150.0), reading_of(forces[sim : sim + 1])
-        for name in ("position", "velocity", "effort"):
-            getattr(one, name)[:] = getattr(reading, name)[sim : sim + 1]
-        for _ in range(50):
-            alone.update(one)
-        assert alone.force[0] == together.force[sim]
-
-
 def test_a_plant_that_measures_no_efforts_has_no_limit() -> None:
-    limit = ForceLimit(ARM, 1, HZ, 150.0)
-    reading = reading_of(np.array([(0.0, 0.0, -500.0)]))
-    reading.has_effort = False
-    assert not any(limit.update(reading) for _ in range(100))
+    felt = Felt(np.array([(0.0, 0.0, -500.0)]))
+    felt.limits["has_effort"] = False
+    assert felt.update(100) == -1
 
 
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan")])
 def test_a_limit_has_to_be_positive(largest: float) -> None:
     with pytest.raises(ConfigError, match=r"max_force is .*positive"):
-        ForceLimit(ARM, 1, HZ, largest)
+        Felt(np.zeros((1, 3)), largest=largest)

@@ -6,12 +6,15 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import HELD, Capsule
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.arm.held import HeldObjects
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.held import follow_gripper, held_capsule
 from bhd_lerobot.control.geometry.collision import CollisionModel
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.kernels import as_objects
 
 ARM, HZ, STALL = ur5(), 500, 50
+FORWARD = ForwardKinematics(ARM.arm.chain)
 KINEMATICS = ArmKinematics(ARM.arm.chain, ARM.limits)
 LEAST = ARM.arm.chain.min_distance
 
@@ -28,15 +31,23 @@ class Hand:
     """n grippers, as they are commanded and measured."""
 
     def __init__(self, *postures: np.ndarray) -> None:
-        n = len(postures)
-        self.held, self.reading = HeldObjects(ARM.arm, n, HZ), PlantReading(n, 7)
-        self.command = np.concatenate((postures, np.full((n, 1), 0.085)), axis=1)
-        self.reading.position[:] = self.command
+        self.controller = controller = ArmController(ARM, len(postures), HZ, 20)
+        self.command, self.position = controller.command, controller.states["position"][:, :7]
+        self.command[:, :6], self.command[:, 6] = postures, 0.085
+        self.position[:] = self.command
+        [self._limits] = as_objects(controller.arm_limits)
+        self._records = list(zip(as_objects(controller.states), as_objects(controller.arms), strict=True))
 
     def run(self, opening: float, command: float, ticks: int = STALL + 1, speed: float = 0.0) -> dict:
         """Measure and command openings [m] for some ticks; return what changed, by arm."""
-        self.reading.position[:, -1], self.command[:, -1], self.reading.velocity[:, -1] = opening, command, speed
-        return {arm: held for _ in range(ticks) for arm, held in self.held.update(self.reading, self.command)}
+        states, changes = self.controller.states, {}
+        self.position[:, -1], self.command[:, -1], states["velocity"][:, 6] = opening, command, speed
+        for _ in range(ticks):
+            for number, (state, arm) in enumerate(self._records):
+                if follow_gripper(state, arm, self._limits):
+                    records = states[number], self.controller.arms[number]
+                    changes[number] = held_capsule(ARM.arm.chain, FORWARD, *records)
+        return changes
 
 
 def test_what_a_stalled_gripper_holds_reaches_down_to_the_table() -> None:
@@ -74,11 +85,11 @@ def test_it_is_forgotten_when_the_gripper_opens_or_closes_without_it(opening: fl
     assert first is not None
     assert hand.run(0.045, 0.02, speed=-0.01) == {}  # it gives way a little: it is still there
     hand.command[:, :6] = posture(0.2)
-    hand.reading.position[:, :6] = posture(0.2)
+    hand.position[:, :6] = posture(0.2)
     assert hand.run(0.05, 0.02) == {}
     assert hand.run(opening, command) == {0: None}
     again = hand.run(0.05, 0.02)[0]
     assert again is not None
     assert again.end[2] > first.end[2]  # taken from where the tool is now
-    hand.held.restart(np.zeros(1, np.intp))
+    hand.controller.restart(np.zeros(1, np.intp))
     assert hand.run(0.085, 0.085) == {}

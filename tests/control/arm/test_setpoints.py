@@ -6,7 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.arm.setpoints import SetpointFilter
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.setpoints import follow_setpoint, leave_setpoints, take_setpoint
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.messages import Limit
 
 LIMITS = ur5().limits
@@ -22,14 +24,22 @@ class Stream:
 
     def __init__(self, n: int = 1, start: np.ndarray = HOME, frame: int = FRAME) -> None:
         self.n, self.frame_ticks = n, frame
-        self.filter = SetpointFilter(LIMITS, n, HZ, frame)
-        self.position = np.broadcast_to(start, (n, 7)).copy()
-        self.velocity, self.acceleration = np.zeros((n, 7)), np.zeros((n, 7))
+        self.controller = controller = ArmController(ur5(), n, HZ, frame, holds=False, keeps_clear=False)
+        self.position, self.velocity = controller.command, controller.velocity
+        self.acceleration, self.limits = controller.acceleration, controller.limits
+        self.position[:] = start
+        [self._limits] = as_objects(controller.arm_limits)
+        self._records = list(zip(as_objects(controller.states), as_objects(controller.arms), strict=True))
         self.rows: list[np.ndarray] = [np.stack([self.position, self.velocity, self.acceleration])]
+
+    def run(self) -> None:
+        for state, arm in self._records:
+            if arm.follows_setpoints:
+                follow_setpoint(state, arm, self._limits, None)
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
-            self.filter.run(self.position, self.velocity, self.acceleration)
+            self.run()
             self.rows.append(np.stack([self.position, self.velocity, self.acceleration]))
 
     def check(self) -> None:
@@ -49,8 +59,13 @@ class Stream:
         return np.array(self.rows)[:, 0]
 
     def set_setpoint(self, values: np.ndarray, mask: np.ndarray | None = None) -> None:
-        mask = np.ones(self.n, np.bool_) if mask is None else mask
-        self.filter.set_setpoint(np.broadcast_to(values, (self.n, 7)).copy(), mask, self.position)
+        self.controller.states["requested"][:, :7] = values
+        for sim, (state, arm) in enumerate(self._records):
+            if mask is None or mask[sim]:
+                take_setpoint(state, arm, self._limits)
+
+    def drop(self) -> None:
+        leave_setpoints(self._records[0][1])
 
     def frame(self, values: np.ndarray, frames: int = 1) -> None:
         for _ in range(frames):
@@ -151,9 +166,9 @@ def test_after_a_moving_stream_the_last_setpoint_is_reached_exactly_too() -> Non
 def test_a_range_s_ends_are_inside() -> None:
     stream = Stream(2)
     stream.set_setpoint(np.stack([LOWER, UPPER]))
-    assert stream.filter.limits.tolist() == [Limit.NONE, Limit.NONE]
+    assert stream.limits.tolist() == [Limit.NONE, Limit.NONE]
     stream.set_setpoint(np.stack([np.nextafter(LOWER, -10), HOME]))
-    assert stream.filter.limits.tolist() == [Limit.POSITION, Limit.NONE]
+    assert stream.limits.tolist() == [Limit.POSITION, Limit.NONE]
 
 
 def test_an_arm_without_setpoints_is_left_alone() -> None:
@@ -162,7 +177,7 @@ def test_an_arm_without_setpoints_is_left_alone() -> None:
     stream.velocity[1, 2] = 0.1  # another writes it
     before = stream.position[1].copy()
     for _ in range(50):
-        stream.filter.run(stream.position, stream.velocity, stream.acceleration)
+        stream.run()
     assert np.array_equal(stream.position[1], before)
     assert stream.velocity[1, 2] == 0.1
     assert stream.position[0, 0] > HOME[0]
@@ -171,9 +186,9 @@ def test_an_arm_without_setpoints_is_left_alone() -> None:
 def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_reference() -> None:
     stream = Stream()
     stream.frame(off(j0=1.0), 5)
-    stream.filter.drop(np.array([True]))
+    stream.drop()
     before = stream.position.copy()
-    stream.filter.run(stream.position, stream.velocity, stream.acceleration)
+    stream.run()
     assert np.array_equal(stream.position, before)
     stream.velocity[:] = 0  # it was brought to rest elsewhere by other means
     stream.position[:] = HOME

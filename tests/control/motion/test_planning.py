@@ -198,7 +198,7 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig.stop(ResultCode.ESTOP, hard=True)
         due = [("b", ResultCode.ESTOP)]
     elif way == "setpoint":
-        rig.manager.end_all(mask, ResultCode.REPLACED_BY_SETPOINT, "a setpoint")
+        rig.manager.end_all(0, ResultCode.REPLACED_BY_SETPOINT, "a setpoint")
         due = [("b", ResultCode.REPLACED_BY_SETPOINT)]
         assert not rig.manager.following.any()
         rig.bring_to_rest()  # as what follows setpoints does
@@ -265,19 +265,20 @@ def test_inline_planning_is_the_default(script: list) -> None:
 @each_case("latency", [1, LEAD + 2, 200])
 def test_a_goal_that_comes_while_setpoints_are_followed_begins_with_a_brake(latency: int, preempt: bool) -> None:
     controller = ArmController(ARM, 1, HZ, 20, planning=LatePlanning([latency, latency]))
-    reading = PlantReading(1, 7)
+    reading = PlantReading(1, 7, states=controller.states)
     rows = []
 
     def tick(ticks: int) -> None:
         for _ in range(ticks):
             reading.position[:], reading.velocity[:] = controller.command, controller.velocity
-            controller.run(reading)
+            controller.advance()
             rows.append(np.stack((controller.command, controller.velocity, controller.acceleration)))
 
     reading.position[:] = HOME
     controller.configure(np.array([0]), reading)
     for _ in range(5):
-        controller.set_setpoint(controller.command + 0.02, np.ones(1, np.bool_))
+        controller.states["requested"][:, :7], controller.states["has_setpoint"] = controller.command + 0.02, True
+        controller.tell(0)
         tick(20)
     assert controller.velocity.any()
     assert controller.submit(0, BrainCommand("b", joint_target=NEAR, preempt=preempt)) is None

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bhd_lerobot.control.arm.record import ARM_LIMITS, new_arms
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.motion import line as line_module
 from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
 from bhd_lerobot.control.motion.player import TrajectoryPlayer
+from bhd_lerobot.control.motion.player import play as play_row
 from bhd_lerobot.control.motion.trajectory import (
     MotionLimits,
     PlanFailure,
@@ -25,6 +28,7 @@ from bhd_lerobot.control.motion.trajectory import (
     to_rest,
     to_target,
 )
+from bhd_lerobot.control.record import new_states
 from tests.control.goal_rig import HOME, HZ, KINEMATICS, LIMITS, STOP_LIMITS, TOOL, moved
 
 Array = NDArray[np.float64]
@@ -280,29 +284,44 @@ def numbered(ticks: int, first: float) -> Trajectory:
     return Trajectory(rows, rows + 1000, rows + 2000)
 
 
+class Played(TrajectoryPlayer):
+    """A player with arms of two dimensions, for which it is ticked."""
+
+    def __init__(self, n: int) -> None:
+        arms, states, limits = new_arms(n), new_states(n), np.zeros(1, ARM_LIMITS)
+        limits["width"] = 2
+        super().__init__(arms, 2)
+        self._fields = states["command"][:, :2], arms["speed"][:, :2], arms["change"][:, :2]
+        self._records, [self._limits] = list(zip(*map(as_objects, (states, arms)), strict=True)), as_objects(limits)
+
+    def tick(self) -> np.ndarray:
+        """Play a row; return positions, speeds and accelerations, shape (3, n, 2): no numbers if there was none."""
+        before = [self.is_playing(sim) for sim in range(len(self._records))]
+        for state, arm in self._records:
+            play_row(state, arm, self._limits, self.rows)
+        return np.where(np.array(before)[:, None], np.stack(self._fields), np.nan)
+
+
 @settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 3000), st.integers(0, 2000)), max_size=12))
 def test_every_row_is_played_once_and_in_order(script: list[tuple[int, int, int]]) -> None:
-    player = TrajectoryPlayer(4, 2)
-    arrays = [np.zeros((4, 2)) for _ in range(3)]
+    player = Played(4)
     expected: list[list[np.ndarray]] = [[] for _ in range(4)]
-    last = np.zeros((4, 2))
     for number, (sim, ticks, wait) in enumerate(script):
         trajectory = numbered(ticks, 10_000.0 * number)
         player.start(sim, trajectory)
         assert player.remaining(sim) == ticks
         expected[sim] = list(trajectory.position)
         for _ in range(min(wait, 50) if number % 2 else wait):
-            player.tick(arrays[0], arrays[1], arrays[2])
+            rows = player.tick()
             for one in range(4):
                 if expected[one]:
-                    last[one] = expected[one].pop(0)
+                    row = expected[one].pop(0)
+                    assert np.array_equal(rows[:, one], [row, row + 1000, row + 2000])
+                else:
+                    assert np.isnan(rows[:, one]).all()
                 assert player.remaining(one) == len(expected[one])
-                assert player.active[one] == bool(expected[one])
-            assert np.array_equal(arrays[0], last)
-    moving = arrays[1].any(axis=1)
-    assert np.array_equal(arrays[1][moving], arrays[0][moving] + 1000)
-    assert np.array_equal(arrays[2][moving], arrays[0][moving] + 2000)
+                assert player.is_playing(one) == bool(expected[one])
 
 
 def test_joined_trajectories_wait_for_each_other() -> None:
@@ -316,52 +335,46 @@ def rows_of(ticks: int, seed: int = 0, dof: int = 2) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(ticks, 3, dof))
 
 
-def play(player: TrajectoryPlayer, n: int = 1) -> np.ndarray:
-    reference = np.full((3, n, 2), np.nan)
-    player.tick(*reference)
-    return reference
-
-
 def equal(state: State | None, row: np.ndarray) -> bool:
     return state is not None and np.array_equal((state.position, state.velocity, state.acceleration), row)
 
 
 @given(st.integers(1, 20), st.integers(0, 19), st.integers(1, 30), st.booleans())
 def test_ahead_matches_later_playback(ticks: int, played: int, ahead: int, borrowed: bool) -> None:
-    player, rows = TrajectoryPlayer(1, 2), rows_of(ticks)
+    player, rows = Played(1), rows_of(ticks)
     player.start(0, numbered(5, 1.0))
-    play(player)
+    player.tick()
     if borrowed:
         player.borrow(rows)
     else:
         player.start(0, Trajectory(rows[:, 0], rows[:, 1], rows[:, 2]))
     for _ in range(played):
-        play(player)
+        player.tick()
     if played >= ticks:
         assert player.ahead(0, ahead) is None
-        assert not player.active[0]
+        assert not player.is_playing(0)
         return
     state = player.ahead(0, ahead)
     assert equal(state, rows[min(played + ahead, ticks) - 1])
-    last = play(player)
+    last = player.tick()
     for _ in range(min(ahead, ticks - played) - 1):
-        last = play(player)
+        last = player.tick()
     assert equal(state, last[:, 0])
 
 
 def test_borrowed_rows_are_played_where_they_lie() -> None:
-    player, rows = TrajectoryPlayer(1, 2), rows_of(6)
+    player, rows = Played(1), rows_of(6)
     player.borrow(rows)
     state = player.ahead(0, 2)
     assert state is not None
     state.position[:] = 9.0  # of a copy
     assert (rows != 9.0).all()
     assert player.remaining(0) == 6
-    assert np.array_equal(play(player)[:, 0], rows[0])
+    assert np.array_equal(player.tick()[:, 0], rows[0])
     rows[1] = 7.0  # forbidden to the owner; that it shows proves that nothing was copied
-    assert (play(player) == 7.0).all()
+    assert (player.tick() == 7.0).all()
     player.stop(0)
-    assert np.isnan(play(player)).all()
+    assert np.isnan(player.tick()).all()
     assert player.remaining(0) == 0
-    with pytest.raises(ValueError, match="3 simulations"):
-        TrajectoryPlayer(3, 2).borrow(rows_of(2))
+    with pytest.raises(ValueError, match="3 arms"):
+        Played(3).borrow(rows_of(2))
