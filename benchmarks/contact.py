@@ -68,7 +68,7 @@ def run(
     arm = UR5Simulation(UR5Config(max_force=force), 1, threads=1, fixtures=fixtures)
     arm.reset(np.zeros(1, np.intp), [TableScene("empty", (), arm.body.arm.home)], [0])
     if way != WAYS[0]:
-        arm.cerebellum.controller.setpoints.clearance = None
+        arm.cerebellum.controller.arm_limits["keeps_clear"] = False
     model = arm.world.copy_model(0)
     data, wrench, forces = mujoco.MjData(model), np.zeros(6), []
     after_tick = arm._after_tick

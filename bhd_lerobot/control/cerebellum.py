@@ -60,6 +60,7 @@ class Cerebellum:
         numbers: the record of their limits, shape (1,).
         written: what is written to the plant, shape (n, actuators).
         readings: checks that what the plant reads can be a measurement of the present.
+        may_write: whether it is known where the robots are: before, nothing is written.
         requested: the setpoint that was last taken, before all limits, shape (n, width).
     """
 
@@ -113,7 +114,7 @@ class Cerebellum:
         numbers["timeout_ns"], numbers["width"], numbers["has_sensors"] = self._timeout_ns, width, sensors > 0
         self._is_compiled = controller.is_compiled
         self._now_ns = 0
-        self._may_write = False
+        self.may_write = False
         self._dropped = np.zeros(n, np.int64)
         self._fifo = CommandFifo(n, width) if fifo is None else fifo
         self._estop = EstopWord(n) if estop is None else estop
@@ -188,7 +189,7 @@ class Cerebellum:
         if np.count_nonzero(self._mode_is_new):
             self._mode_is_new[:] = False
             self.plant.set_mode(self.mode)
-        if self._may_write:
+        if self.may_write:
             self.plant.write(self.written)
 
     def serve(self) -> None:
@@ -487,7 +488,7 @@ class Cerebellum:
         self.controller.configure(ids, self.reading)
         self._start_writing(ids)
         self.states["is_configured"] |= mask
-        self._may_write = True  # before, it was not known where the robots are
+        self.may_write = True  # before, it was not known where the robots are
         np.copyto(self.requested, self.command, where=mask[:, None])
 
     def _start_writing(self, ids: NDArray[np.intp]) -> None:

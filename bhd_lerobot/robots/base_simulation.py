@@ -53,25 +53,15 @@ class BaseSimulation(BaseHost, Simulation):
         self._reading = PlantReading(n, self._controller.joints)
         self._touch = self.world.sensor(drive.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
-        self._touched = np.zeros(n, np.bool_)
+        touches = np.zeros((1, n), np.bool_)
+        self._touched = touches[0]
         self.scan_rate_hz = lidar.rate_hz
         self._scan_ticks = config.control_hz // lidar.rate_hz
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
-        # What a subclass does after steps and ticks is Python.
-        hooks = ("advance", "_after_step", "_after_tick")
-        self._is_plain = all(getattr(type(self), hook) is getattr(BaseSimulation, hook) for hook in hooks)
-        self._frames = Frames(
-            world,
-            self.cerebellum,
-            drive.joints,
-            drive.actuators,
-            touch=drive.touch_sensor,
-            touched=self._touched,
-            gyro="imu_gyro" if config.imu else None,
-            beams=config.beams,
-        )
+        gyro = "imu_gyro" if config.imu else None
+        self._frames = Frames(world, self.cerebellum, touches, gyro=gyro, beams=config.beams)
 
     def truth(self) -> BaseTruth:
         """Return where the bases are, and whether they touched the scene since the start of the last frame."""
@@ -145,16 +135,7 @@ class BaseSimulation(BaseHost, Simulation):
     def run_ticks(self, number: int, most: int) -> int:
         """Run ticks up to the next scan, see `LockstepBridge`."""
         ticks = max(1, min(most, self._next_scan - self.tick))
-        if not self._is_plain or not self._frames.run(self._active, number, ticks):
-            return 0
-        self.tick += ticks
-        self._after_tick()
-        return ticks
-
-    def close(self) -> None:
-        """Free renderers and threads. May be called twice."""
-        self._frames.close()
-        super().close()
+        return super().run_ticks(number, ticks)
 
     def _scan(self, ids: NDArray[np.intp]) -> None:
         if len(ids):

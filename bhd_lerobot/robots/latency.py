@@ -15,6 +15,12 @@ MAX_LATENCY = 25  # [ticks] 0.05 s at 500 Hz
 class LatePlant(Plant):
     """Passes readings on at once, and commands some ticks later, for each simulation its own number.
 
+    Attributes:
+        ring: the last commands, shape (ticks, n, actuators).
+        latency: by how many ticks commands are late, shape (n,).
+        waited: ticks since that was set, shape (n,): before, nothing was commanded.
+        written: commands that were written to the ring.
+
     Args:
         actuators: how many there are.
         max_ticks: largest latency [ticks].
@@ -23,22 +29,22 @@ class LatePlant(Plant):
     def __init__(self, plant: SimulatedPlant, actuators: int, max_ticks: int = MAX_LATENCY) -> None:
         self.n = plant.n
         self._plant = plant
-        self._latency = np.zeros(plant.n, np.int64)
-        self._late = False
+        self.latency: NDArray[np.int64] = np.zeros(plant.n, np.int64)
+        self.waited: NDArray[np.int64] = np.zeros(plant.n, np.int64)
         self._sims = np.arange(plant.n)
         self._largest = max_ticks
-        self._ring = np.zeros((max_ticks + 1, plant.n, actuators))
-        self._ticks = 0
-        self._waiting = np.zeros(plant.n, np.int64)  # ticks since the latency was set: before, nothing was commanded
+        self.ring = np.zeros((max_ticks + 1, plant.n, actuators))
+        self.written = 0
+        self.is_late = False
 
     def set_latency(self, ids: NDArray[np.intp], ticks: Sequence[int]) -> None:
         """Set by how many ticks the servos of some simulations get their commands late."""
         for value in ticks:
             if not 0 <= value <= self._largest:
                 raise ConfigError(f"latency_ticks is {value}; it must be between 0 and {self._largest}.")
-        self._latency[ids] = ticks
-        self._waiting[ids] = 0
-        self._late = bool(self._latency.any())
+        self.latency[ids] = ticks
+        self.waited[ids] = 0
+        self.is_late = bool(self.latency.any())
 
     def read(self, out: PlantReading) -> None:
         """Write the newest joint readings into `out`."""
@@ -50,12 +56,16 @@ class LatePlant(Plant):
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the actuator commands, shape (n, actuators)."""
-        if not self._late:
+        if not self.is_late:
             self._plant.write(ctrl)
             return
-        self._ring[self._ticks % len(self._ring)] = ctrl
+        self.ring[self.written % len(self.ring)] = ctrl
         # What came before the episode is not this episode's: its first command counts until a later one arrives.
-        behind = np.minimum(self._latency, self._waiting)
-        self._plant.write(self._ring[(self._ticks - behind) % len(self._ring), self._sims])
-        self._ticks += 1
-        self._waiting += 1
+        behind = np.minimum(self.latency, self.waited)
+        self._plant.write(self.ring[(self.written - behind) % len(self.ring), self._sims])
+        self.pass_by(1)
+
+    def pass_by(self, ticks: int) -> None:
+        """Count commands that were written to the ring."""
+        self.written += ticks
+        self.waited += ticks

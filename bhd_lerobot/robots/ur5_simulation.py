@@ -17,6 +17,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.arm_host import ArmHost
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.latency import LatePlant
+from bhd_lerobot.sim.frames import Frames
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
@@ -68,7 +69,10 @@ class UR5Simulation(ArmHost, Simulation):
         self._reading = PlantReading(n, self.controller.joints)
         self._noise = np.zeros(n)
         self._now = np.ones(n, np.int64)  # times the tick
-        self._arm_on_table, self._arm_on_object, self._self_contact = (np.zeros(n, np.bool_) for _ in range(3))
+        touches = np.zeros((3, n), np.bool_)
+        self._arm_on_table, self._arm_on_object, self._self_contact = touches
+        if self.controller.is_compiled:
+            self._frames = Frames(world, self.cerebellum, touches, late=self.plant)
 
     @classmethod
     def start_scene(cls, config: "UR5Config") -> TableScene:

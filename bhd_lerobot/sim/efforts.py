@@ -42,9 +42,14 @@ class MeanEfforts:
         counts = model.jnt_actfrclimited[joints] & (mujoco.mj_version() >= 4_000_000)
         self._most_torque = np.where(counts, model.jnt_actfrcrange[joints, 1], np.inf)
 
-    def are_all(self, actuators: Sequence[int]) -> bool:
-        """Return whether these actuators of the model, by their numbers, are all that it has, and act on joints."""
-        return np.array_equal(self._servos, actuators) and len(actuators) == self._actuators
+    def are_all(self, servos: Sequence[int], actuators: Sequence[int]) -> bool:
+        """Return whether these servos of joints, by their numbers, are all of the model, and with others all actuators.
+
+        Args:
+            servos: the servos.
+            actuators: these, and what acts on something else.
+        """
+        return np.array_equal(self._servos, servos) and len(actuators) == self._actuators
 
     def numbers(self, actuators: Sequence[int]) -> dict[str, Array]:
         """Return gear, damping, largest force and largest torque of some servos by their numbers in the model."""

@@ -11,11 +11,13 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm, Drive
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.kernels import is_worth_compiling, kernel, record
 from bhd_lerobot.control.messages import NANOSECONDS
@@ -26,6 +28,7 @@ from bhd_lerobot.sim.world import World
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _TICK_VALUES = 8  # that a tick of one robot counts for, see `kernels`
+_NO_RING = np.zeros((0, 1, 1))
 _OUTPUTS = 16  # fields that may be read after a frame
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.float64]
@@ -39,7 +42,14 @@ LAYOUT = record(
         ("qpos", np.int64, (JOINTS,)),
         ("qvel", np.int64, (JOINTS,)),
         ("ctrl", np.int64, (JOINTS,)),
-        ("touch", np.int64),  # place of the touch sensor's reading
+        # Of a gripper, whose opening is a sum, the second finger's; -1 of other joints.
+        ("qpos_beside", np.int64, (JOINTS,)),
+        ("qvel_beside", np.int64, (JOINTS,)),
+        # Places of the readings that count touches: of anything, of the table, of itself, and of the gripper's.
+        ("touch", np.int64),
+        ("touch_table", np.int64),
+        ("touch_self", np.int64),
+        ("touch_grip", np.int64, (2,)),  # the first, and how many
         ("gyro", np.int64),  # and of the gyroscope's; -1 if it is not read
         ("beams", np.int64),  # sensors before the gyroscope's
         # The servos' damping, see `MeanEfforts`.
@@ -98,8 +108,8 @@ def _load() -> bool:
 
 @kernel(
     "void(i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], "
-    "i4[:,:,:], state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], b1[:], f8[:,:], "
-    "layout[::1], i8, i8, i4)"
+    "i4[:,:,:], state[::1], queue[::1], i8[:,:], monitor[::1], arm[::1], limits[::1], arm_limits[::1], geometry[::1], "
+    "f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], f8[:,:,:], f8[:,:,:], i8[:], i8[:], i8, i8[:], i8, i8, i4)"
 )
 def run_frames(  # noqa: PLR0912, PLR0917
     ids: Counts,
@@ -120,17 +130,28 @@ def run_frames(  # noqa: PLR0912, PLR0917
     queues: Any,
     estop: Counts,
     monitors: Any,
+    arms: Any,
     limits: Any,
+    arm_limits: Any,
+    geometries: Any,
     sensors: Numbers,
     sensors_ns: Counts,
-    touched: NDArray[np.bool_],
+    touches: NDArray[np.bool_],
     efforts: Numbers,
     layouts: Any,
+    trajectories: Numbers,
+    ring: Numbers,
+    latency: Counts,
+    waited: Counts,
+    written: int,
+    numbers: Counts,
     first_tick: int,
     ticks: int,
     spec: int,
 ) -> None:
     """Let some ticks of some simulations go by, one simulation after the other.
+
+    One whose tick waits for its controller is left there, and goes on at the next call.
 
     Args:
         ids: the simulations.
@@ -138,30 +159,66 @@ def run_frames(  # noqa: PLR0912, PLR0917
         data: the address of the data that they run in, whose fields the arrays after `row_bytes` are.
         rows: the address of the first simulation's state; `row_bytes` from one to the next.
         all_warnings: number of warnings of each simulation, as `Batch.warning`.
-        touched: becomes True where the scene was touched.
+        touches: becomes True where the scene was touched, shape (kinds, n): anything; or the table, objects with a
+            link of the arm, the arm itself.
         efforts: mean efforts of the last tick, shape (n, nv).
+        trajectories: what arms play.
+        ring: the last commands, of servos that get them late, shape (ticks, n, actuators); empty if none is late.
+        latency: by how many ticks they are late, shape (n,).
+        waited: ticks since that was set, shape (n,).
+        written: commands that were written to the ring.
+        numbers: the tick that is next for each simulation, shape (n,).
         first_tick: number of the first tick.
         spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
     """
     layout = layouts[0]
     joints = limits[0].joints
     for sim in ids:
-        state, monitor = states[sim], monitors[sim % len(monitors)]
+        state, monitor, arm = states[sim], monitors[sim % len(monitors)], arms[sim % len(arms)]
         _set_state(models[sim], data, rows + sim * row_bytes, spec)
         warnings[:] = 0
-        for number in range(first_tick, first_tick + ticks):
+        for number in range(numbers[sim], first_tick + ticks):
+            numbers[sim] = number
             now_ns = number * NANOSECONDS // layout.ticks_hz
-            state.stamp_ns = now_ns
+            if arm.stage == 0:
+                state.stamp_ns = now_ns
+                for k in range(joints):
+                    position, velocity = qpos[layout.qpos[k]], qvel[layout.qvel[k]]
+                    if layout.qpos_beside[k] >= 0:
+                        position += qpos[layout.qpos_beside[k]]
+                        velocity += qvel[layout.qvel_beside[k]]
+                    state.position[k], state.velocity[k] = position, velocity
+                    state.effort[k] = efforts[sim, layout.qvel[k]]
+            is_over = tick(
+                state,
+                queues[sim],
+                estop[:, sim],
+                monitor,
+                arm,
+                limits[0],
+                arm_limits[0],
+                geometries[arm.geometry % len(geometries)],
+                trajectories,
+                sensors[sim],
+                sensors_ns[sim],
+                now_ns,
+            )
+            if not is_over:
+                break
+            numbers[sim] = number + 1
+            passed = number - first_tick
+            slot = written + passed
+            behind = slot - min(latency[sim], waited[sim] + passed)
             for k in range(joints):
-                state.position[k], state.velocity[k] = qpos[layout.qpos[k]], qvel[layout.qvel[k]]
-                state.effort[k] = efforts[sim, layout.qvel[k]]
-            tick(state, queues[sim], estop[:, sim], monitor, limits[0], sensors[sim], sensors_ns[sim], now_ns)
-            for k in range(joints):
-                ctrl[layout.ctrl[k]] = state.written[k]
+                if len(ring):
+                    ring[slot % len(ring), sim, k] = state.written[k]
+                    ctrl[layout.ctrl[k]] = ring[behind % len(ring), sim, k]
+                else:
+                    ctrl[layout.ctrl[k]] = state.written[k]
             for step in range(layout.substeps):
                 _step(models[sim], data)
                 if sensordata[layout.touch] != 0.0:
-                    touched[sim] = True
+                    note_touches(touches, sim, sensordata, layout)
                 for k in range(joints):
                     dof = layout.qvel[k]
                     value = torque[dof]
@@ -181,20 +238,50 @@ def run_frames(  # noqa: PLR0912, PLR0917
         _get_state(models[sim], data, rows + sim * row_bytes, spec)
         for k in range(len(warnings)):
             all_warnings[sim, k, 1] += warnings[k]
-        for k in range(layout.outputs):
-            _copy(layout.target[k] + sim * layout.nbytes[k], layout.source[k], layout.nbytes[k])
+        if numbers[sim] == first_tick + ticks:
+            for k in range(layout.outputs):
+                _copy(layout.target[k] + sim * layout.nbytes[k], layout.source[k], layout.nbytes[k])
+
+
+@kernel()
+def note_touches(touches: NDArray[np.bool_], sim: int, sensordata: Numbers, layout: Any) -> None:
+    """Note what a simulation touches now; the counts are whole numbers, and their sums exact."""
+    if len(touches) == 1:
+        touches[0, sim] = True
+        return
+    grip = 0.0
+    for k in range(layout.touch_grip[1]):
+        grip += sensordata[layout.touch_grip[0] + k]
+    table, itself = sensordata[layout.touch_table], sensordata[layout.touch_self]
+    touches[0, sim] |= table > 0.0
+    touches[1, sim] |= sensordata[layout.touch] > table + itself + grip
+    touches[2, sim] |= itself > 0.0
+
+
+class Late(Protocol):
+    """Servos that get their commands late, see `bhd_lerobot.robots.latency.LatePlant`."""
+
+    ring: Numbers
+    latency: Counts
+    waited: Counts
+    written: int
+
+    @property
+    def is_late(self) -> bool:
+        """Whether any are."""
+
+    def pass_by(self, ticks: int) -> None:
+        """Count commands that were written to the ring."""
 
 
 class Frames:
-    """Lets ticks of n simulated bases go by, in machine code once that is worth its compilation.
+    """Lets ticks of n simulated robots go by, in machine code once that is worth its compilation.
 
     Args:
         world: the simulations.
         cerebellum: what controls them; its controller is a part of the compiled tick.
-        joints: the joints that it reads, in the order of its readings.
-        actuators: the actuators that it commands.
-        touch: name of the sensor of touches.
-        touched: becomes True where the scene was touched, shape (n,).
+        touches: becomes True where the scene was touched, see `run_frames`, shape (kinds, n).
+        late: what its plant passes commands on through; None if it passes them on at once.
         gyro: name of the gyroscope; None if it is not read.
         beams: sensors of the cerebellum before the gyroscope's.
     """
@@ -203,39 +290,63 @@ class Frames:
         self,
         world: World,
         cerebellum: Cerebellum,
-        joints: Sequence[str],
-        actuators: Sequence[str],
+        touches: NDArray[np.bool_],
         *,
-        touch: str,
-        touched: NDArray[np.bool_],
-        gyro: str | None,
-        beams: int,
+        late: Late | None = None,
+        gyro: str | None = None,
+        beams: int = 0,
     ) -> None:
-        self._world, self._cerebellum, self._touched = world, cerebellum, touched
+        self._world, self._cerebellum, self._touches, self._late = world, cerebellum, touches, late
         self._plant, self._pid = cerebellum.plant, os.getpid()
         self._handled = 0
-        model, layout = world.model, np.zeros(1, LAYOUT)
-        row, efforts = layout[0], world.servos
+        model, self._layout = world.model, np.zeros(1, LAYOUT)
+        row, efforts = self._layout[0], world.servos
         row["ticks_hz"], row["substeps"] = cerebellum.control_hz, world.physics_hz // cerebellum.control_hz
-        k, servos = len(joints), [model.actuator(name).id for name in actuators]
-        row["qpos"][:k] = [model.joint(name).qposadr[0] for name in joints]
-        row["qvel"][:k] = [model.joint(name).dofadr[0] for name in joints]
-        row["ctrl"][:k] = servos
-        row["touch"] = model.sensor(touch).adr[0]
+        row["qpos_beside"] = -1
+        servos = self._place_arm(row) if world.body.arm is not None else self._place_drive(row)
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
-        self._is_possible = efforts.are_all(servos)  # others' efforts are averaged in Python
+        row["most_force"] = row["most_torque"] = np.inf
+        # Others' efforts are averaged in Python.
+        self._is_possible = efforts.are_all(servos, row["ctrl"][: cerebellum.controller.joints])
         if self._is_possible:
             for name, values in efforts.numbers(servos).items():
-                row[name][:k] = values
-        self._layout = layout
+                row[name][: len(servos)] = values
         self._models: list[mujoco.MjModel | None] = [None] * world.n
         self._seen: list[bytes] = []  # the fields that they were made with, and of each simulation
         self._rows: list[bytes | None] = [None] * world.n
         self._threads: list[_Thread] = []
         self._pool: ThreadPoolExecutor | None = None
-        self._addresses = np.zeros(world.n, np.int64)
+        self._addresses, self._numbers, self._zeros = np.zeros((3, world.n), np.int64)
         self._checked, self._copies = -1, False
+
+    def _place_drive(self, row: Any) -> list[int]:
+        """Write where the wheels and the touches are; return the servos."""
+        model, drive = self._world.model, self._world.body.need(Drive)
+        self._place_joints(row, drive.joints)
+        servos = [model.actuator(name).id for name in drive.actuators]
+        row["ctrl"][: len(servos)] = servos
+        row["touch"] = model.sensor(drive.touch_sensor).adr[0]
+        return servos
+
+    def _place_arm(self, row: Any) -> list[int]:
+        """Write where joints, fingers and touches are; return the joints' servos."""
+        model, arm = self._world.model, self._world.body.need(Arm)
+        dof = len(arm.chain.joints)
+        finger, other = (model.joint(name) for name in arm.gripper.joints)
+        self._place_joints(row, (*arm.chain.joints, finger.name))
+        row["qpos_beside"][dof], row["qvel_beside"][dof] = other.qposadr[0], other.dofadr[0]
+        servos = [model.actuator(name).id for name in arm.actuators]
+        row["ctrl"][: len(servos)] = servos
+        for kind, name in (("touch", "any"), ("touch_table", "table"), ("touch_self", "self")):
+            row[kind] = model.sensor(f"touch_{name}").adr[0]
+        row["touch_grip"] = model.sensor("touch_object_0").adr[0], MAX_OBJECTS
+        return servos[:dof]
+
+    def _place_joints(self, row: Any, names: Sequence[str]) -> None:
+        joints = [self._world.model.joint(name) for name in names]
+        row["qpos"][: len(joints)] = [joint.qposadr[0] for joint in joints]
+        row["qvel"][: len(joints)] = [joint.dofadr[0] for joint in joints]
 
     def run(self, ids: NDArray[np.intp] | None, first_tick: int, ticks: int) -> bool:
         """Let some ticks go by.
@@ -249,7 +360,8 @@ class Frames:
             False if nothing was done: Python does it as well so far, or the cerebellum's plant is another than the
             world's.
         """
-        if not self._is_possible or self._cerebellum.plant is not self._plant:
+        own = self._cerebellum
+        if not self._is_possible or own.plant is not self._plant or not own.may_write:
             return False
         ids = np.arange(self._world.n) if ids is None else ids
         self._handled += len(ids) * _TICK_VALUES
@@ -264,10 +376,24 @@ class Frames:
             self._threads = [_Thread(self._world, self._layout) for _ in range(self._world.threads)]
             if len(self._threads) > 1:
                 self._pool = ThreadPoolExecutor(len(self._threads), "frames")
+        self._numbers[ids] = first_tick
+        own.controller.arms["stage"] = 0  # whatever interrupted the last frame
+        while True:
+            self._run(ids, first_tick, ticks)
+            ids = ids[self._numbers[ids] < first_tick + ticks]
+            if not len(ids):
+                break
+            own.serve()
+        if self._late is not None and self._late.is_late:
+            self._late.pass_by(ticks)
+        return True
+
+    def _run(self, ids: NDArray[np.intp], first_tick: int, ticks: int) -> None:
+        """Let ticks go by until each simulation is at the end, or waits for its controller."""
         shared = self._shared
         if self._pool is None:
             self._threads[0].run(ids, self._addresses, shared, first_tick, ticks)
-            return True
+            return
         shares = np.array_split(ids, len(self._threads))
         calls = zip(self._threads, shares, strict=True)
         jobs = [
@@ -280,7 +406,6 @@ class Frames:
                 job.result()
         finally:
             wait(jobs)  # whatever interrupts this: no other frame begins meanwhile
-        return True
 
     @property
     def _are_copied(self) -> bool:
@@ -298,11 +423,17 @@ class Frames:
         return self._copies
 
     @property
-    def _shared(self) -> tuple[Any, ...]:
-        own = self._cerebellum
-        reading, records = own.reading, (own.states, own.fifo.queues, own.estop.words, own.controller.monitors)
-        sensors = reading.sensors, reading.sensors_ns
-        return (self._world.warnings, *records, own.numbers, *sensors, self._touched, self._world.efforts)
+    def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """What all threads run with, before and after the layout."""
+        own, late = self._cerebellum, self._late
+        controller, reading = own.controller, own.reading
+        records = own.states, own.fifo.queues, own.estop.words, controller.monitors, controller.arms
+        limits = own.numbers, controller.arm_limits, controller.geometries
+        sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
+        ring = (_NO_RING, self._zeros, self._zeros, 0)
+        if late is not None and late.is_late:
+            ring = (late.ring, late.latency, late.waited, late.written)
+        return (self._world.warnings, *records, *limits, *sensors), (controller.rows, *ring, self._numbers)
 
     def _take_models(self) -> None:
         """Make the simulations' models again if their fields have changed."""
@@ -336,11 +467,11 @@ class _Thread:
         self._outputs = 0
         self._lock = Lock()  # after an interruption the last frame may still be running
 
-    def run(self, ids: NDArray, models: Counts, shared: tuple[Any, ...], first_tick: int, ticks: int) -> None:
+    def run(self, ids: NDArray, models: Counts, shared: tuple[Any, Any], first_tick: int, ticks: int) -> None:
         with self._lock:
             self._run(ids, models, shared, first_tick, ticks)
 
-    def _run(self, ids: NDArray, models: Counts, shared: tuple[Any, ...], first_tick: int, ticks: int) -> None:
+    def _run(self, ids: NDArray, models: Counts, shared: tuple[Any, Any], first_tick: int, ticks: int) -> None:
         state, row = self._world.state, self._layout[0]
         if len(self._world.outputs) != self._outputs:
             for k, (name, target) in enumerate(self._world.outputs.items()):
@@ -348,4 +479,6 @@ class _Thread:
                 row["nbytes"][k] = target[0].nbytes
             self._outputs = row["outputs"] = len(self._world.outputs)
         where = self._data._address, state.ctypes.data, state.strides[0]
-        run_frames.compiled(ids, models, *where, *self._fields, *shared, self._layout, first_tick, ticks, _STATE)
+        before, after = shared
+        arguments = *where, *self._fields, *before, self._layout, *after
+        run_frames.compiled(ids, models, *arguments, first_tick, ticks, _STATE)

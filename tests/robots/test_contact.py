@@ -35,7 +35,7 @@ class Pusher:
         arm.reset(FIRST, [TableScene("empty", (), arm.body.arm.home)], [0])
         self.controller: Any = arm.cerebellum.controller
         if not clearance:
-            self.controller.setpoints.clearance = None
+            self.controller.arm_limits["keeps_clear"] = False
         self.action = arm.cerebellum.command.copy()
         self.limits = self.watchdog = 0
         self.forces: list[float] = []
@@ -118,7 +118,7 @@ def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: flo
             if pusher.faulty_since is not None:
                 break
         assert pusher.watchdog == Watchdog.FORCE  # the stop itself needs no guard
-        assert max(pusher.forces) > pusher.controller.force.largest
+        assert max(pusher.forces) > pusher.controller.arm_limits["most_force"][0]
         for _ in range(40):
             pusher.arm.step(None)
         after = pusher.forces[pusher.faulty_since :]

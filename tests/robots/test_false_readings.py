@@ -253,7 +253,7 @@ def test_efforts_that_are_zero_in_between_leave_the_limit_of_force_as_it_is() ->
     lied.action[:, 2] -= 0.8
     lied.turn(0.8)
     assert (lied.cerebellum.mode == Mode.TRACKING).all()
-    assert lied.cerebellum.controller.force.force.max() < 60.0
+    assert lied.cerebellum.controller.force.max() < 60.0
 
 
 @pytest.mark.parametrize("rate", [20.0, -100.0])
@@ -333,4 +333,4 @@ def test_what_is_no_number_leaves_no_blind_limit_of_force(what: str) -> None:
     lied.action = lied.cerebellum.command.copy()
     lied.turn(1.0)
     assert (lied.cerebellum.mode == Mode.TRACKING).all()
-    assert np.isfinite(lied.cerebellum.controller.force.torque).all()
+    assert np.isfinite(lied.cerebellum.controller.arms["torque"]).all()

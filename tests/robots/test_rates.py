@@ -36,7 +36,7 @@ def test_at_any_rates_free_goals_succeed_and_press_on_nothing(control_hz: int, p
     while arm.controller.busy.any():
         report = arm.step(None)
         assert not report.watchdog.any()
-        most = max(most, float(arm.controller.force.force.max()))
+        most = max(most, float(arm.controller.force.max()))
         codes += [result.code for results in report.results.values() for result in results]
     assert codes == [ResultCode.SUCCEEDED] * POSTURES
     assert most < MOST_FREE_N
