@@ -16,6 +16,7 @@ class LatePlant(Plant):
     """Passes readings on at once, and commands some ticks later, for each simulation its own number.
 
     Attributes:
+        plant: what they are passed on to.
         ring: the last commands, shape (ticks, n, actuators).
         latency: by how many ticks commands are late, shape (n,).
         waited: ticks since that was set, shape (n,): before, nothing was commanded.
@@ -28,7 +29,7 @@ class LatePlant(Plant):
 
     def __init__(self, plant: SimulatedPlant, actuators: int, max_ticks: int = MAX_LATENCY) -> None:
         self.n = plant.n
-        self._plant = plant
+        self.plant = plant
         self.latency: NDArray[np.int64] = np.zeros(plant.n, np.int64)
         self.waited: NDArray[np.int64] = np.zeros(plant.n, np.int64)
         self._sims = np.arange(plant.n)
@@ -48,21 +49,21 @@ class LatePlant(Plant):
 
     def read(self, out: PlantReading) -> None:
         """Write the newest joint readings into `out`."""
-        self._plant.read(out)
+        self.plant.read(out)
 
     def set_mode(self, mode: NDArray[np.int8]) -> None:
         """Pass on the modes at once."""
-        self._plant.set_mode(mode)
+        self.plant.set_mode(mode)
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the actuator commands, shape (n, actuators)."""
         if not self.is_late:
-            self._plant.write(ctrl)
+            self.plant.write(ctrl)
             return
         self.ring[self.written % len(self.ring)] = ctrl
         # What came before the episode is not this episode's: its first command counts until a later one arrives.
         behind = np.minimum(self.latency, self.waited)
-        self._plant.write(self.ring[(self.written - behind) % len(self.ring), self._sims])
+        self.plant.write(self.ring[(self.written - behind) % len(self.ring), self._sims])
         self.pass_by(1)
 
     def pass_by(self, ticks: int) -> None:

@@ -35,6 +35,7 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 1e-300)
 OUTSIDE = {"position", "velocity", "effort", "actuators", "requested", "target", "values", "near"}
 POSITIVE = {"deceleration", "reach", "range_min", "range_max"}
 TIMES = (0, 1, 10**6, 10**9, -(10**9), 2**62, -(2**62), 2**63 - 1, -(2**63))
+FIXED = {"limits", "arm_limits", "geometry"}  # numbers of a body
 WHOLE = {  # the smallest and the largest; others are from 0 to 3
     "mode": (0, 8),
     "joints": (2, 8),
@@ -56,7 +57,7 @@ def floats(shape: Any, rng: np.random.Generator, *, special: bool = True) -> Any
 
 def records(name: str, rng: np.random.Generator) -> Any:
     """Return two records, or one of limits, that a core may come to; a queue holds whatever another process wrote."""
-    n = 1 if name == "limits" else 2
+    n = 1 if name in FIXED else 2
     made = np.zeros(n, kernels.RECORDS[name])
     if name == "queue" and rng.random() < 0.3:
         return np.frombuffer(rng.bytes(made.nbytes), made.dtype).copy()
@@ -64,7 +65,7 @@ def records(name: str, rng: np.random.Generator) -> Any:
         shape, kind = made[field].shape, made[field].dtype.kind
         if kind == "f":
             values = floats(shape, rng, special=field in OUTSIDE)
-            made[field] = np.abs(values) + 1e-3 if name == "limits" or field in POSITIVE else values
+            made[field] = np.abs(values) + 1e-3 if name in FIXED or field in POSITIVE else values
         elif kind == "b":
             made[field] = rng.random(shape) < 0.5
         elif field.endswith("_ns") or field == "sequence":
@@ -86,6 +87,8 @@ def drawn(kind: str, rng: np.random.Generator) -> Any:
     shape = (2, 2, 6)[-1 - dimensions.count(",") :] if dimensions else ()
     if kind == "i8[:,:]":  # the words of emergency stops
         shape = (3, 2)
+    if kind == "f8[:,:,:]":  # what arms play
+        shape = (2, 3, 8)
     if name in ("i8", "i1"):
         return rng.integers(-1, 3, shape).astype(name) if shape else int(rng.integers(-1, 2))
     if name == "b1":

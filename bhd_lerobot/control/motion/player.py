@@ -85,7 +85,7 @@ class TrajectoryPlayer:
 @kernel()
 def play(state: Any, arm: Any, limits: Any, rows: Array) -> None:
     """Write the next row of an arm's trajectory to its reference; it stays as it is if none is left."""
-    if arm.row >= arm.end:
+    if arm.row >= min(arm.end, len(rows)):
         return
     for k in range(limits.width):
         state.command[k], arm.speed[k], arm.change[k] = rows[arm.row, 0, k], rows[arm.row, 1, k], rows[arm.row, 2, k]

@@ -21,6 +21,7 @@ from bhd_lerobot.sim.world import Snapshot, World
 # Streams of random numbers of one episode: what one draws more of must not shift the others.
 SENSOR_STREAM = 1
 _NONE = np.zeros(0, np.intp)
+_HOOKS = ("advance", "_after_step", "_after_tick", "run_ticks")
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -187,7 +188,9 @@ class Simulation(Host):
     def run_ticks(self, number: int, most: int) -> int:
         """Run ticks in machine code, see `LockstepBridge`; none where a subclass of ours does something in between."""
         frames = self._frames
-        if frames is None or not self._is_plain or not frames.run(self._active, number, most):
+        if frames is None or not self._is_plain or any(hook in vars(self) for hook in _HOOKS):
+            return 0
+        if not frames.run(self._active, number, most):
             return 0
         self.tick += most
         self._after_tick()
@@ -197,5 +200,4 @@ class Simulation(Host):
     def _is_plain(self) -> bool:
         """Whether nothing but its own class does something after steps and ticks."""
         own = next(kind for kind in type(self).__mro__ if kind.__module__.startswith(_PACKAGE) and "place" in vars(kind))
-        hooks = ("advance", "_after_step", "_after_tick", "run_ticks")
-        return all(getattr(type(self), hook) is getattr(own, hook) for hook in hooks)
+        return all(getattr(type(self), hook) is getattr(own, hook) for hook in _HOOKS)
