@@ -239,7 +239,12 @@ def test_a_folder_is_read_at_a_glance() -> None:
 @each_case(
     ("changed", "tests", "laws", "no_laws"),
     [
-        ("bhd_lerobot/control/arm/relief.py", "control/arm", {"control.arm", "robots", "cli"}, {"sim", "control"}),
+        (
+            "bhd_lerobot/control/arm/relief.py",
+            "control/arm",
+            {"control.arm", "robots", "cli"},
+            {"control", "datasets.format"},
+        ),
         ("bhd_lerobot/sim/world.py", "sim", {"sim", "robots.host", "envs"}, {"control", "datasets.format"}),
         ("tests/datasets/remote/test_hub.py", "datasets/remote/test_hub.py", set(), {"datasets.remote"}),
         ("constraints.txt", None, set(ARROWS), set()),

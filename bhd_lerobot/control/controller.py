@@ -6,12 +6,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm.record import ARM_LIMITS, GEOMETRY, new_arms
 from bhd_lerobot.control.collision_monitor import MONITOR
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import LIMITS, new_states
+from bhd_lerobot.control.record import ARM_LIMITS, GEOMETRY, LIMITS, new_arms, new_states
 
 _NO_ROWS = np.zeros((1, 3, 1))
 

@@ -34,7 +34,7 @@ class LatePlant(Plant):
         self.waited: NDArray[np.int64] = np.zeros(plant.n, np.int64)
         self._sims = np.arange(plant.n)
         self._largest = max_ticks
-        self.ring = np.zeros((max_ticks + 1, plant.n, actuators))
+        self.ring: NDArray[np.float64] = np.zeros((max_ticks + 1, plant.n, actuators))
         self.written = 0
         self.is_late = False
 

@@ -29,7 +29,7 @@ from bhd_lerobot.sim.world import World
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _TICK_VALUES = 8  # that a tick of one robot counts for, see `kernels`
 _LEFT_OUT = ("read", "write", "set_mode", "step", "tick")  # methods that frames in machine code do not call
-_NO_RING = np.zeros((0, 1, 1))
+_NO_RING: NDArray[np.float64] = np.zeros((0, 1, 1))
 _OUTPUTS = 16  # fields that may be read after a frame
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.float64]

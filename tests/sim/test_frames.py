@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control import kernels
+from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim import frames
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 
 FRAMES = 30
@@ -27,6 +32,14 @@ def compiled() -> Iterator[None]:
     kernels.compile_at_once()
     yield
     kernels._values = before
+
+
+def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that grows with every frame of a share in machine code."""
+    calls: list[int] = []
+    real = frames._Thread.run
+    monkeypatch.setattr(frames._Thread, "run", lambda *arguments: (calls.append(1), real(*arguments))[1])
+    return calls
 
 
 def make(n: int, threads: int | None = None, **options: Any) -> BaseSimulation:
@@ -74,14 +87,82 @@ def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
 ) -> None:
     if options.get("physics_hz") == 100:
         monkeypatch.setattr("bhd_lerobot.bodies.body.Body.check_rates", lambda *_, **__: None)
-    calls = []
-    real = frames._Thread.run
-    monkeypatch.setattr(frames._Thread, "run", lambda *arguments: (calls.append(1), real(*arguments))[1])
+    calls = count_calls(monkeypatch)
     fast = run(n, threads, **options)
     assert calls
     with kernels.never_compiled():
         calls.clear()
         plain = run(n, threads, **options)
+        assert not calls
+    np.testing.assert_array_equal(fast, plain)
+
+
+class Reacher:
+    """What arms are told to do: by setpoints, by goals, and something else in between."""
+
+    def __init__(self, n: int, threads: int | None, options: dict[str, Any]) -> None:
+        config = UR5Config(**options)
+        self.arm = UR5Simulation(config, n, threads)
+        self.task = PickTask(
+            PickConfig(randomisation=RandomisationConfig(enabled=True, latency_s=0.02)), n, config.fps, config.body()
+        )
+        self.all, self.rng = np.arange(n), np.random.default_rng(0)
+        self.arm.reset(self.all, [self.task.sample(sim) for sim in range(n)], self.all.tolist())
+        self.action = self.arm.cerebellum.command.copy()
+
+    def disturb(self, frame: int) -> None:
+        """Stop, reset, leave alone and start again."""
+        bridge, n = self.arm.bridge, len(self.all)
+        if frame == 20:
+            bridge.estop(self.all[:1])
+        if frame == 26:
+            bridge.reset()
+            bridge.activate()
+            self.action[:] = self.arm.cerebellum.command
+        if frame == 30 and n > 1:
+            self.arm.stop(np.array([1]))
+        if frame == 34 and n > 1:
+            self.arm.reset(np.array([1]), [self.task.sample(7)], [7])
+            self.action[:] = self.arm.cerebellum.command
+
+    def run(self) -> NDArray[np.float64]:
+        rows = []
+        for frame in range(44):
+            self.disturb(frame)
+            goals: dict[int, tuple[BrainCommand, ...]] = {}
+            if frame in (2, 12, 13, 36):
+                pose = Pose((0.5, 0.1 - 0.01 * frame, 0.2), (0.0, 1.0, 0.0, 0.0))
+                opening = 0.02 if frame == 13 else 0.08
+                goals = {sim: (BrainCommand(f"{frame}", target_pose=pose, gripper=opening),) for sim in self.all}
+            if goals or frame in range(2, 8) or frame in range(12, 20) or frame > 36:
+                report = self.arm.step(Goals(goals))
+            else:
+                self.action[:, :6] += self.rng.uniform(-0.06, 0.06, (len(self.all), 6)) - (0.0, 0.05, 0, 0, 0, 0)
+                report = self.arm.step(self.action)
+            seen, true = self.arm.observe(), self.arm.truth()
+            touches = np.stack([true.arm_on_table, true.arm_on_object, true.self_contact], axis=1)
+            flags = np.stack([report.limits, report.watchdog, report.mode], axis=1)
+            results = [[len(self.arm.bridge.take_results(int(sim)))] for sim in self.all]
+            every = [seen.state, report.applied, flags, touches, report.columns["control.effort"], results]
+            every += [true.tool_pose, self.arm.physics_state]
+            row = np.concatenate(every, axis=1)
+            rows.append(np.where(self.arm.running[:, None], row, 0.0))
+        self.arm.close()
+        return np.array(rows)
+
+
+@pytest.mark.usefixtures("compiled")
+@each_case("options", [{}, {"wrench": True}, {"physics_hz": 1000}, {"max_force": 30.0, "jerk_limits": False}])
+@pytest.mark.parametrize(("n", "threads"), [(1, None), (4, 1), (4, 3)])
+def test_frames_of_arms_are_the_bits_of_ticks_and_steps_in_turns(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], n: int, threads: int | None
+) -> None:
+    calls = count_calls(monkeypatch)
+    fast = Reacher(n, threads, options).run()
+    assert len(calls) > 44
+    with kernels.never_compiled():
+        calls.clear()
+        plain = Reacher(n, threads, options).run()
         assert not calls
     np.testing.assert_array_equal(fast, plain)
 

@@ -11,5 +11,6 @@ __all__ = [
     "relief",
     "rotations",
     "setpoints",
+    "step",
     "wrench",
 ]

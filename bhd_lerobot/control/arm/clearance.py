@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain
-from bhd_lerobot.control.arm.record import GEOMETRY, PAIRS, SAMPLES, SHAPES
 from bhd_lerobot.control.geometry.chain import find_distances
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.kernels import clamp, kernel
+from bhd_lerobot.control.record import GEOMETRY, PAIRS, SAMPLES, SHAPES
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -99,7 +99,9 @@ def is_near(arm: Any, limits: Any, geometry: Any, q: Array) -> bool:
 
 
 @kernel()
-def free_share(arm: Any, limits: Any, geometry: Any, q: Array, itself: float, table: float) -> float:
+def free_share(  # noqa: PLR0917
+    arm: Any, limits: Any, geometry: Any, q: Array, itself: float, table: float
+) -> float:
     """Return which share of the way on which an arm would stop is free.
 
     Args:

@@ -10,7 +10,6 @@ from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.arm.clearance import LOOKS, fill_geometry, new_geometries
 from bhd_lerobot.control.arm.force_limit import explain_force, forget_force, put_force_limit
 from bhd_lerobot.control.arm.held import held_capsule
-from bhd_lerobot.control.arm.record import ARM_LIMITS, new_arms
 from bhd_lerobot.control.arm.relief import ContactRelief, Sensed
 from bhd_lerobot.control.arm.setpoints import leave_setpoints, put_setpoint_limits, take_setpoint
 from bhd_lerobot.control.arm.step import Stage, is_arm_at_rest, move_arm
@@ -25,7 +24,7 @@ from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.motion.supervision import most_away, put_goal_limits
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import put
+from bhd_lerobot.control.record import ARM_LIMITS, new_arms, put
 
 Array = NDArray[np.float64]
 
@@ -289,7 +288,9 @@ class ArmController(Controller):
                 arm["wrong"][:dof] |= wrong
                 forget_force(arm)  # what was felt was felt in another posture
             torque, pressing, doubtful = arm["torque"][:dof], float(arm["pressing"]), bool(arm["wrong"].any())
-            sensed = Sensed(self._where(sim)[None], torque[None], *(np.array([v]) for v in (pressing, measured, doubtful)))
+            sensed = Sensed(
+                self._where(sim)[None], torque[None], *(np.array([v]) for v in (pressing, measured, doubtful))
+            )
         else:
             position, none = self.states["position"][sim : sim + 1, :dof], np.zeros(1, np.bool_)
             sensed = Sensed(position, np.zeros_like(position), np.zeros(1), none, none)
@@ -311,18 +312,17 @@ class ArmController(Controller):
             measured = self._is_measured(sim)
             is_misread = bool(((away > limit) & self._misread_joints(sim)).any())
             moved = np.abs(np.asarray(state.position[: self.width]) - self._first[sim])
-            if (moved < _STANDS).all():
-                message = _DEAF
-            else:
-                message = self._misread if is_misread and measured else self._blocked
+            message = self._misread if is_misread and measured else self._blocked
+            message = _DEAF if (moved < _STANDS).all() else message
             self._protect(sim, Watchdog.BLOCKED, message, follows=is_misread or not measured)
         # One that gives way does what it can.
-        if arm["presses"] and not arm["yields"] and (not arm["is_stopped"] or self.goals.following[sim]):
-            if arm["ticks"] == 0 and self._limits["has_effort"]:  # a new estimate
-                if self._misread_joints(sim).any():  # it is the force in another posture
-                    self._protect(sim, Watchdog.BLOCKED, self._misread, follows=True)
-                else:
-                    self._protect(sim, Watchdog.FORCE, explain_force(self._body, arm, self._limits), follows=False)
+        is_new = arm["ticks"] == 0 and self._limits["has_effort"]
+        is_free = not arm["yields"] and (not arm["is_stopped"] or self.goals.following[sim])
+        if arm["presses"] and is_new and is_free:
+            if self._misread_joints(sim).any():  # it is the force in another posture
+                self._protect(sim, Watchdog.BLOCKED, self._misread, follows=True)
+            else:
+                self._protect(sim, Watchdog.FORCE, explain_force(self._body, arm, self._limits), follows=False)
         if arm["is_lost"] and arm["is_driven"] and not arm["is_stopped"]:
             self._protect(sim, Watchdog.PLANT, _LOST, follows=True)
 

@@ -7,10 +7,9 @@ import numpy as np
 
 from bhd_lerobot.bodies.body import Limits
 from bhd_lerobot.control.arm.clearance import permitted_share
-from bhd_lerobot.control.arm.record import NEVER
 from bhd_lerobot.control.kernels import clamp, kernel, largest_change
 from bhd_lerobot.control.messages import Limit
-from bhd_lerobot.control.record import put
+from bhd_lerobot.control.record import NEVER, put
 
 # [1/s] How eagerly a remaining error is closed. With the jerk limit of a UR5 the first follows random setpoints best:
 # less lags, more overshoots. Without a jerk limit it may be twice as much.
@@ -36,7 +35,12 @@ def put_setpoint_limits(row: Any, limits: Limits, control_hz: int, frame_ticks: 
     is_gradual = bool((jerk < 2 * acceleration).any())
     # Farther from an end of the range than this, any speed can be stopped in time: more than `stoppable` needs.
     room = 1.01 * (speed / control_hz + speed * (speed / 2 + ramp) / (_APPROACH * acceleration))
-    row["width"], row["hz"], row["frame_ticks"], row["is_gradual"] = len(limits.names), control_hz, frame_ticks, is_gradual
+    row["width"], row["hz"], row["frame_ticks"], row["is_gradual"] = (
+        len(limits.names),
+        control_hz,
+        frame_ticks,
+        is_gradual,
+    )
     # A larger gain would overshoot in a single tick.
     row["gain"] = min(_GAIN if is_gradual else _GAIN_AT_ONCE, control_hz / 2)
     values = {"lower": lower, "upper": upper, "near_lower": lower + room, "near_upper": upper - room}

@@ -1,7 +1,7 @@
 """What a tick does for an arm with position servos: setpoints, goals and stops to servo positions.
 
-Where something rare is to be done, such as a plan, a tick waits for its controller: `move_arm` returns, and goes on from
-there when it is called again.
+Where something rare is to be done, such as a plan, a tick waits for its controller: `move_arm` returns, and goes on
+from there when it is called again.
 """
 
 import math
@@ -127,8 +127,8 @@ def lead_servos(state: Any, arm: Any, limits: Any) -> None:
     """Lead the servos' commands by their damping, so that they follow without a lag; note what does not follow.
 
     A servo beyond its effort gives its largest: that is flagged, and the command stays as it is. Holding the command
-    near the joint, to ask for no more, would be a second loop around the servo, which a few milliseconds of latency turn
-    into a brake. It goes on with its full torque for as long as its command is out of reach: for a while only.
+    near the joint, to ask for no more, would be a second loop around the servo, which a few milliseconds of latency
+    turn into a brake. It goes on with its full torque for as long as its command is out of reach: for a while only.
     """
     is_limited = is_off = False
     for k in range(limits.width):

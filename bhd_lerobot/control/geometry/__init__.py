@@ -1,3 +1,3 @@
 """Kinematics, collisions, dynamics and poses."""
 
-__all__ = ["collision", "dynamics", "forward_kinematics", "inverse_kinematics", "kinematics", "poses"]
+__all__ = ["chain", "collision", "dynamics", "forward_kinematics", "inverse_kinematics", "kinematics", "poses"]

@@ -104,7 +104,9 @@ class ArmDynamics:
             joint, placed, inertia = model.joints[k + 1], model.jointPlacements[k + 1], model.inertias[k + 1]
             axes = {"JointModelRX": (1, 0, 0), "JointModelRY": (0, 1, 0), "JointModelRZ": (0, 0, 1)}
             if joint.shortname() not in axes:
-                raise ConfigError(f"Joint {model.names[k + 1]!r} of the MJCF turns about none of its body's axes x, y, z.")
+                raise ConfigError(
+                    f"Joint {model.names[k + 1]!r} of the MJCF turns about none of its body's axes x, y, z."
+                )
             row["axis"][k] = axes[joint.shortname()]
             row["turn"][k], row["offset"][k] = placed.rotation, placed.translation
             row["mass"][k], row["centre"][k], row["inertia"][k] = inertia.mass, inertia.lever, inertia.inertia

@@ -51,7 +51,8 @@ class GoalManager:
         self, body: Body, states: NDArray[Any], arms: NDArray[Any], control_hz: int, planning: Planning | None = None
     ) -> None:
         self._arm, n = body.need(Arm), len(arms)
-        self._hz, self._dof = control_hz, dof = control_hz, len(self._arm.chain.joints)
+        self._hz, self._dof = control_hz, len(self._arm.chain.joints)
+        dof = self._dof
         self.planner = GoalPlanner(body, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = states["busy"]

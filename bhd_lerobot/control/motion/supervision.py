@@ -4,6 +4,8 @@ import math
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.kernels import kernel
@@ -120,16 +122,14 @@ def explain_verdict(verdict: int, body_arm: Arm, state: Any, arm: Any, control_h
     if verdict == Verdict.OFF:
         away, most = arm["away"][:dof], arm["most"][:dof]
         joint = int((away - most).argmax())
-        return ResultCode.PATH_TOLERANCE, (
-            f"{joints[joint]} is {away[joint]:.3f} rad from its reference; {most[joint]:.3g} rad is the "
-            "most: something is in its way, or it carries too much."
-        )
+        text = f"{joints[joint]} is {away[joint]:.3f} rad from its reference; {most[joint]:.3g} rad is the most: "
+        return ResultCode.PATH_TOLERANCE, text + "something is in its way, or it carries too much."
     if verdict == Verdict.TIMEOUT:
         seconds = arm["deadline"] / control_hz
         return ResultCode.TIMEOUT, f"The goal was not reached within its {seconds:.3g} s."
     if verdict == Verdict.NOT_ARRIVED:
         off, speed = abs(position - arm["aim"][:dof]), abs(state["velocity"][:dof])
-        joint = int(max(range(dof), key=lambda k: max(off[k] / JOINT_TOLERANCE, speed[k] / JOINT_STILL)))
+        joint = int(np.maximum(off / JOINT_TOLERANCE, speed / JOINT_STILL).argmax())
         return ResultCode.GOAL_TOLERANCE, (
             f"{joints[joint]} is {off[joint]:.4f} rad from its target at {speed[joint]:.3f} rad/s, "
             f"{SETTLING_S} s after the end of the motion; "
@@ -140,11 +140,9 @@ def explain_verdict(verdict: int, body_arm: Arm, state: Any, arm: Any, control_h
             f"The gripper has neither reached {target:.4f} m nor stalled {GRIPPING_S} s after the "
             f"end of the motion; the opening is {opening:.4f} m."
         )
-    if not arm["moves_gripper"]:
-        return ResultCode.SUCCEEDED, "The target is reached."
-    if abs(opening - target) <= OPENING_TOLERANCE:
-        return ResultCode.SUCCEEDED, f"The target is reached; the opening is {opening:.4f} m."
-    return (
-        ResultCode.SUCCEEDED,
-        f"The gripper has stalled on its way to {target:.4f} m; the opening is {opening:.4f} m.",
-    )
+    text = "The target is reached."
+    if arm["moves_gripper"]:
+        text = f"The target is reached; the opening is {opening:.4f} m."
+        if abs(opening - target) > OPENING_TOLERANCE:
+            text = f"The gripper has stalled on its way to {target:.4f} m; the opening is {opening:.4f} m."
+    return ResultCode.SUCCEEDED, text

@@ -199,5 +199,7 @@ class Simulation(Host):
     @cached_property
     def _is_plain(self) -> bool:
         """Whether nothing but its own class does something after steps and ticks."""
-        own = next(kind for kind in type(self).__mro__ if kind.__module__.startswith(_PACKAGE) and "place" in vars(kind))
+        own = next(
+            kind for kind in type(self).__mro__ if kind.__module__.startswith(_PACKAGE) and "place" in vars(kind)
+        )
         return all(getattr(type(self), hook) is getattr(own, hook) for hook in _HOOKS)

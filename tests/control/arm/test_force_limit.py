@@ -36,7 +36,8 @@ class Felt:
     def update(self, ticks: int = 1) -> int:
         """Let ticks go by; return the first in which any force was too large, or -1."""
         for tick in range(ticks):
-            if any([feel(*records) for records in self._records]):
+            presses = [feel(*records) for records in self._records]
+            if any(presses):
                 return tick
         return -1
 

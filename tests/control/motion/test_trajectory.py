@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.control.arm.record import ARM_LIMITS, new_arms
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.motion import line as line_module
@@ -28,7 +27,7 @@ from bhd_lerobot.control.motion.trajectory import (
     to_rest,
     to_target,
 )
-from bhd_lerobot.control.record import new_states
+from bhd_lerobot.control.record import ARM_LIMITS, new_arms, new_states
 from tests.control.goal_rig import HOME, HZ, KINEMATICS, LIMITS, STOP_LIMITS, TOOL, moved
 
 Array = NDArray[np.float64]
