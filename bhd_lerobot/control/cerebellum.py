@@ -26,7 +26,7 @@ from bhd_lerobot.control.messages import (
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 from bhd_lerobot.control.record import JOINTS, new_states, put
-from bhd_lerobot.control.tick import begin_all, drop_all, end_all, judge_all, tick_all
+from bhd_lerobot.control.tick import begin_all, drop_all, end_all, judge_all, tick_arms, tick_bases
 from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
@@ -100,8 +100,8 @@ class Cerebellum:
             *(states[name] for name in ("busy", "follows_goal", "protective_stop", "stamp_ns")),
             numbers["has_stamps"],
         )
-        self._has_effort = controller.arm_limits["has_effort"]
-        if controller.is_compiled:
+        self._has_effort = None if controller.arms is None else controller.arm_limits["has_effort"]
+        if controller.is_compiled and controller.arms is None:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
             if sensors < needed:  # compiled code would read beyond them
                 raise ConfigError(f"The controller of {body.name!r} takes {needed} sensors; the plant reads {sensors}.")
@@ -125,9 +125,12 @@ class Cerebellum:
         states, queues, words = self.states, self.fifo.queues, self.estop.words
         sensors = self.reading.sensors, self.reading.sensors_ns
         if self._is_compiled:
-            own = self.controller
-            records = own.arms, self.numbers, own.arm_limits, own.geometries
-            self._run = tick_all.bind(states, queues, words, own.monitors, *records, *sensors)
+            own, records = self.controller, (states, queues, words)
+            if own.arms is None:
+                self._run = tick_bases.bind(*records, own.monitors, self.numbers, *sensors)
+            else:
+                limits = self.numbers, own.arm_limits, own.geometries
+                self._run_arms = tick_arms.bind(*records, own.arms, *limits, sensors[1])
         else:
             self._begin = begin_all.bind(states, queues, words, self.numbers, sensors[1])
             self._end = end_all.bind(states, self.numbers)
@@ -180,10 +183,12 @@ class Cerebellum:
         self._now_ns = now_ns
         self._read()
         if self._is_compiled:
-            is_over = self._run(self.controller.rows, now_ns, False)
-            while not is_over:
+            if self.controller.arms is None:
+                self._run(now_ns)
+            elif not self._run_arms(self.controller.rows, now_ns, False):
                 self.serve()
-                is_over = self._run(self.controller.rows, now_ns, True)
+                while not self._run_arms(self.controller.rows, now_ns, True):
+                    self.serve()
         else:
             self._run_controller(self.controller, now_ns)
         if np.count_nonzero(self._mode_is_new):
@@ -202,7 +207,8 @@ class Cerebellum:
         self.plant.read(reading)
         self._stamp_ns[:] = self._now_ns if reading.stamp_ns is None else reading.stamp_ns
         self._has_stamps[0] = reading.stamp_ns is not None
-        self._has_effort[0] = reading.has_effort
+        if self._has_effort is not None:
+            self._has_effort[0] = reading.has_effort
 
     def _run_controller(self, controller: Any, now_ns: int) -> None:
         """Run a tick with a controller that is no part of the compiled one."""

@@ -1,18 +1,15 @@
 """What stands between a command and the actuators; the modes are the cerebellum's."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.collision_monitor import MONITOR
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import ARM_LIMITS, GEOMETRY, LIMITS, new_arms, new_states
-
-_NO_ROWS = np.zeros((1, 3, 1))
+from bhd_lerobot.control.record import LIMITS, new_states
 
 
 class Controller(ABC):
@@ -28,12 +25,11 @@ class Controller(ABC):
         states: the records of the robots, shape (n,).
         numbers: the record of their limits, shape (1,).
         is_compiled: whether it is a part of the compiled tick.
-        arms: the records of the robots' arms, shape (n,); a single one if they have none.
+        arms: the records of the robots' arms, shape (n,); None if they have none.
         arm_limits: the record of the arms' limits, shape (1,).
         geometries: what the arms are kept clear with, see `bhd_lerobot.control.arm.clearance`.
-        rows: the trajectories that the arms play, shape (T, 3, width).
-        monitors: the records of the robots' collision monitors, shape (n,); a single one without beams if there are
-            none.
+        monitors: of bases, the records of their collision monitors, shape (n,); a single one without beams if there
+            are none.
         width: number of values in a command.
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
@@ -56,17 +52,14 @@ class Controller(ABC):
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
     is_compiled: ClassVar[bool] = False
+    monitors: NDArray
+    arm_limits: NDArray
+    geometries: NDArray
 
     def __init__(self, n: int) -> None:
         self.states, self.numbers = new_states(n), np.zeros(1, LIMITS)
-        self.monitors, self.arms = np.zeros(1, MONITOR), new_arms(1)
         self.numbers["gyro"] = -1
-        self.arm_limits, self.geometries = np.zeros(1, ARM_LIMITS), np.zeros(1, GEOMETRY)
-
-    @property
-    def rows(self) -> NDArray[np.float64]:
-        """What the arms play."""
-        return _NO_ROWS
+        self.arms: Any = None
 
     def serve(self, sim: int) -> None:
         """Do what the tick of one robot waits for, see `tick`."""
@@ -75,6 +68,11 @@ class Controller(ABC):
     def tell(self, sim: int) -> None:
         """Take the modes that one robot has entered outside of a tick."""
         return
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """The trajectories that arms play, shape (T, 3, width)."""
+        raise NotImplementedError
 
     @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:

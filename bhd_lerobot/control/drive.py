@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive
-from bhd_lerobot.control.collision_monitor import forget_scans, keep_clear
+from bhd_lerobot.control.collision_monitor import MONITOR, forget_scans, keep_clear
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.kernels import clamp, kernel, largest_change
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
@@ -269,8 +269,7 @@ class BaseController(Controller):
         latency_s: float = 0.0,
     ) -> None:
         super().__init__(n)
-        if monitors is not None:
-            self.monitors = monitors
+        self.monitors = np.zeros(1, MONITOR) if monitors is None else monitors
         self.drive, limits, states, numbers = drive, drive.limits, self.states, self.numbers[0]
         self.command: Array = states["command"][:, :2]
         self.actuators: Array = states["actuators"][:, :2]

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from functools import cache, cached_property, partial, update_wrapper
 from pathlib import Path
 from threading import RLock
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,14 @@ class Kernel[**P, R]:
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:  # noqa: D102
         return self.function(*args, **kwargs)
+
+    def of(self, name: str, signature: str) -> "Kernel[P, R]":
+        """Return the kernel of the same function for other types, such as None in the place of a record."""
+        code, names = self.function.__code__, self.function.__globals__
+        copy: Any = FunctionType(code, names, name, self.function.__defaults__, self.function.__closure__)
+        copy.__qualname__ = name  # by which its machine code is found again
+        copy.__doc__, copy.__module__ = self.function.__doc__, self.function.__module__
+        return Kernel(copy, signature)
 
     @cached_property
     def compiled(self) -> Callable[..., R]:

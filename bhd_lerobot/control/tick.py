@@ -45,8 +45,8 @@ def tick(  # noqa: PLR0917
     limits: Any,
     arm_limits: Any,
     geometry: Any,
-    rows: Trajectories,
-    sensors: Numbers,
+    rows: Any,
+    sensors: Any,
     sensors_ns: int,
     now_ns: int,
 ) -> bool:
@@ -59,39 +59,39 @@ def tick(  # noqa: PLR0917
         state: the robot's record.
         queue: its commands.
         estop: the word of its emergency stop, see `EstopWord`.
-        monitor: its collision monitor; one without beams if there is none.
-        arm: its arm; any record if it has none.
+        monitor: the collision monitor of a base; one without beams if there is none.
+        arm: its arm; None of a base.
         limits: the numbers of its body.
         arm_limits: the numbers of its arm.
         geometry: what its arm is kept clear with.
         rows: the trajectories that arms play.
-        sensors: further values that the plant measures.
+        sensors: further values that the plant of a base measures.
         sensors_ns: when the oldest of them was measured [ns].
         now_ns: the time that the tick is for [ns].
 
     Returns:
         False if the tick waits for `Controller.serve`, and is to be continued by the same call.
     """
-    if limits.is_drive:
+    if monitor is not None:  # numba leaves out what is for the other kind of robot
         begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
         drive(state, limits, monitor, sensors, sensors_ns)
         end_tick(state, limits)
-        return True
-    if arm.stage == _NONE:
-        if state.mode == _STOPPING:
-            state.is_at_rest = is_arm_at_rest(state, arm, arm_limits)
-        begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
-        arm.stage = _BEGUN
-        if has_to_be_told(state, arm, arm_limits):
-            return False
-    if arm.stage < _ENDED:
-        if not move_arm(state, arm, arm_limits, geometry, rows, limits.has_stamps):
-            return False
-        end_tick(state, limits)
-        arm.stage = _ENDED
-        if state.entered != 0 or state.goes_back:
-            return False
-    arm.stage = _NONE
+    if arm is not None:
+        if arm.stage == _NONE:
+            if state.mode == _STOPPING:
+                state.is_at_rest = is_arm_at_rest(state, arm, arm_limits)
+            begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+            arm.stage = _BEGUN
+            if has_to_be_told(state, arm, arm_limits):
+                return False
+        if arm.stage < _ENDED:
+            if not move_arm(state, arm, arm_limits, geometry, rows, limits.has_stamps):
+                return False
+            end_tick(state, limits)
+            arm.stage = _ENDED
+            if state.entered != 0 or state.goes_back:
+                return False
+        arm.stage = _NONE
     return True
 
 
@@ -262,26 +262,42 @@ def follow_controller(state: Any) -> None:
             set_mode(state, _HOLD)
 
 
-@kernel(
-    "b1(state[::1], queue[::1], i8[:,:], monitor[::1], arm[::1], limits[::1], arm_limits[::1], geometry[::1], f8[:,:], "
-    "i8[:], f8[:,:,:], i8, b1)"
-)
-def tick_all(  # noqa: PLR0917
+@kernel("void(state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], i8)")
+def tick_bases(  # noqa: PLR0917
     states: Any,
     queues: Any,
     estop: Counts,
     monitors: Any,
+    limits: Any,
+    sensors: Numbers,
+    sensors_ns: Counts,
+    now_ns: int,
+) -> None:
+    """Run one tick of n bases; a monitor without beams may be one for all."""
+    for sim in range(len(states)):
+        state, queue, word, monitor = states[sim], queues[sim], estop[:, sim], monitors[sim % len(monitors)]
+        seen, seen_ns, own = sensors[sim], sensors_ns[sim], limits[0]
+        tick(state, queue, word, monitor, None, own, None, None, None, seen, seen_ns, now_ns)
+
+
+@kernel(
+    "b1(state[::1], queue[::1], i8[:,:], arm[::1], limits[::1], arm_limits[::1], geometry[::1], i8[:], f8[:,:,:], i8, "
+    "b1)"
+)
+def tick_arms(  # noqa: PLR0917
+    states: Any,
+    queues: Any,
+    estop: Counts,
     arms: Any,
     limits: Any,
     arm_limits: Any,
     geometries: Any,
-    sensors: Numbers,
     sensors_ns: Counts,
     rows: Trajectories,
     now_ns: int,
     goes_on: bool,
 ) -> bool:
-    """Run one tick of n robots; monitors and arms of robots that have none may be one for all.
+    """Run one tick of n arms.
 
     Args:
         goes_on: continue the ticks that have waited for the controller.
@@ -291,16 +307,13 @@ def tick_all(  # noqa: PLR0917
     """
     is_over = True
     for sim in range(len(states)):
-        arm = arms[sim % len(arms)]
+        state, queue, word, arm = states[sim], queues[sim], estop[:, sim], arms[sim]
         if goes_on and arm.stage == _NONE:
             continue
         if not goes_on:
             arm.stage = _NONE
-        geometry = geometries[arm.geometry % len(geometries)]
-        queue, word, monitor = queues[sim], estop[:, sim], monitors[sim % len(monitors)]
-        seen, seen_ns = sensors[sim], sensors_ns[sim]
-        own = limits[0], arm_limits[0]
-        if not tick(states[sim], queue, word, monitor, arm, own[0], own[1], geometry, rows, seen, seen_ns, now_ns):
+        geometry, own, its = geometries[arm.geometry % len(geometries)], limits[0], arm_limits[0]
+        if not tick(state, queue, word, None, arm, own, its, geometry, rows, None, sensors_ns[sim], now_ns):
             is_over = False
     return is_over
 

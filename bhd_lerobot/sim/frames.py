@@ -37,6 +37,7 @@ Numbers = NDArray[np.float64]
 LAYOUT = record(
     "layout",
     [
+        ("joints", np.int64),
         ("ticks_hz", np.int64),
         ("substeps", np.int64),
         # Places of the joints in qpos and qvel, and of the actuators in ctrl.
@@ -107,11 +108,7 @@ def _load() -> bool:
     return True
 
 
-@kernel(
-    "void(i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], "
-    "i4[:,:,:], state[::1], queue[::1], i8[:,:], monitor[::1], arm[::1], limits[::1], arm_limits[::1], geometry[::1], "
-    "f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], f8[:,:,:], f8[:,:,:], i8[:], i8[:], i8, i8[:], i8, i8, i4)"
-)
+@kernel()
 def run_frames(  # noqa: PLR0912, PLR0917
     ids: Counts,
     models: Counts,
@@ -131,24 +128,24 @@ def run_frames(  # noqa: PLR0912, PLR0917
     queues: Any,
     estop: Counts,
     monitors: Any,
-    arms: Any,
     limits: Any,
-    arm_limits: Any,
-    geometries: Any,
     sensors: Numbers,
     sensors_ns: Counts,
     touches: NDArray[np.bool_],
     efforts: Numbers,
     layouts: Any,
-    trajectories: Numbers,
-    ring: Numbers,
-    latency: Counts,
-    waited: Counts,
-    written: int,
     numbers: Counts,
     first_tick: int,
     ticks: int,
     spec: int,
+    arms: Any,
+    arm_limits: Any,
+    geometries: Any,
+    trajectories: Any,
+    ring: Any,
+    latency: Any,
+    waited: Any,
+    written: int,
 ) -> None:
     """Let some ticks of some simulations go by, one simulation after the other.
 
@@ -163,59 +160,48 @@ def run_frames(  # noqa: PLR0912, PLR0917
         touches: becomes True where the scene was touched, shape (kinds, n): anything; or the table, objects with a
             link of the arm, the arm itself.
         efforts: mean efforts of the last tick, shape (n, nv).
+        numbers: the tick that is next for each simulation, shape (n,).
+        first_tick: number of the first tick.
+        spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
+        arms: their records; None of bases, which have none of what follows.
         trajectories: what arms play.
         ring: the last commands, of servos that get them late, shape (ticks, n, actuators); empty if none is late.
         latency: by how many ticks they are late, shape (n,).
         waited: ticks since that was set, shape (n,).
         written: commands that were written to the ring.
-        numbers: the tick that is next for each simulation, shape (n,).
-        first_tick: number of the first tick.
-        spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
     """
     layout = layouts[0]
-    joints = limits[0].joints
+    joints = layout.joints
     for sim in ids:
-        state, monitor, arm = states[sim], monitors[sim % len(monitors)], arms[sim % len(arms)]
+        state = states[sim]
         _set_state(models[sim], data, rows + sim * row_bytes, spec)
         warnings[:] = 0
         for number in range(numbers[sim], first_tick + ticks):
             numbers[sim] = number
             now_ns = number * NANOSECONDS // layout.ticks_hz
-            if arm.stage == 0:
-                state.stamp_ns = now_ns
+            queue, word, own, seen_ns = queues[sim], estop[:, sim], limits[0], sensors_ns[sim]
+            if monitors is not None:
+                read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
+                monitor, seen = monitors[sim % len(monitors)], sensors[sim]
+                tick(state, queue, word, monitor, None, own, None, None, None, seen, seen_ns, now_ns)
                 for k in range(joints):
-                    position, velocity = qpos[layout.qpos[k]], qvel[layout.qvel[k]]
-                    if layout.qpos_beside[k] >= 0:
-                        position += qpos[layout.qpos_beside[k]]
-                        velocity += qvel[layout.qvel_beside[k]]
-                    state.position[k], state.velocity[k] = position, velocity
-                    state.effort[k] = efforts[sim, layout.qvel[k]]
-            is_over = tick(
-                state,
-                queues[sim],
-                estop[:, sim],
-                monitor,
-                arm,
-                limits[0],
-                arm_limits[0],
-                geometries[arm.geometry % len(geometries)],
-                trajectories,
-                sensors[sim],
-                sensors_ns[sim],
-                now_ns,
-            )
-            if not is_over:
-                break
-            numbers[sim] = number + 1
-            passed = number - first_tick
-            slot = written + passed
-            behind = slot - min(latency[sim], waited[sim] + passed)
-            for k in range(joints):
-                if len(ring):
-                    ring[slot % len(ring), sim, k] = state.written[k]
-                    ctrl[layout.ctrl[k]] = ring[behind % len(ring), sim, k]
-                else:
                     ctrl[layout.ctrl[k]] = state.written[k]
+            if arms is not None:
+                arm, its = arms[sim], arm_limits[0]
+                if arm.stage == 0:
+                    read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
+                geometry = geometries[arm.geometry % len(geometries)]
+                if not tick(state, queue, word, None, arm, own, its, geometry, trajectories, None, seen_ns, now_ns):
+                    break
+                passed = number - first_tick
+                slot = written + passed
+                behind = slot - min(latency[sim], waited[sim] + passed)
+                for k in range(joints):
+                    ctrl[layout.ctrl[k]] = state.written[k]
+                    if len(ring):
+                        ring[slot % len(ring), sim, k] = state.written[k]
+                        ctrl[layout.ctrl[k]] = ring[behind % len(ring), sim, k]
+            numbers[sim] = number + 1
             for step in range(layout.substeps):
                 _step(models[sim], data)
                 if sensordata[layout.touch] != 0.0:
@@ -242,6 +228,32 @@ def run_frames(  # noqa: PLR0912, PLR0917
         if numbers[sim] == first_tick + ticks:
             for k in range(layout.outputs):
                 _copy(layout.target[k] + sim * layout.nbytes[k], layout.source[k], layout.nbytes[k])
+
+
+_WHERE = (
+    "i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], i4[:,:,:], "
+    "state[::1], queue[::1], i8[:,:]"
+)
+_WHAT = "limits[::1], f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], i8[:], i8, i8, i4"
+_ARMS = "arm[::1], arm_limits[::1], geometry[::1], f8[:,:,:], f8[:,:,:], i8[:], i8[:], i8"
+run_base_frames = run_frames.of(
+    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 7)}, i8)"
+)
+run_arm_frames = run_frames.of("run_arm_frames", f"void({_WHERE}, none, {_WHAT}, {_ARMS})")
+
+
+@kernel()
+def read_joints(  # noqa: PLR0917
+    state: Any, layout: Any, qpos: Numbers, qvel: Numbers, efforts: Numbers, now_ns: int
+) -> None:
+    """Read the joints of a simulation."""
+    state.stamp_ns = now_ns
+    for k in range(layout.joints):
+        position, velocity = qpos[layout.qpos[k]], qvel[layout.qvel[k]]
+        if layout.qpos_beside[k] >= 0:
+            position += qpos[layout.qpos_beside[k]]
+            velocity += qvel[layout.qvel_beside[k]]
+        state.position[k], state.velocity[k], state.effort[k] = position, velocity, efforts[layout.qvel[k]]
 
 
 @kernel()
@@ -303,7 +315,7 @@ class Frames:
         model, self._layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = self._layout[0], world.servos
         row["ticks_hz"], row["substeps"] = cerebellum.control_hz, world.physics_hz // cerebellum.control_hz
-        row["qpos_beside"] = -1
+        row["qpos_beside"], row["joints"] = -1, cerebellum.controller.joints
         servos = self._place_arm(row) if world.body.arm is not None else self._place_drive(row)
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
@@ -319,7 +331,9 @@ class Frames:
         self._threads: list[_Thread] = []
         self._pool: ThreadPoolExecutor | None = None
         self._addresses, self._numbers, self._zeros = np.zeros((3, world.n), np.int64)
+        self._at_once = _NO_RING, self._zeros, self._zeros, 0
         self._checked, self._copies = -1, False
+        self._kernel = run_base_frames if cerebellum.controller.arms is None else run_arm_frames
 
     def _place_drive(self, row: Any) -> list[int]:
         """Write where the wheels and the touches are; return the servos."""
@@ -366,7 +380,7 @@ class Frames:
             return False
         ids = np.arange(self._world.n) if ids is None else ids
         self._handled += len(ids) * _TICK_VALUES
-        if not is_worth_compiling(run_frames, self._handled) or not _load():
+        if not is_worth_compiling(self._kernel, self._handled) or not _load():
             return False
         if not self._are_copied:
             return False
@@ -378,13 +392,12 @@ class Frames:
             if len(self._threads) > 1:
                 self._pool = ThreadPoolExecutor(len(self._threads), "frames")
         self._numbers[ids] = first_tick
-        own.controller.arms["stage"] = 0  # whatever interrupted the last frame
-        while True:
-            self._run(ids, first_tick, ticks)
-            ids = ids[self._numbers[ids] < first_tick + ticks]
-            if not len(ids):
-                break
+        if own.controller.arms is not None:
+            own.controller.arms["stage"] = 0  # whatever interrupted the last frame
+        self._run(ids, first_tick, ticks)
+        while len(ids := ids[self._numbers[ids] < first_tick + ticks]):
             own.serve()
+            self._run(ids, first_tick, ticks)
         if self._late is not None and self._late.is_late:
             self._late.pass_by(ticks)
         return True
@@ -399,12 +412,14 @@ class Frames:
         """Let ticks go by until each simulation is at the end, or waits for its controller."""
         shared = self._shared
         if self._pool is None:
-            self._threads[0].run(ids, self._addresses, shared, first_tick, ticks)
+            self._threads[0].run(self._kernel, ids, self._addresses, shared, self._numbers, first_tick, ticks)
             return
         shares = np.array_split(ids, len(self._threads))
         calls = zip(self._threads, shares, strict=True)
         jobs = [
-            self._pool.submit(thread.run, share, self._addresses, shared, first_tick, ticks)
+            self._pool.submit(
+                thread.run, self._kernel, share, self._addresses, shared, self._numbers, first_tick, ticks
+            )
             for thread, share in calls
             if len(share)
         ]
@@ -433,14 +448,15 @@ class Frames:
     def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """What all threads run with, before and after the layout."""
         own, late = self._cerebellum, self._late
-        controller, reading = own.controller, own.reading
-        records = own.states, own.fifo.queues, own.estop.words, controller.monitors, controller.arms
-        limits = own.numbers, controller.arm_limits, controller.geometries
+        controller, reading, is_base = own.controller, own.reading, own.controller.arms is None
+        records = own.states, own.fifo.queues, own.estop.words, controller.monitors if is_base else None
         sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
-        ring = (_NO_RING, self._zeros, self._zeros, 0)
-        if late is not None and late.is_late:
-            ring = (late.ring, late.latency, late.waited, late.written)
-        return (self._world.warnings, *records, *limits, *sensors), (controller.rows, *ring, self._numbers)
+        arms: tuple[Any, ...] = (*[None] * 7, 0)
+        if not is_base:
+            arms = controller.arms, controller.arm_limits, controller.geometries, controller.rows
+            is_late = late is not None and late.is_late
+            arms += (late.ring, late.latency, late.waited, late.written) if late and is_late else self._at_once
+        return (self._world.warnings, *records, own.numbers, *sensors), arms
 
     def _take_models(self) -> None:
         """Make the simulations' models again if their fields have changed."""
@@ -474,11 +490,20 @@ class _Thread:
         self._outputs = 0
         self._lock = Lock()  # after an interruption the last frame may still be running
 
-    def run(self, ids: NDArray, models: Counts, shared: tuple[Any, Any], first_tick: int, ticks: int) -> None:
+    def run(self, *arguments: Any) -> None:
         with self._lock:
-            self._run(ids, models, shared, first_tick, ticks)
+            self._run(*arguments)
 
-    def _run(self, ids: NDArray, models: Counts, shared: tuple[Any, Any], first_tick: int, ticks: int) -> None:
+    def _run(  # noqa: PLR0917
+        self,
+        kernel: Any,
+        ids: NDArray,
+        models: Counts,
+        shared: tuple[Any, Any],
+        numbers: Counts,
+        first_tick: int,
+        ticks: int,
+    ) -> None:
         state, row = self._world.state, self._layout[0]
         if len(self._world.outputs) != self._outputs:
             for k, (name, target) in enumerate(self._world.outputs.items()):
@@ -486,6 +511,6 @@ class _Thread:
                 row["nbytes"][k] = target[0].nbytes
             self._outputs = row["outputs"] = len(self._world.outputs)
         where = self._data._address, state.ctypes.data, state.strides[0]
-        before, after = shared
-        arguments = *where, *self._fields, *before, self._layout, *after
-        run_frames.compiled(ids, models, *arguments, first_tick, ticks, _STATE)
+        before, arms = shared
+        arguments = *where, *self._fields, *before, self._layout, numbers
+        kernel.compiled(ids, models, *arguments, first_tick, ticks, _STATE, *arms)
