@@ -11,11 +11,7 @@ REASONS = "BHD_NOT_TESTED"
 
 
 def not_tested(reason: str) -> NoReturn:
-    """Skip a test because of what this machine lacks, which `make test` repeats at its end; fail it with REQUIRE=1.
-
-    Args:
-        reason: what is not tested, what it lacks, and how to have it tested.
-    """
+    """Skip a test because of what this machine lacks, which `make test` repeats at its end; fail it with REQUIRE=1."""
     if os.environ.get(REQUIRE) == "1":
         pytest.fail(reason)
     if REASONS in os.environ:

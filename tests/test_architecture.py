@@ -251,9 +251,7 @@ def test_a_folder_is_read_at_a_glance() -> None:
         ("README.md", None, set(), set(ARROWS)),
     ],
 )
-def test_a_change_concerns_the_tests_that_mirror_it_and_the_laws_of_what_may_import_it(
-    changed: str, tests: str | None, laws: set[str], no_laws: set[str]
-) -> None:
+def test_a_change_concerns_the_tests_that_mirror_it_and_the_laws_of_what_may_import_it(changed, tests, laws, no_laws):
     mirrors, packages = selection.concerned({ROOT / changed})
     assert mirrors == ({ROOT / "tests" / tests} if tests else set())
     assert laws <= packages

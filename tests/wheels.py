@@ -20,13 +20,6 @@ def install(project: Path, folder: Path) -> Path:
     """Build the wheel of a project, and install it into a new virtual environment.
 
     The environment has whatever packages this one has, but reads what the wheel holds from the wheel.
-
-    Args:
-        project: the folder of its pyproject.toml.
-        folder: where the wheel and the environment are put.
-
-    Returns:
-        The environment's interpreter.
     """
     environment = folder / "environment"
     venv.create(environment, symlinks=True)

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks._turns import GOAL_MISSED
-from benchmarks.realtime import (
-    OURS,
-    NotMeasuredError,
-    Ticks,
-    main,
-    summarise,
-)
+from benchmarks.realtime import OURS, NotMeasuredError, Ticks, main, summarise
 
 PERIOD = 1_000_000
 

@@ -13,7 +13,7 @@ import pytest
 from benchmarks._report import mean
 from benchmarks.results import page
 from benchmarks.results.rows import is_met, over_seeds, over_trainings
-from benchmarks.results.runner import REPOSITORY, FailedError, Part, Ran, Runner, write_parts
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.table import Table
 from bhd_lerobot import plugin  # noqa: F401 - registers our policies
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -59,29 +59,6 @@ def test_the_commands_of_a_section_are_those_of_the_page_and_their_options_are_v
                 read_stages(parse_aggregation(options))
     outputs = [one for command in set(listed) for one in re.findall(r"--output_dir=(\S+)", command)]
     assert len(outputs) == len(set(outputs))
-
-
-def test_a_section_shows_rows_seeds_remarks_and_each_command_once(tmp_path: Path) -> None:
-    table = Table(tmp_path)
-    table.sections = {"one": {"title": "One", "once": {}, "parts": {"one": {}}, "remarks": ["R."]}}
-    train, other = Ran("bhd-train x", 12.0, 3.0), Ran("bhd-eval y", 5.0, 100.0, "on 2020-01-02")
-    rows = [{"what": "a", "value": "1"}, {"what": "b", "value": "2", "goal": "at least 3", "met": False}]
-    parts = {"one": Part("", [Ran("bhd-record z", 1.0, 4.0)], {"rows": rows})}
-    parts |= {f"one_{seed}": Part("on 2020-01-01", [train, other, train], {"value": 1}) for seed in (0, 2)}
-    write_parts(tmp_path / "results.json", parts)
-    text, missed = page.write(table, tmp_path / "results.json")
-    assert missed == ["one: b"]
-    for line in (
-        "Made on 2020-01-02.",
-        "| a | 1 |  |  |",
-        "| b | 2 | at least 3 | **missed** |",
-        "| seed 2: processor time of all its recordings and trainings | 7 s |  |  |",
-        "Seeds 0 and 2 were made on 2020-01-01.",
-        "R.",
-        "bhd-eval y   # 5 s, 100 s of processor time",
-    ):
-        assert f"\n{line}\n" in text
-    assert text.count("bhd-train x") == 1
 
 
 @each_case(

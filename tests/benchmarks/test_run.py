@@ -68,9 +68,7 @@ def test_a_benchmark_runs_in_its_shortest_form(name: str, tmp_path: Path) -> Non
     assert status in (0, GOAL_MISSED) or (status == 2 and "Nothing was measured" in printed), printed[-3000:]
 
 
-def test_a_crash_and_a_missed_goal_have_statuses_of_their_own(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_crash_and_a_missed_goal_have_statuses_of_their_own(monkeypatch, capsys):
     statuses = {"arms": 0, "bags": GOAL_MISSED, "check": 1, "motion": -9, "wire": 2}
     assert GOAL_MISSED not in (0, 1, 2)  # of success, of an exception, and of wrong options
 

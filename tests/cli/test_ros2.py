@@ -143,9 +143,7 @@ def test_a_domain_with_nobody_is_an_error(capsys: pytest.CaptureFixture[str]) ->
             assert f"Nobody is in ROS domain {domain} on 'lo', after 0.5 s." in capsys.readouterr().err
 
 
-def test_without_cyclonedds_the_command_that_installs_it_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_cyclonedds_the_command_that_installs_it_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cyclonedds.core", None)
     assert main(["topics", "list"]) == 2
     assert "pip install -e '.[ros2]'" in capsys.readouterr().err

@@ -70,9 +70,7 @@ def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (5, "")
 
 
-def test_threads_that_wait_sleep_unless_the_environment_sets_another_policy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_that_wait_sleep_unless_the_environment_sets_another_policy(tmp_path, monkeypatch):
     program = "import os\nvalue = os.environ['OMP_WAIT_POLICY']\ndef main():\n    print(value)\n    return 0\n"
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     assert started(tmp_path, program).stdout == "PASSIVE\n"

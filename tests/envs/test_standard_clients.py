@@ -1,4 +1,4 @@
-"""What others wrote for Gymnasium's environments works on ours: Stable-Baselines3, and Gymnasium's own wrappers."""
+"""What others wrote for Gymnasium works on ours: vector wrappers, and every documented way to make an environment."""
 
 import subprocess
 import sys

@@ -59,21 +59,6 @@ def test_it_is_the_single_environments_bit_for_bit(name: str, mode: AutoresetMod
     sync.close()
 
 
-def test_images_are_those_of_the_single_environments() -> None:
-    size = {"camera_width": 32, "camera_height": 24, "beams": 36}
-    arguments = {"robot": size, "cameras": True, "task": {"duration_s": 0.3}}
-    ours = BhdVectorEnv(2, AVOID, **arguments, autoreset_mode="SameStep")
-    sync = SyncVectorEnv([lambda i=i: BhdEnv(AVOID, **arguments, first_episode=i) for i in range(2)])
-    actions = some_actions(AVOID, 2, 2)
-    for mine, theirs in zip(play(ours, actions), play(sync, actions), strict=True):
-        assert_same(mine[0], theirs[0])
-    final = ours.step(actions[0])[4]["final_obs"][0]
-    assert final["pixels"]["front"].shape == (24, 32, 3)
-    assert final["pixels"]["front"].std() > 0
-    ours.close()
-    sync.close()
-
-
 def test_environments_run_different_episodes_that_follow_from_the_seed() -> None:
     env = make(task={"duration_s": 0.1}, autoreset_mode="SameStep")
     seen = [env.reset(seed=10)[1]["episode_index"].tolist()]

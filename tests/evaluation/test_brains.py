@@ -8,11 +8,7 @@ from bhd_lerobot.errors import ConfigError
 from tests.evaluation.test_evaluate import FAILING, results, run_eval
 from tests.recording.support import save_lidar_policy
 
-LIVE = {
-    "robot__clock": "realtime",
-    "robot__realtime__brain_timeout_s": 20,
-    "robot__realtime__most_misses": 10**6,
-}
+LIVE = {"robot__clock": "realtime", "robot__realtime__brain_timeout_s": 20, "robot__realtime__most_misses": 10**6}
 
 
 @pytest.fixture(scope="module")

@@ -55,15 +55,9 @@ def test_one_brain_has_a_short_form():
         ([*TWO, "--episodes=[]"], "at least one episode"),
         ([*TWO, "--episodes=[1,1]"], "none twice"),
         ([*TWO, "--record.root=somewhere"], "record.repo_id is not"),
-        (
-            [*BASE, "--brain.type=avoidance", "--plan=true"],
-            "'avoidance' is the only brain: nothing is compared.",
-        ),
+        ([*BASE, "--brain.type=avoidance", "--plan=true"], "'avoidance' is the only brain: nothing is compared."),
         ([*TWO, "--only=[old]", "--sequential=true"], "'old' is the only brain: nothing is compared. Add one"),
-        (
-            [*TWO, "--only=[old]", "--baseline=new", "--sequential=true"],
-            "baseline is 'new', which only leaves out.",
-        ),
+        ([*TWO, "--only=[old]", "--baseline=new", "--sequential=true"], "baseline is 'new', which only leaves out."),
         ([*TWO, "--plan=true", "--baseline=never"], "Unknown brain in baseline 'never'"),
         ([*TWO, "--sequential=true", "--engine=ray"], "Use --engine=local"),
         ([*TWO, "--fps=20"], "set --robot.fps instead"),

@@ -133,9 +133,7 @@ def test_the_report_has_returns_where_there_are_no_scores(compared: Compared, tm
 
 
 @pytest.mark.parametrize("finished", [0, 2])
-def test_a_signal_ends_the_run_with_the_batches_that_are_finished(
-    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_signal_ends_the_run_with_the_batches_that_are_finished(finished, tmp_path, monkeypatch, capsys):
     step = LineEnv.step
 
     def pressed(self: LineEnv, action: Any) -> Any:
@@ -155,9 +153,7 @@ def test_a_signal_ends_the_run_with_the_batches_that_are_finished(
     assert "Stopped by SIGTERM: the results are partial" in capsys.readouterr().err
 
 
-def test_an_environment_that_reports_no_success_is_warned_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_environment_that_reports_no_success_is_warned_of(tmp_path, monkeypatch, capsys):
     """LeRobot counts its episodes as successes."""
     step = LineEnv.step
     monkeypatch.setattr(LineEnv, "step", lambda self, action: (*step(self, action)[:4], {}))
@@ -168,9 +164,7 @@ def test_an_environment_that_reports_no_success_is_warned_of(
 
 
 @pytest.mark.parametrize("finished", [0, 2])
-def test_an_environment_that_fails_is_named_with_the_brain(
-    finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_environment_that_fails_is_named_with_the_brain(finished, tmp_path, monkeypatch, capsys):
     """What was finished before is kept."""
     step = LineEnv.step
 
@@ -209,9 +203,7 @@ def test_an_environment_that_fails_is_named_with_the_brain(
         (BHD, "its actions have 1 numbers, and those of the environment 2"),
     ],
 )
-def test_what_cannot_run_is_refused(
-    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_run_is_refused(options, message, tmp_path, capsys):
     path = save(tmp_path / "policy", 1, 2, [0.0], [1.0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "gym_pusht", None)  # as if it were not installed

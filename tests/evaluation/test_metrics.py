@@ -100,18 +100,6 @@ def test_latched_stops_are_counted():
         assert (metrics.estops, metrics.faults) == (stops, faults)
 
 
-def test_what_is_plain_is_plain_and_complete():
-    metrics = measured(episode(np.zeros((4, 2)), Event.WRONG_OBJECT, {"problem": "there are two cups"}))
-    plain = metrics.plain()
-    assert plain["seed"] == str(2**62 + 1)  # a number would lose digits in other programs
-    assert plain["outcome"] == "wrong_object"
-    assert plain["problem"] == "there are two cups"
-    assert plain["reward"] == 1.0
-    assert plain["length_s"] == 0.4
-    assert "wall" not in plain
-    assert measured(episode(np.zeros((4, 2)), plan={"problem": "solved in the end"})).problem == ""
-
-
 def test_digests_tell_different_episodes_apart():
     one, same = episode(np.zeros((4, 2))), episode(np.zeros((4, 2)))
     other = episode(np.zeros((4, 2)))

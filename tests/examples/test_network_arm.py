@@ -69,12 +69,7 @@ except BhdError as error:
 
 
 class Arm:
-    """The arm's process.
-
-    Attributes:
-        address: where it is.
-        process: the process.
-    """
+    """The arm's process."""
 
     def __init__(self, *options: str) -> None:
         command = [sys.executable, str(EXAMPLE / "network_arm.py"), "--port=0", "--watchdog=1.0", *options]
@@ -153,9 +148,7 @@ def test_it_is_recorded(arms: Callable[[], Arm], installed: list[str], tmp_path:
         Replay(root, 0)
 
 
-def test_its_death_ends_the_episode_with_the_reason(
-    arms: Callable[[], Arm], installed: list[str], tmp_path: Path
-) -> None:
+def test_its_death_ends_the_episode_with_the_reason(arms, installed, tmp_path):
     # The time is over before the tool has been at the target for so long: the next episode goes on until it is ended.
     longer = ("--task.hold_s=500", "--task.duration_s=600", "--task.start_spread_rad=0", "--dataset.num_episodes=2")
     for number in itertools.count():
@@ -205,10 +198,7 @@ def _block(name: str) -> Any:
 @pytest.mark.usefixtures("installed")
 def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", ALONE, network_arm.address],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, "-c", ALONE, network_arm.address], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert process.stdin is not None
     assert process.stdout is not None

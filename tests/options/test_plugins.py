@@ -16,11 +16,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options import plugins
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.brain import BrainConfig
-from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import TaskConfig
 from tests.cases import each_case
 from tests.recording.support import options
@@ -109,19 +105,6 @@ def test_a_brain_that_is_not_derived_from_the_base_class_is_refused(installer) -
     assert "brain 'plain', Mine, is not derived from bhd_lerobot.ConfiguredBrain" in text
     assert "write class Mine(bhd.ConfiguredBrain)" in text
     assert "plain" not in registry.brains_for("turtlebot3")
-
-
-def test_a_robot_has_the_parts_of_its_options_and_its_type_those_that_it_has_by_default(monkeypatch: Any) -> None:
-    config = UR5Config()
-    assert registry.parts_of(config) == registry.parts_of("ur5") == {bhd.Arm, bhd.GripperSpec}
-    assert registry.robots_with({bhd.Drive, bhd.LidarSpec}) == ["turtlebot3"]
-    assert not registry.parts_of("so101_follower")
-    base = TurtleBot3Config().body()
-    monkeypatch.setattr(config, "body", lambda: base, raising=False)
-    assert registry.parts_of(config) == {bhd.Drive, bhd.LidarSpec}
-    assert registry.drives(GapFollowerConfig(), config)
-    with pytest.raises(ConfigError, match=r"which needs an arm; robot\.type is 'ur5', which has none\. Valid: ur5"):
-        registry.check_task(ReachConfig(), config)
 
 
 @each_case(

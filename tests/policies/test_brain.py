@@ -38,10 +38,7 @@ def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) 
     assert_allclose(np.unwrap(angles), 2 * np.pi * np.arange(beams) / beams, atol=1e-12)
 
 
-@each_case(
-    "names",
-    [(), ("x.vel", "theta.vel"), ("scan_000.pos", "x.vel", "scan_001.pos"), ("scan_000.vel",)],
-)
+@each_case("names", [(), ("x.vel", "theta.vel"), ("scan_000.pos", "x.vel", "scan_001.pos"), ("scan_000.vel",)])
 def test_no_scan_or_a_torn_one_is_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="'rule' needs a range scan"):
         find_scan(names, "rule")

@@ -139,11 +139,7 @@ def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(kind: str, options: 
         ("bhd_mlp", {"residual": ["a.pos"], "residual_columns": [1]}, "residual_columns"),
         ("bhd_mlp", {"scan": {"transform": "log", "start": 4, "beams": 8}}, "10 columns"),
         ("bhd_cnn", {"range_minimum": 4.0}, "policy.range_minimum is 4.0"),
-        (
-            "bhd_cnn",
-            {"camera": "rear"},
-            "no 'observation.images.rear'. It has observation.images.front. Record",
-        ),
+        ("bhd_cnn", {"camera": "rear"}, "no 'observation.images.rear'. It has observation.images.front. Record"),
         ("bhd_cnn", {"shape": (3, 8, 24)}, "are 24 x 8 px; bhd_cnn needs at least 16"),
         ("bhd_cnn", {"names": cnn.NAMES[:-3]}, "no 'x.pos'. Record it with --robot.odometry=true"),
         ("bhd_cnn", {"names": ["x.vel", *cnn.NAMES[-3:]]}, "range scan"),
@@ -152,11 +148,7 @@ def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(kind: str, options: 
         ("bhd_pixels", {"ignored_columns": []}, "matches no number of observation.state"),
         ("bhd_pixels", {"camera": "wrist"}, "the dataset has no 'observation.images.wrist'"),
         ("bhd_perception", {"camera": "wrist"}, "policy.camera is 'wrist', and the dataset has no"),
-        (
-            "bhd_perception",
-            {"camera_position": [0.0, 0.0]},
-            "policy.camera_position is [0.0, 0.0]; it must be 3",
-        ),
+        ("bhd_perception", {"camera_position": [0.0, 0.0]}, "policy.camera_position is [0.0, 0.0]; it must be 3"),
         (
             "bhd_perception",
             {"camera_position": [0.37, 0.02, 1.0], "camera_target": [0.37, 0.02, 0.0]},

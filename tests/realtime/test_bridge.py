@@ -28,10 +28,7 @@ class Rig:
 
     def __init__(self) -> None:
         self.now = 5 * 10**12
-        sizes = {
-            "requests": Mailbox.nbytes(request_dtype(0)),
-            "events": Mailbox.nbytes(EVENT_DTYPE),
-        }
+        sizes = {"requests": Mailbox.nbytes(request_dtype(0)), "events": Mailbox.nbytes(EVENT_DTYPE)}
         self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY.drive, 1, HZ))
         own = {name: np.asarray(value) for name, value in vars(self.cerebellum.state(0)).items()}
         numbers = [("tick", np.int64), ("due_ns", np.int64)]

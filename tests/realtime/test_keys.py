@@ -31,9 +31,7 @@ def is_taken(device: int) -> bool:
     return not termios.tcgetattr(device)[3] & (termios.ICANON | termios.ECHO)
 
 
-def test_the_emergency_stop_comes_first_and_others_cannot_disable_it(
-    terminal: Terminal, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_emergency_stop_comes_first_and_others_cannot_disable_it(terminal, capsys):
     person, device = terminal
     source = key_source(device)
     assert source is not None

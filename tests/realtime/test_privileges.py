@@ -30,13 +30,7 @@ from tests.cases import each_case
 
 FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 NAMES = ["collector", "memory lock", "cpu latency", "timer slack", "scheduler"]
-INITIAL = {
-    "scheduler": (os.SCHED_OTHER, 0),
-    "affinity": {0, 1, 2},
-    "slack": 50_000,
-    "locked": 0,
-    "latency": None,
-}
+INITIAL = {"scheduler": (os.SCHED_OTHER, 0), "affinity": {0, 1, 2}, "slack": 50_000, "locked": 0, "latency": None}
 
 
 class FakeKernel(SystemCalls):
@@ -195,9 +189,7 @@ NICE, LOCK, INFINITE = (CAP_SYS_NICE,), (CAP_IPC_LOCK,), resource.RLIM_INFINITY
         (FakeKernel("cpu latency", MEMORY), {"require": True}, {"cpu latency", MEMORY}, ("not permitted",)),
     ],
 )
-def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(
-    kernel: FakeKernel, settings: dict[str, Any], refused: set[str], parts: tuple[str, ...]
-) -> None:
+def test_a_refusal_is_reported_with_its_remedy_and_stops_nothing_else(kernel, settings, refused, parts):
     with Privileges(kernel) as privileges:
         grants = privileges.acquire(RealtimeSettings(freeze_collector=False, **settings))
         assert {grant.name for grant in grants if not grant.granted} == refused

@@ -1,3 +1,4 @@
+from dataclasses import asdict
 from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
@@ -30,6 +31,17 @@ def test_overruns_and_maxima_are_exact(ticks: list[tuple[int, int]]) -> None:
     assert summary.lateness_max == max(0, late.max()) / 1e9
     assert summary.duration_max == long.max() / 1e9
     assert 0 <= summary.lateness_p50 <= summary.lateness_p99 <= summary.lateness_max
+
+
+def test_a_punctual_loop_is_punctual() -> None:
+    statistics = TimingStatistics(PERIOD)
+    nothing = asdict(statistics.summary())
+    assert [nothing.pop(name) for name in ("period", "clock", "tolerated")] == [PERIOD / 1e9, "lockstep", {}]
+    assert set(nothing.values()) == {0}
+    statistics.add_punctual(1000)
+    summary = statistics.summary()
+    assert (summary.ticks, summary.overruns) == (1000, 0)
+    assert (summary.lateness_p50, summary.lateness_p99, summary.lateness_max) == (0, 0, 0)
 
 
 TICKS = st.lists(st.tuples(st.integers(0, PERIOD - 1), st.integers(0, 20_000_000), st.integers(0, 4)), max_size=40)
@@ -100,9 +112,7 @@ def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
 
 
 @given(TICKS, TICKS)
-def test_what_is_counted_since_a_copy_is_what_came_after_it(
-    before: list[tuple[int, int, int]], after: list[tuple[int, int, int]]
-) -> None:
+def test_what_is_counted_since_a_copy_is_what_came_after_it(before, after):
     since, alone = on_grid([*before, *after]).since(on_grid(before)).summary(), on_grid(after).summary()
     for name in ("ticks", "overruns", "skipped"):
         assert getattr(since, name) == getattr(alone, name)

@@ -92,9 +92,7 @@ REACH = {
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("robot", [{**AVOID, **TURNS}, REACH], ids=["avoid", "reach"])
-def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_exactly(
-    tmp_path: Path, robot: dict[str, Any]
-) -> None:
+def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_exactly(tmp_path, robot):
     one, many = tmp_path / "one", tmp_path / "many"
     run_record(one, **robot)
     run_record(many, **robot, n_envs=8)
@@ -195,9 +193,7 @@ def test_what_ends_an_episode_is_not_overwritten() -> None:
     assert flagged(event, taken).tolist() == [0, Event.INTERVENTION, Event.SUCCESS, Event.COLLISION]
 
 
-def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in_place_of_what_was_done(
-    tmp_path: Path,
-) -> None:
+def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in_place_of_what_was_done(tmp_path):
     driven, alone, both = tmp_path / "driven", tmp_path / "alone", tmp_path / "both"
     run_record(driven, **AVOID, brain__patience_s=1, dataset__num_episodes=2, dataset__expert_action=True)
     columns = {key: np.array(values) for key, values in data_columns(driven).items()}
@@ -234,9 +230,7 @@ EXPERTS = {
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("expert", EXPERTS)
-def test_every_rule_that_gives_setpoints_says_what_it_would_do_where_it_did_not_choose_to_be(
-    expert: str, tmp_path: Path
-) -> None:
+def test_every_rule_that_gives_setpoints_says_what_it_would_do_where_it_did_not_choose_to_be(expert, tmp_path):
     common = {**EXPERTS[expert], "dataset__expert_action": True, "dataset__episode_time_s": 1.6}
     brains = {"brain__type": "dagger", "brain__learner__type": "noop", "brain__expert__type": expert}
     turns = {"brain__patience_s": 0.4, "brain__hold_s": 0.4, "brain__collision_s": None, "brain__stall_s": None}

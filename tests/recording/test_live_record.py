@@ -32,11 +32,7 @@ from tests.recording.support import data_columns, options, run_record, saved
 from tests.robots.host.support import is_alive, is_gone, unique
 from tests.waiting import until
 
-LIVE = {
-    "robot__clock": "realtime",
-    "robot__realtime__brain_timeout_s": 20,
-    "robot__realtime__most_misses": 10**6,
-}
+LIVE = {"robot__clock": "realtime", "robot__realtime__brain_timeout_s": 20, "robot__realtime__most_misses": 10**6}
 ARM = {"robot__type": "ur5", "robot__beams": None, "brain__type": "pick", "task__type": "pick"}
 
 

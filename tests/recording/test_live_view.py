@@ -196,9 +196,7 @@ def test_a_viewer_that_disappears_does_not_delay_the_end_of_the_run(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("ip", "port", "compress"), [(None, None, False), ("10.0.0.1", 9876, True)])
-def test_images_over_a_network_are_compressed(
-    sent: Helpers, robot: Simulation, ip: str | None, port: int | None, compress: bool
-) -> None:
+def test_images_over_a_network_are_compressed(sent, robot, ip, port, compress):
     view = LiveView(display(display_ip=ip, display_port=port), robot)
     view(0, columns(robot))
     view.close()
@@ -218,9 +216,7 @@ def test_half_an_address_is_refused(wrong: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("mode", "package"), [("rerun", "rerun-sdk"), ("foxglove", "foxglove-sdk")])
-def test_a_package_that_is_missing_is_named_before_anything_starts(
-    mode: str, package: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_package_that_is_missing_is_named_before_anything_starts(mode, package, monkeypatch, tmp_path):
     find: Callable[..., Any] = module.importlib.util.find_spec
     missing = PACKAGES[mode][1]
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None if name == missing else find(name))

@@ -32,9 +32,7 @@ PLUGIN = "--robot.discover_packages_path=tests.robots.external.mock_devices"
 
 
 @pytest.mark.parametrize("fault_at", [1, 2])
-def test_a_fault_at_the_first_frame_has_its_status_a_summary_and_a_hint_and_leaves_no_dataset(
-    tmp_path: Path, fault_at: int
-) -> None:
+def test_a_fault_at_the_first_frame_has_its_status_a_summary_and_a_hint_and_leaves_no_dataset(tmp_path, fault_at):
     root = tmp_path / "d"
     result, text = run(root, robot__fault="disconnect", robot__fault_at=fault_at)
     text = " ".join(text.split())
@@ -57,9 +55,7 @@ def test_a_leader_that_cannot_be_connected_leaves_no_dataset(tmp_path: Path, mon
     assert not (tmp_path / "d").exists()
 
 
-def test_an_emergency_stop_while_the_robot_connects_counts_and_claims_no_episode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_emergency_stop_while_the_robot_connects_counts_and_claims_no_episode(tmp_path, monkeypatch):
     connect = MockArm.connect
 
     def pressed(self: MockArm, calibrate: bool = True) -> None:
@@ -75,9 +71,7 @@ def test_an_emergency_stop_while_the_robot_connects_counts_and_claims_no_episode
     assert not (tmp_path / "d").exists()
 
 
-def test_the_announced_signal_ends_nothing_after_the_last_episode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_announced_signal_ends_nothing_after_the_last_episode(tmp_path, monkeypatch):
     disconnect = MockArm.disconnect
 
     def late(self: MockArm) -> None:
@@ -192,9 +186,7 @@ def test_a_rate_is_said_and_a_hiccup_is_none(gaps: dict[int, int], is_said: bool
     assert ("20 of 30 frames/s" in status.line().plain) == is_said
 
 
-def test_an_encoder_that_is_too_slow_holds_up_no_frame_and_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_encoder_that_is_too_slow_holds_up_no_frame_and_is_named(tmp_path, monkeypatch):
     put = EncoderProcess.put_image
     asked: dict[int, int] = {}
 

@@ -23,16 +23,6 @@ ALL = np.array([True, True])
 NOTHING = np.zeros(2, np.int64)
 
 
-def test_an_outcome_is_handed_over_once() -> None:
-    marks = Marks(2)
-    marks.outcome("dropped", 1)
-    event, driven = marks.frame(NOTHING, ALL)
-    assert event.tolist() == [Event.NOTHING, Event.DROPPED]
-    assert not driven.any()
-    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
-    assert NOTHING.tolist() == [0, 0]
-
-
 def test_it_waits_for_its_simulation_and_not_for_the_next_episode() -> None:
     marks = Marks(2)
     marks.outcome("success", 1)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.rollout import plots
@@ -25,13 +24,3 @@ def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeyp
     monkeypatch.setattr(plots, "draw_trajectories", lambda trajectories, path, heading: headings.append(heading))
     album.draw(tmp_path / "t.png", "20 episodes")
     assert headings == ["20 episodes; 5 of them, failures before others"]
-
-
-def test_a_divergence_of_zero_is_drawn_as_such(tmp_path):
-    arena = make_arena("empty", 0)
-    xy = np.zeros((5, 2))
-    path = tmp_path / "d.png"
-    curves = {"position [m]": np.zeros(5)}
-    time = np.arange(5) / 10
-    plots.draw_divergence(scene=arena, recorded=xy, replayed=xy, time=time, curves=curves, heading="same", path=path)
-    assert np.asarray(Image.open(path)).std() > 1

@@ -35,18 +35,6 @@ def test_a_punctual_episode_has_no_late_frame(frames: int) -> None:
     assert not late.any()
 
 
-@pytest.mark.parametrize(
-    ("column", "limit"),
-    [("lateness", PERIOD_S / 2), ("age", FRAME_S), ("skipped", 0), ("lateness", float("inf")), ("age", float("nan"))],
-)
-def test_exactly_the_frame_beyond_a_default_is_late(column: str, limit: float) -> None:
-    above = np.nextafter(np.float32(limit), np.float32(np.inf)) if column != "skipped" else 1
-    if np.isfinite(limit):
-        assert not late_frames(changed(column, 4, limit), TimingTolerance(), RATES).any()
-    late = late_frames(changed(column, 4, above), TimingTolerance(), RATES)
-    assert np.flatnonzero(late).tolist() == [4]
-
-
 @pytest.mark.parametrize("limit", [1e-3, 0.0025, 1 / 3, 0.1])
 def test_a_limit_does_not_turn_itself_away_in_single_precision(limit: float) -> None:
     tolerance = TimingTolerance(max_lateness_s=limit, max_age_s=limit)
@@ -73,9 +61,7 @@ def test_a_frame_out_of_place_is_late_and_so_is_the_one_after(shift: float, late
     hnp.arrays(np.int64, 30, elements=st.integers(0, 3)),
     st.tuples(st.floats(1e-4, 0.1), st.floats(1e-3, 0.1), st.integers(0, 3)),
 )
-def test_flags_are_set_where_a_limit_is_violated_and_nowhere_else(
-    times: np.ndarray, skipped: np.ndarray, limits: tuple[float, float, int]
-) -> None:
+def test_flags_are_set_where_a_limit_is_violated_and_nowhere_else(times, skipped, limits):
     lateness, age = times
     tolerance = TimingTolerance(max_lateness_s=limits[0], max_age_s=limits[1], max_skipped=limits[2])
     late = late_frames(FrameTiming(np.arange(30) * FRAME_S, age, lateness, skipped), tolerance, RATES)

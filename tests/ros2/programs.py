@@ -28,18 +28,11 @@ from tests.waiting import until
 
 BOOL, STATE = "std_msgs/msg/Bool", "bhd_interfaces/msg/CerebellumState"
 
-RELAXED = (
-    "--robot.realtime.brain_timeout_s=20",
-    "--robot.realtime.most_misses=1000000",
-)
+RELAXED = ("--robot.realtime.brain_timeout_s=20", "--robot.realtime.most_misses=1000000")
 
 
 class Program:
-    """A program of ours, running from `with` to its end.
-
-    Attributes:
-        log: what it prints.
-    """
+    """A program of ours, running from `with` to its end."""
 
     def __init__(self, main: Callable[..., int], *arguments: Any, log: Path) -> None:
         self._main, self._arguments, self.log = main, arguments, log
@@ -198,11 +191,7 @@ def _record(options: list[str], starts: Path) -> int:
 
 
 class Recording(Program):
-    """`bhd-record` of a robot on the network.
-
-    Attributes:
-        root: the dataset.
-    """
+    """`bhd-record` of a robot on the network."""
 
     def __init__(self, robot: str, *options: str, domain: int, folder: Path, silence_s: float = 5) -> None:
         self.root, self._starts = folder / "dataset", folder / "starts"

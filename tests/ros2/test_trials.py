@@ -48,12 +48,7 @@ def test_the_avoidance_node_drives_the_served_robot_without_contact(domain: int,
     assert ticks > 100 * seconds
 
 
-DRIVE = (
-    "--task.type=free",
-    "--task.instruction=drive",
-    "--task.duration_s=3",
-    "--brain.type=avoidance",
-)
+DRIVE = ("--task.type=free", "--task.instruction=drive", "--task.duration_s=3", "--brain.type=avoidance")
 PILLAR = "--pose=0.0:-0.6:0"  # a pillar is 0.9 m ahead, to the left
 
 
@@ -118,11 +113,7 @@ def test_what_is_recorded_is_what_the_robot_measured_and_was_sent(domain: int, t
 def check_source(
     values: np.ndarray, times: np.ndarray, messages: np.ndarray, lines: list[dict[str, Any]], *, atol: float
 ) -> list[int]:
-    """Check that each frame has the values of a message that was measured before its time, and that none goes back.
-
-    Returns:
-        Which message each frame has.
-    """
+    """Check that each frame has the values of a message that was measured before its time, and that none goes back."""
     measured = np.array([line["monotonic"] for line in lines])
     used: list[int] = []
     for value, moment in zip(values, times, strict=True):
@@ -143,9 +134,7 @@ KILLED = {  # a part of its command line, None for bhd-record itself; what is sa
 
 @pytest.mark.parametrize("killed", KILLED)
 @pytest.mark.thorough(but=1)
-def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(
-    killed: str, domain: int, tmp_path: Path
-) -> None:
+def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(killed, domain, tmp_path):
     part, cause = KILLED[killed]
     log = tmp_path / "robot.jsonl"
     with (
@@ -210,9 +199,7 @@ def talk(arm: Side) -> Callable[..., list[tuple[bool, str]]]:
     return send
 
 
-def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate(
-    arm: Side, talk: Callable[..., list[tuple[bool, str]]]
-) -> None:
+def test_each_goal_of_a_brain_gets_exactly_one_result_and_the_state_has_its_rate(arm, talk):
     bad = {
         goal(3.0, 0.0, 0.3): "too far away",
         goal(math.nan, 0.0, 0.3): "must be finite",
@@ -254,9 +241,7 @@ STOPPED = {  # what happens to the driver or to a process of ours; what is print
 
 @pytest.mark.parametrize("what", STOPPED)
 @pytest.mark.thorough
-def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cause(
-    what: str, domain: int, tmp_path: Path
-) -> None:
+def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cause(what, domain, tmp_path):
     options, cause = STOPPED[what]
     log = tmp_path / "robot.jsonl"
     move = ("--task.type=free", "--task.instruction=move", "--task.duration_s=2", "--brain.type=random")

@@ -78,18 +78,6 @@ def test_less_than_a_tenth_of_a_metre_in_ten_seconds_is_stuck(step: float, stuck
     assert run.frames[0] == (stuck_after or 250)
 
 
-def test_a_critic_is_told_how_near_being_stuck_is_how_far_it_came_and_the_score() -> None:
-    run = Run(AvoidConfig(min_path_m=2.0))
-    while run.running[0]:
-        run.frame(on_circle(min(run.frames[0], 80), 0.2))  # 1.6 m, then it stands still
-        stuck, path, score = run.task.privileged_state()[0]
-        assert score == run.outcome().score
-        if run.frames[0] >= 100:
-            assert (stuck < 1.0) == (run.events[0] == Event.STUCK)
-    assert run.frames[0] > 160
-    assert path == pytest.approx(0.8, rel=1e-3)
-
-
 def test_stuck_is_about_the_last_ten_seconds_wherever_they_begin() -> None:
     run = Run(AvoidConfig())
     for frame in range(1, 400):

@@ -90,9 +90,7 @@ def test_a_distance_that_no_arena_has_is_refused_with_what_it_has() -> None:
     st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3),
     st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
 )
-def test_turning_and_moving_the_world_changes_nothing_in_the_robots_frame(
-    places: list[float], angles: list[float], shift: tuple[float, float]
-) -> None:
+def test_turning_and_moving_the_world_changes_nothing_in_the_robots_frame(places, angles, shift):
     goal, pose = np.array([[*places[:2], angles[0]]]), np.array([[*places[2:], angles[1]]])
     turn = angles[2]
 
@@ -150,6 +148,15 @@ def test_the_tolerances_are_the_borders(off: tuple[float, float, float], event: 
     drive_to_goal(run)
     run.until_done((GOAL[0] + off[0], GOAL[1] + off[1], GOAL[2] + off[2]))
     assert run.events[0] == event
+
+
+def test_a_touch_is_a_collision_before_all_else() -> None:
+    run = Run(NavigateConfig(hold_s=0.1))
+    drive_to_goal(run)
+    run.frame(GOAL)
+    run.frame(GOAL, touched=True)
+    assert run.events[0] == Event.COLLISION
+    assert run.outcome().score == 0
 
 
 def test_the_end_of_time_is_a_time_out_and_standing_still_is_stuck() -> None:

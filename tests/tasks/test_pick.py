@@ -4,14 +4,12 @@ import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
@@ -20,13 +18,7 @@ from bhd_lerobot.options.parse import parse as parse_configuration
 from bhd_lerobot.policies.language.instruction import parse
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.tasks.pick import (
-    HELD_OUT_INSTRUCTIONS,
-    HELD_OUT_NAMES,
-    INSTRUCTIONS,
-    PickConfig,
-    PickTask,
-)
+from bhd_lerobot.tasks.pick import HELD_OUT_INSTRUCTIONS, HELD_OUT_NAMES, INSTRUCTIONS, PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
@@ -121,9 +113,7 @@ NARROW = replace(
 @each_case(
     ("body", "table", "fits"), [(ur5(), (0.35, -0.3, 0.65, 0.3), MAX_OPENING - 0.008), (NARROW, NARROW_TABLE, 0.06)]
 )
-def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(
-    body: Body, table: tuple[float, ...], fits: float, randomisation: RandomisationConfig
-) -> None:
+def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(body, table, fits, randomisation):
     task = PickTask(PickConfig(randomisation=randomisation), 1, FPS, body)
     counts = set()
     for seed in range(150):
@@ -159,32 +149,6 @@ def test_every_object_can_be_grasped_without_touching_another(randomisation: Ran
 def test_the_number_of_objects_is_that_of_the_configuration(least: int, most: int) -> None:
     task = PickTask(PickConfig(min_objects=least, max_objects=most), 1, FPS)
     assert {len(task.sample(seed).objects) for seed in range(60)} == set(range(least, most + 1))
-
-
-def test_the_environment_state_is_what_its_names_say() -> None:
-    task = PickTask(PickConfig(), 2, FPS)
-    empty = TableScene("pick", SCENE.objects[:1], SCENE.posture, target_object=0)
-    task.begin(np.array([0, 1]), [SCENE, empty])
-    truth = truth_of([SCENE, empty])
-    truth.object_poses[0, 1, :3] = 0.45, 0.21, 0.15  # lifted, in the base frame
-    state = task.environment_state(truth)
-    assert state.shape == (2, len(task.environment_names)) == (2, MAX_OBJECTS * len(OBJECT_FIELDS))
-    reported = [dict(zip(task.environment_names, row.tolist(), strict=True)) for row in state]
-
-    def of(sim: int, number: int, *names: str) -> list[float]:
-        return [reported[sim][f"object_{number}_{name}"] for name in names]
-
-    assert of(0, 0, "present", "target", "box") == [1, 0, 0]
-    assert of(0, 1, "present", "target", "box") == [1, 1, 1]
-    assert of(0, 3, "present", "target", "box") == [0, 0, 0]
-    assert of(0, 1, "x", "y", "z") == [0.45, 0.21, 0.15]
-    assert of(0, 1, "qw", "qx", "qy", "qz") == pytest.approx([math.cos(0.35), 0, 0, math.sin(0.35)])
-    assert of(0, 1, "length", "width", "height") == pytest.approx([0.08, 0.06, 0.06])
-    red, green, _ = COLOURS["blue"]
-    assert of(0, 1, "red", "green", "blue") == pytest.approx([red + 0.05, green - 0.2, 1.0])  # at most 1
-    for sim, number in ((0, 3), (0, 4), (1, 1), (1, 4)):
-        assert of(sim, number, *OBJECT_FIELDS) == [0] * 6 + [1] + [0] * 9
-    assert of(1, 0, "present", "target") == [1, 1]
 
 
 def test_a_smaller_table_leaves_nothing_of_a_larger_one() -> None:
@@ -328,22 +292,3 @@ def test_objects_that_were_not_seen_are_of_no_size_style_or_shade_that_was() -> 
         assert 2 * min(one.size_x, one.size_y) <= 0.076, "it fits between the fingers"
         seen = np.clip(np.add(COLOURS[one.colour], one.shade), 0, 1)
         assert min(COLOURS, key=lambda name: math.dist(seen, COLOURS[name])) == one.colour
-
-
-@each_case(
-    ("options", "message"),
-    [
-        ({"language": "de"}, r"task.language 'de'.*Valid: any, en, zh"),
-        ({"wording": "other"}, r"task.wording.*Valid: held_out, known"),
-        ({"names": "some"}, r"task.names.*Valid: any, held_out, known"),
-        ({"objects": "new"}, r"task.objects.*Valid: known, unseen"),
-        ({"order": "none"}, r"task.order.*Valid: random, target"),
-        *(
-            ({"min_objects": least, "max_objects": most}, f"min_objects is {least} and task.max_objects is {most}")
-            for least, most in ((0, 3), (1, 6), (3, 2), (-1, -1))
-        ),
-    ],
-)
-def test_what_cannot_be_honoured_is_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        PickConfig(**options)

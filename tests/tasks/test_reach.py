@@ -1,7 +1,6 @@
 """The reach task: scenes that can be done, and its judge on made-up truth."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene, Variation
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event
+from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.tasks.support import Judged
 
 FPS = 20
@@ -71,17 +71,13 @@ def test_every_target_can_be_reached_and_every_start_is_free() -> None:
     assert (spread > [0.4, 0.7, 0.4]).all()  # all over the box, not in one corner of it
 
 
-def test_targets_are_in_the_workspace_of_the_arm_and_starts_around_its_home() -> None:
-    low, high = np.array([[0.3, 0.1, 0.2], [0.5, 0.3, 0.4]])
-    home = (*(angle + 0.2 for angle in ARM.arm.home[:6]), 0.05)
-    workspace = replace(ARM.arm.workspace, tool=(tuple(low), tuple(high)))
-    body = replace(ARM, arm=replace(ARM.arm, home=home, workspace=workspace))
-    task = ReachTask(ReachConfig(), 1, FPS, body)
-    for seed in range(20):
-        scene = task.sample(seed)
-        assert ((np.array(scene.target_pose[:3]) >= low) & (np.array(scene.target_pose[:3]) <= high)).all()
-        assert np.abs(np.array(scene.posture[:6]) - home[:6]).max() <= 0.3
-        assert scene.posture[6] == 0.05
+def test_randomisation_changes_the_world_and_not_the_task() -> None:
+    plain = ReachTask(ReachConfig(), 1, FPS)
+    wild = ReachTask(ReachConfig(randomisation=RandomisationConfig(enabled=True)), 1, FPS)
+    for seed in range(5):
+        one, two = plain.sample(seed), wild.sample(seed)
+        assert (one.target_pose, one.posture) == (two.target_pose, two.posture)
+        assert one.variation == Variation() != two.variation
 
 
 def test_without_spread_it_starts_at_home() -> None:

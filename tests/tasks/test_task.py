@@ -197,9 +197,7 @@ def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late(name: str) ->
 @each_case("name", HELD)
 @each_case("touch", ["arm_on_table", "self_contact", "arm_on_object"])
 @each_case("when", ["at once", "at success", "at the end"])
-def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(
-    name: str, touch: str, when: str
-) -> None:
+def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(name, touch, when):
     task = HELD[name]
     run = task.run(task.config(duration_s=2.0, hold_s=0.5))
     frames = {"at once": 1, "at success": run.task.in_frames(0.5), "at the end": run.task.in_frames(2.0)}[when]

@@ -195,6 +195,17 @@ def test_a_move_that_is_none_or_would_not_be_honoured_is_refused(values: tuple[d
         RandomisationConfig(**{"enabled": True, **options})
 
 
+def test_a_range_without_randomisation_is_refused_unless_it_is_switched_off() -> None:
+    for name in RANGES:
+        range_ = {name: 0.04}
+        more = {"latency_s": 0.05} if name == "latency_min_s" else {}
+        with pytest.raises(ConfigError, match=r"randomisation\.\w+ is 0\.0\d, but randomisation\.enabled is not set"):
+            RandomisationConfig(**range_, **more)
+        off = RandomisationConfig(enabled=False, **range_, **more)
+        assert off == RandomisationConfig(), "what is recorded is what was in force"
+        assert off.enabled is False
+
+
 def test_a_range_on_top_of_a_shipped_configuration_is_used_or_refused() -> None:
     asked = set()
     for path in sorted((Path(__file__).resolve().parents[2] / "configs" / "record").glob("*.yaml")):

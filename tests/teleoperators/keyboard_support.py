@@ -24,11 +24,7 @@ class Clock:
 
 
 class Person:
-    """Somebody in front of a terminal.
-
-    Attributes:
-        device: the program's end of the terminal.
-    """
+    """Somebody in front of a terminal."""
 
     def __init__(self) -> None:
         self._end, self.device = pty.openpty()

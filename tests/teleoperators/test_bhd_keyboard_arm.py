@@ -248,9 +248,7 @@ def test_the_tool_starts_at_its_observed_pose_or_where_the_joints_have_it(
         ("tool", {name: POSE[name] for name in TOOL_NAMES[:-1]}, "needs gripper.pos, too"),
     ],
 )
-def test_an_observation_without_the_pose_is_refused(
-    tmp_path: Path, space: str, observation: dict[str, float], message: str
-) -> None:
+def test_an_observation_without_the_pose_is_refused(tmp_path, space, observation, message):
     teleop = BhdKeyboardArm(BhdKeyboardArmConfig(calibration_dir=tmp_path, action_space=space))
     with pytest.raises(ConfigError, match=message):
         teleop.start_from(observation)

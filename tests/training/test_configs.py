@@ -17,7 +17,6 @@ from bhd_lerobot.tasks.pick import ENVIRONMENT
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import command, parse_aggregation, read_stages
 from bhd_lerobot.training.rl.config import parse_rl
-from tests.training.support import MLP, make_dataset, options, run_train
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "train"
 KINDS = ("bc_", "act_", "cnn_", "diffusion_", "smolvla_")
@@ -93,15 +92,3 @@ def test_no_configuration_for_a_cpu_counts_on_a_second_processor() -> None:
             continue  # it runs the configurations of other files
         if "gpu" not in path.stem and values.get("policy", {}).get("device", "cpu") == "cpu":
             assert values["threads"] == 1, path
-
-
-def test_the_configuration_for_fine_tuning_takes_its_policy_from_the_checkpoint(tmp_path: Path) -> None:
-    data = make_dataset(tmp_path / "set", episodes=2)
-    run_train(options(data, tmp_path / "before", MLP, steps=2))
-    path = FOLDER / "fine_tune_ur5_pick.yaml"
-    config = parse_train([f"--config_path={path}", f"--fine_tune={tmp_path / 'before'}"])
-    config.validate()
-    assert config.policy.type == "bhd_mlp"
-    assert config.policy.optimizer_lr == 1e-4
-    assert config.optimizer.lr == 1e-4
-    assert config.policy.pretrained_path == (tmp_path / "before/checkpoints/last/pretrained_model").resolve()

@@ -109,9 +109,7 @@ def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, 
     refused(options(data, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
 
 
-def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(
-    data: Path, tmp_path: Path
-) -> None:
+def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(data, tmp_path):
     """What it says nothing about stays as it is observed: by `bhd-train` in all ways.
 
     LeRobot's programs do not tell the policy which statistics count: it learns where they are the same only.
@@ -194,6 +192,17 @@ def test_a_checkpoint_with_a_damaged_state_or_another_dataset_is_not_resumed(tra
         run_train(again)
 
 
+def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "damaged", symlinks=True)
+    file = tmp_path / "damaged" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:200])
+    for key in ("fine_tune", "policy.path"):
+        arguments = options(data, tmp_path / "run", {key: tmp_path / "damaged"})
+        refused(arguments, ConfigError, r"'bhd_mlp' cannot be made from .*damaged.*header")
+    with pytest.raises(ConfigError, match=r"'bhd_mlp' cannot be made from .*damaged"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'damaged'}", "--steps=12"])
+
+
 def test_an_environment_of_another_robot(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "set", episodes=2, robot="ur5")
     env = {"env__type": "bhd", "env__task": "TurtleBot3Avoid-v0", "env_eval_freq": 2}
@@ -201,9 +210,7 @@ def test_an_environment_of_another_robot(tmp_path: Path) -> None:
     refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
 
 
-def test_what_is_chosen_by_while_training_is_not_what_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_chosen_by_while_training_is_not_what_is_reported(tmp_path, monkeypatch):
     """Beside the episodes of the split that was asked for, an evaluation while training runs none that are held out."""
     root, splits = make_dataset(tmp_path / "set", robot="turtlebot3"), []
 
@@ -220,9 +227,7 @@ def test_what_is_chosen_by_while_training_is_not_what_is_reported(
     assert splits == ["validation", "train", "validation"]
 
 
-def test_metrics_that_cannot_be_written_leave_the_checkpoint(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_metrics_that_cannot_be_written_leave_the_checkpoint(data, tmp_path, monkeypatch):
     append = MetricsFile.append
 
     def full(self: MetricsFile, row: dict[str, Any]) -> None:
@@ -260,9 +265,7 @@ def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None
     assert parse_train(again).selection.hold_out == "instruction"
 
 
-def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(data, tmp_path, monkeypatch):
     calls = []
     forward = ACTPolicy.forward
 
@@ -326,17 +329,13 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"policy.optimizer_lr": ".nan"}, r"optimizer cannot be made: .*nan.*policy\.optimizer_"),
     ],
 )
-def test_a_configuration_that_cannot_be_honoured(
-    data: Path, tmp_path: Path, change: dict[str, Any], match: str
-) -> None:
+def test_a_configuration_that_cannot_be_honoured(data, tmp_path, change, match):
     refused(options(data, tmp_path / "run", {**ACT, **change}), ConfigError, match)
     arguments = [one for one in options(data, tmp_path / "run", {}) if "policy" not in one]
     refused(arguments, ConfigError, "No policy is given.*bhd_mlp")
 
 
-def test_mixed_precision_that_the_processor_can_only_emulate(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mixed_precision_that_the_processor_can_only_emulate(data, tmp_path, monkeypatch):
     arguments = options(data, tmp_path / "run", MLP, steps=2, policy__use_amp="true")
     # A processor that has no such instruction says so, or knows nothing of it.
     for known in ({}, {"avx512_bf16": False, "avx2": True}, {"neon": True}):

@@ -27,9 +27,7 @@ def test_an_incomplete_file_and_values_that_are_not_finite(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("completed", "said"), [(0, "15:00:00 left, by the first step. Take less."), (90, "")])
-def test_the_time_left_is_printed_from_the_first_step_on(
-    completed: int, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_time_left_is_printed_from_the_first_step_on(completed, said, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("bhd_lerobot.training.log.time.monotonic", lambda: now[0])
     printed = io.StringIO()

@@ -95,9 +95,7 @@ def more_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials, "__name__", "doctor_trials")
 
 
-def test_whatever_happens_in_a_process_is_an_outcome_and_the_rest_is_tried(
-    more_trials: None, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_whatever_happens_in_a_process_is_an_outcome_and_the_rest_is_tried(more_trials, capfd):
     names = (["noisy"], ["refuse", 0], ["crash"], ["fail"], ["exit"], ["noisy"])
     noisy, refuse, crash, fail, ended, again = run_trials(names)
     assert (noisy.kind, noisy.value, noisy.error) == ("value", 7, "")
@@ -301,10 +299,7 @@ BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
     "disk.slow": (lambda folder: checks.check_disk(folder, lambda _: 50 * GIB, ticking(16.0)), "2 MB/s"),
     "latency.late": (lambda _: checks.check_latency(latency(500e-6), {"ur5": 500}, 0.02), "50 % of the period"),
     "latency.missed": (lambda _: checks.check_latency(latency(1e-3), {"ur5": 500}, 0.02), "at 500 Hz ticks are missed"),
-    "latency.stopped": (
-        lambda _: checks.check_latency(latency(9.1e-3), {"ur5": 500}, 0.02),
-        "older than 20 ms",
-    ),
+    "latency.stopped": (lambda _: checks.check_latency(latency(9.1e-3), {"ur5": 500}, 0.02), "older than 20 ms"),
     "latency.error": (lambda _: checks.check_latency(failed("timeout", "no answer in 70 s"), {}, 0.02), "no answer"),
 }
 
@@ -397,9 +392,7 @@ def run(
     return status, json.loads(capsys.readouterr().out)
 
 
-def test_a_problem_makes_the_exit_status_and_a_warning_does_not(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_problem_makes_the_exit_status_and_a_warning_does_not(capsys, tmp_path):
     def statuses(report: dict[str, Any], check: str) -> list[str]:
         return [one["status"] for one in report["findings"] if one["check"] == check]
 
@@ -415,9 +408,7 @@ def test_a_problem_makes_the_exit_status_and_a_warning_does_not(
 @pytest.mark.parametrize(
     ("worst_ms", "statuses"), [(14.9, ["warning"] * 2), (17, ["problem", "warning"]), (18.1, ["problem"] * 2)]
 )
-def test_one_wake_up_that_is_later_than_the_plant_waits_is_a_problem(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, worst_ms: float, statuses: list[str]
-) -> None:
+def test_one_wake_up_that_is_later_than_the_plant_waits_is_a_problem(capsys, tmp_path, worst_ms, statuses):
     """The plant waits 20 ms for a command, and the last was written a period before."""
     outcome = latency(worst_ms / 2e3)
     status, report = run(capsys, tmp_path, "--realtime", answers={"latency test": outcome})
@@ -425,9 +416,7 @@ def test_one_wake_up_that_is_later_than_the_plant_waits_is_a_problem(
     assert status == 1 or "problem" not in statuses
 
 
-def test_the_printed_report_has_findings_histogram_and_remedies(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_printed_report_has_findings_histogram_and_remedies(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     fake = FakeTrials({"rights": grants(scheduler="ask"), "opengl": failed("crash", "[E] ended by SIGSEGV")})
     assert main([f"--root={tmp_path}", "--realtime"], fake) == 1

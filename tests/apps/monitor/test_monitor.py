@@ -352,9 +352,7 @@ def test_the_only_robot_is_found_and_of_several_one_is_to_be_named(robot: Robot)
         (["--3d", "--json"], "leave --once and --json out"),
     ],
 )
-def test_bad_arguments_end_with_a_message_and_status_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_arguments_end_with_a_message_and_status_2(arguments, message, capsys):
     assert main(arguments) == 2
     assert message in capsys.readouterr().err
 

@@ -28,18 +28,13 @@ from tests.recording.support import options
 
 BASE: dict[str, object] = {}
 ARM: dict[str, object] = {
-    **{"robot.type": "ur5", "robot.scene": "pick", "robot.beams": None, "brain.type": "pick", "task.type": "pick"},
+    **{"robot.type": "ur5", "robot.scene": "pick", "robot.beams": None, "brain.type": "pick", "task.type": "pick"}
 }
 NUMBERS = iter(range(1000))
 
 
 class Robot:
-    """A robot that publishes where its simulation is.
-
-    Args:
-        options: of the simulation.
-        has_world: whether it publishes the simulator's state, as a real robot does not.
-    """
+    """A robot that publishes where its simulation is."""
 
     def __init__(self, overrides: dict[str, object], *, has_world: bool = True) -> None:
         config: Any = parse(RecordConfig, options(Path("unused"), **overrides)).robot
@@ -225,9 +220,7 @@ def pixels(page: Any) -> bytes:
 
 
 @pytest.mark.parametrize(("overrides", "has_world"), [(BASE, True), (BASE, False), (ARM, True)])
-def test_the_browser_draws_the_scene_and_it_moves(
-    browser: Any, overrides: dict[str, object], has_world: bool, watched: Any
-) -> None:
+def test_the_browser_draws_the_scene_and_it_moves(browser, overrides, has_world, watched):
     with closing(Robot(overrides, has_world=has_world)) as robot:
         robot.place()
         robot.publish()

@@ -10,7 +10,8 @@ from rich.console import Console
 from bhd_lerobot.apps.monitor import state as monitor_state
 from bhd_lerobot.apps.monitor.state import Count, Dimension, MonitorState, Spread
 from bhd_lerobot.apps.monitor.view import KEYS, render, unit
-from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
 from tests.cases import each_case
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
@@ -172,3 +173,11 @@ def test_a_latched_mode_is_written_in_white_on_red_and_no_other_is() -> None:
 
     red = {mode.name for mode in Mode if styles(mode.name) == {"bold white on red"}}
     assert red == {"ESTOP", "FAULT"}
+
+
+def test_the_names_are_those_of_what_the_states_count() -> None:
+    assert tuple(limit.name for limit in LIMITS) == monitor_state.LIMITS
+    assert tuple(watchdog.name for watchdog in WATCHDOGS) == monitor_state.WATCHDOGS
+    assert len(monitor_state.REASONS) == len(Reason)
+    assert set(monitor_state.LIMITS) == {one.name for one in Limit} - {"NONE"}
+    assert set(monitor_state.WATCHDOGS) == {one.name for one in Watchdog} - {"NONE"}

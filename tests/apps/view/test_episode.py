@@ -14,28 +14,6 @@ from tests.datasets.loader.support import length, record_ours
 COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
-@each_case(
-    "array",
-    [
-        np.arange(7, dtype=np.float32).reshape(7, 1),
-        np.array([[np.nan, np.inf], [-0.0, 1e-300]]),
-        np.array([True, False, True]),
-        np.array([-(2**31), 2**31 - 1]),
-        np.array([2**40, -1]),
-        np.zeros((0, 3), np.float32),
-        np.arange(24, dtype=np.uint8).reshape(2, 3, 4)[:, ::-1],
-        np.arange(5, dtype=">f8"),
-    ],
-)
-def test_arrays_come_back_as_they_were(array) -> None:
-    content = pack({"a": 1, "ü": "ä\n"}, {"before": np.ones(3, np.uint8), "x": array})
-    header, found = unpack(content)
-    assert header == {"a": 1, "ü": "ä\n"}
-    np.testing.assert_array_equal(found["x"], array)
-    assert found["x"].shape == array.shape
-    assert (len(content) - sum(-(-one.nbytes // 8) * 8 for one in found.values())) % 8 == 0
-
-
 def test_the_header_is_json_for_every_reader() -> None:
     content = pack({"worst": float("inf"), "list": [float("nan"), 1.5]}, {})
     header, _ = unpack(content)

@@ -269,6 +269,19 @@ def test_an_action_is_the_answer_to_its_observation(tmp_path):
         assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500), late_ms
 
 
+def test_a_key_press_is_in_force_until_the_next(tmp_path, capsys):
+    """Teleoperation by keys publishes once, and a TurtleBot3 goes on: its node has no time-out of its own."""
+    presses = {0.02: (0.1, 0.0), 2.5: (0.0, 0.6), 4.0: (0.2, -0.6)}
+    base = [message for message in drive() if message[0] != "/cmd_vel"]
+    keys = [("/cmd_vel", START + int(at * NANO), bags.twist(*values)) for at, values in presses.items()]
+    imported(write(tmp_path / "bag", sorted([*base, *keys], key=lambda message: message[1])), tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    ends = columns["control.time"] + (source_of(tmp_path / "d")["start_ns"] - START) / NANO + 0.1
+    newest = [max(at for at in presses if at < end) for end in ends]
+    assert (columns["action"] == np.float32([presses[at] for at in newest])).all()
+    assert (columns["control.mode"] == 3).all()
+
+
 def test_a_robot_that_moves_without_a_command_needs_a_choice(tmp_path, capsys):
     messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] > START + 2 * NANO]
     source = write(tmp_path / "bag", messages)

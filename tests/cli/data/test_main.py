@@ -53,17 +53,6 @@ def test_ten_times_the_episodes_take_at_most_twice_the_work(tmp_path, capsys):
     assert counts[2] < 2 * counts[1]
 
 
-def test_info_as_json_holds_everything(recorded, capsys):
-    assert main.main(["info", "--root", str(recorded), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert [episode["index"] for episode in summary["episodes"]] == [0, 1, 2]
-    for episode in summary["episodes"]:
-        assert json.loads(episode["metadata"]["timing"])["overruns"] == 0
-        assert len(episode["metadata"]["initial_state"]) > 20
-        assert set(json.loads(episode["metadata"]["versions"])) == {"bhd_lerobot", "lerobot", "mujoco", "numpy"}
-    assert summary["recording"]["brain"]["type"] == "avoidance"
-
-
 def test_info_of_several_datasets(recorded, tmp_path, capsys):
     other = tmp_path / "[b]other"  # square brackets are not markup
     run_record(other, dataset__num_episodes=1, robot__beams=18)

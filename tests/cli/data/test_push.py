@@ -26,7 +26,7 @@ from tests.fake_hub.hub import FakeHub, Fault, real_client
 from tests.forks import Fork
 from tests.recording.support import options as record_options
 from tests.recording.support import run_record
-from tests.training.support import MLP, curve, make_dataset, run_train
+from tests.training.support import MLP, make_dataset, run_train
 from tests.training.support import options as train_options
 from tests.waiting import until
 
@@ -112,10 +112,7 @@ def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, recorded: Path) -> N
 @pytest.mark.figures
 def test_images_of_cameras_and_of_curves(hub: FakeHub, lesson: Path, tmp_path: Path) -> None:
     videos = make_dataset(tmp_path / "videos", episodes=2, camera=True)
-    for root, caption in (
-        (videos, "as `observation.images.front` saw it"),
-        (lesson, "observations and actions"),
-    ):
+    for root, caption in ((videos, "as `observation.images.front` saw it"), (lesson, "observations and actions")):
         assert main.main(["push", str(root), f"me/{root.name}"]) == 0
         assert caption in text_of(hub, f"me/{root.name}")
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
@@ -187,19 +184,6 @@ def test_recording_does_not_begin_what_cannot_be_uploaded(hub: FakeHub, tmp_path
     assert record_module.main(record_options(tmp_path / "d", **wanted)) == 2
     assert "no token" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: FakeHub, lesson: Path, tmp_path: Path) -> None:
-    assert main.main(["push", str(lesson), "me/d"]) == 0
-    assert main.main(["pull", "me/d", f"--root={tmp_path / 'pulled'}"]) == 0
-    short = {"steps": 2, "log_freq": 1, "save_freq": 0, "save_checkpoint": "false"}
-    run_train(train_options(lesson, tmp_path / "one", MLP, **short))
-    run_train(train_options(tmp_path / "pulled", tmp_path / "two", MLP, **short))
-    # By name alone, downloaded by LeRobot.
-    run_train(train_options(None, tmp_path / "three", MLP, **short, dataset__repo_id="me/d"))  # type: ignore[arg-type]
-    wanted = curve(tmp_path / "one")
-    assert len(wanted) == 2
-    assert curve(tmp_path / "two") == curve(tmp_path / "three") == wanted
 
 
 def test_a_policy_that_cannot_be_uploaded_is_kept(hub: FakeHub, lesson: Path, tmp_path: Path, monkeypatch) -> None:

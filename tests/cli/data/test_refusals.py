@@ -126,9 +126,7 @@ def status_of(arguments: list[str]) -> object:
 
 @pytest.mark.usefixtures("hub")
 @each_case(("line", "message"), REFUSALS)
-def test_what_is_refused_is_named_and_nothing_is_changed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str, message: str
-) -> None:
+def test_what_is_refused_is_named_and_nothing_is_changed(folder, monkeypatch, capsys, line, message):
     monkeypatch.chdir(folder)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert status_of(shlex.split(line)) == 2

@@ -3,15 +3,12 @@
 import os
 import threading
 from pathlib import Path
-from typing import Any
 
-import av
 import numpy as np
 import pytest
 
 from bhd_lerobot.datasets.format import statistics, video
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
-from bhd_lerobot.datasets.format.video_splice import splice
 from tests.waiting import until
 
 SIZE = (32, 48)
@@ -23,32 +20,6 @@ def encode(path: Path, greys: list[int], settings: VideoSettings) -> Path:
         encoder.add(np.full((*SIZE, 3), grey, np.uint8))
     assert encoder.finish().shape == (len(greys), 3, 256)
     return path
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        VideoSettings(),
-        VideoSettings(g=30, extra_options={"bf": 2}),
-        VideoSettings(vcodec="libsvtav1", preset=12, crf=30),
-    ],
-)
-def test_joined_files_hold_every_frame_at_its_time(tmp_path: Path, settings: VideoSettings) -> None:
-    parts = [[20, 60, 100], [140], [180, 40, 90, 130, 200]]
-    paths = [encode(tmp_path / f"{i}.mp4", greys, settings) for i, greys in enumerate(parts)]
-    assert len({video.stream_signature(path) for path in paths}) == 1
-    joined = tmp_path / "joined.mp4"
-    splice([(path, [(0, len(greys))]) for path, greys in zip(paths, parts, strict=True)], joined, 10)
-    # Joining what was joined before, as resuming does.
-    twice = tmp_path / "twice.mp4"
-    splice([(joined, [(0, 9)]), (paths[0], [(0, 3)])], twice, 10)
-    wanted = [*parts[0], *parts[1], *parts[2], *parts[0]]
-    with av.open(str(twice)) as container:
-        frames: list[Any] = list(container.decode(container.streams.video[0]))
-    assert [float(frame.pts * frame.time_base) for frame in frames] == pytest.approx([i / 10 for i in range(12)])
-    for frame, grey in zip(frames, wanted, strict=True):
-        assert abs(frame.to_ndarray(format="rgb24").mean() - grey) < 4
-    assert video.count_frames(twice) == 12
 
 
 @pytest.mark.parametrize("settings", [VideoSettings(queue_size=1), VideoSettings("libsvtav1", preset=12, queue_size=1)])

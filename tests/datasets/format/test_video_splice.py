@@ -48,6 +48,9 @@ def test_every_image_stays(tmp_path: Path, codec: str, options: dict[str, str]) 
     spans = [(STARTS[2], LENGTHS[2]), (STARTS[0], LENGTHS[0])]
     splice([(tmp_path / "all.mp4", spans), (parts[3], [(0, LENGTHS[3])])], tmp_path / "new.mp4", 10)
     assert images(tmp_path / "new.mp4") == shown[2] + shown[0] + shown[3]
+    with av.open(str(tmp_path / "new.mp4")) as video:
+        times = [float(frame.pts * frame.time_base) for frame in video.decode(video=0)]  # type: ignore[operator]
+    assert times == pytest.approx(np.arange(len(times)) / 10)
     # And what was spliced can be spliced again.
     splice([(tmp_path / "new.mp4", [(LENGTHS[2], LENGTHS[0])])], tmp_path / "again.mp4", 10)
     assert images(tmp_path / "again.mp4") == shown[0]

@@ -60,11 +60,7 @@ def assert_equal_datasets(root: Path, **options: Any) -> TableDataset:
 @pytest.mark.law
 @each_case(
     ("episodes", "deltas"),
-    [
-        (None, None),
-        ([0], {"action": [0.0]}),
-        ([4, 1], {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW}),
-    ],
+    [(None, None), ([0], {"action": [0.0]}), ([4, 1], {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW})],
 )
 def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, deltas: dict[str, list[float]]) -> None:
     assert_equal_datasets(plain, episodes=episodes, delta_timestamps=deltas)
@@ -74,28 +70,21 @@ def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, de
     ("return_uint8", "deltas"),
     [(True, None), (False, {"action": CHUNK, FRONT: WINDOW}), (True, {FRONT: [0.0], WRIST: [-0.1]})],
 )
-def test_frames_of_our_recorder_are_those_of_lerobot(
-    video_dataset: Path, return_uint8: bool, deltas: dict[str, list[float]] | None
-) -> None:
+def test_frames_of_our_recorder_are_those_of_lerobot(video_dataset, return_uint8, deltas):
     assert_equal_datasets(video_dataset, episodes=[1, 3], delta_timestamps=deltas, return_uint8=return_uint8)
 
 
 @each_case(("video", "cores"), [(AV1, 8), (B_FRAMES, 1)])
-def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(
-    tmp_path: Path, video: VideoSettings, cores: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(tmp_path, video, cores, monkeypatch):
     root = support.record_light(tmp_path / "d", 3, (FRONT,), video)
     monkeypatch.setattr(frame_cache.os, "cpu_count", lambda: cores)
     assert_equal_datasets(root, delta_timestamps={"action": CHUNK}, return_uint8=True)
 
 
 @each_case(
-    ("episodes", "deltas"),
-    [(None, None), ([2, 0], {"action": CHUNK, "grid": WINDOW, FRONT: WINDOW, PHOTO: [0.0]})],
+    ("episodes", "deltas"), [(None, None), ([2, 0], {"action": CHUNK, "grid": WINDOW, FRONT: WINDOW, PHOTO: [0.0]})]
 )
-def test_a_dataset_that_stock_lerobot_recorded(
-    foreign: Path, episodes: list[int] | None, deltas: dict[str, list[float]] | None
-) -> None:
+def test_a_dataset_that_stock_lerobot_recorded(foreign, episodes, deltas):
     assert_equal_datasets(foreign, episodes=episodes, delta_timestamps=deltas)
 
 
@@ -187,35 +176,6 @@ def test_the_table_by_episode(plain: Path) -> None:
     assert table.place(table.rows(3).start + 2) == "episode 3, frame 2"
     with pytest.raises(DatasetError, match="episode 0 is not among 1, 3"):
         table.rows(0)
-
-
-def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> None:
-    from lerobot.datasets.sampler import EpisodeAwareSampler
-
-    theirs = support.stock(plain, episodes=[0, 2, 3], delta_timestamps={"action": CHUNK})
-    sampler = EpisodeAwareSampler(
-        theirs.meta.episodes["dataset_from_index"],
-        theirs.meta.episodes["dataset_to_index"],
-        episode_indices_to_use=theirs.episodes,
-        drop_n_last_frames=2,
-        shuffle=True,
-        seed=11,
-        absolute_to_relative_idx=theirs.absolute_to_relative_idx,
-    )
-    config = LoaderConfig(
-        batch_size=4,
-        seed=11,
-        episodes=[0, 2, 3],
-        delta_timestamps={"action": CHUNK},
-        drop_n_last_frames=2,
-        return_uint8=False,
-    )
-    loader = make_loader("t/t", config, root=plain).train
-    reference = DataLoader(theirs, 4, sampler=sampler)
-    for _ in range(2):
-        assert len(loader) == len(reference)
-        for mine, other in zip(loader, reference, strict=True):
-            support.assert_same(mine, other)
 
 
 @pytest.mark.thorough(but=1)

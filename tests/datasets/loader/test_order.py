@@ -33,12 +33,7 @@ def test_every_epoch_has_every_sample_once_in_another_order() -> None:
     assert flat(epochs(BatchOrder(SAMPLES, 5, 3, shuffle=False), 1)[0]) == SAMPLES.tolist()
 
 
-@given(
-    count=st.integers(1, 40),
-    batch_size=st.integers(1, 12),
-    world_size=st.integers(1, 4),
-    drop_last=st.booleans(),
-)
+@given(count=st.integers(1, 40), batch_size=st.integers(1, 12), world_size=st.integers(1, 4), drop_last=st.booleans())
 def test_the_ranks_share_an_epoch(count: int, batch_size: int, world_size: int, drop_last: bool) -> None:
     samples = torch.arange(count)
     if drop_last and count < batch_size * world_size:
@@ -78,12 +73,7 @@ def test_the_ranks_are_dealt_what_accelerate_deals() -> None:
 
 
 @pytest.mark.law
-@given(
-    batches=st.integers(0, 40),
-    world_size=st.integers(1, 2),
-    drop_last=st.booleans(),
-    weighted=st.booleans(),
-)
+@given(batches=st.integers(0, 40), world_size=st.integers(1, 2), drop_last=st.booleans(), weighted=st.booleans())
 def test_it_goes_on_after_any_batch(batches: int, world_size: int, drop_last: bool, weighted: bool) -> None:
     def make() -> BatchOrder:
         weights = torch.linspace(0, 1, len(SAMPLES)) if weighted else None

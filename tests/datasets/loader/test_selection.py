@@ -149,10 +149,7 @@ def test_a_policy_can_learn_from_a_valid_dataset(plain: Path, video_dataset: Pat
         ({"delta_timestamps": {"acton": [0.0]}}, "Unknown feature 'acton'"),
         ({"delta_timestamps": {"action": [0.0, 0.05]}}, r"must be multiples of 1 / 10 s.* got \[0.05\]"),
         ({"delta_timestamps": {"subtask": [0.0]}}, "'subtask', which is text"),
-        (
-            {"delta_timestamps": {"action": [0.0]}, "keep": ["event"]},
-            "'action', which is not among the features",
-        ),
+        ({"delta_timestamps": {"action": [0.0]}, "keep": ["event"]}, "'action', which is not among the features"),
         ({"budget_gib": 0}, "must be positive; got 0"),
     ],
 )
@@ -197,9 +194,7 @@ def test_memory_is_asked_for_before_anything_is_decoded(video_dataset: Path, mon
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
 @pytest.mark.parametrize("part", ["columns", "images"])
-def test_memory_that_runs_out_leads_to_the_fallback(
-    video_dataset: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, part: str
-) -> None:
+def test_memory_that_runs_out_leads_to_the_fallback(video_dataset, monkeypatch, error, part):
     def fail(*_: Any) -> None:
         raise error if part == "images" else MemoryError
 

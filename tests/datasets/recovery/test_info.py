@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,9 +35,7 @@ def without_features(path: Path) -> None:
 
 
 @pytest.mark.parametrize("break_it", [torn, without_features, Path.unlink, lambda path: path.write_text("[]")])
-def test_the_advice_works(
-    recorded: Path, other: Path, tmp_path: Path, capsys, break_it: Callable[[Path], object]
-) -> None:
+def test_the_advice_works(recorded, other, tmp_path, capsys, break_it):
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     break_it(root / "meta/info.json")
     for command in ("info", "check", "repair", "view"):

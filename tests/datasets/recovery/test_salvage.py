@@ -89,9 +89,7 @@ def loaded(root: Path, frames: int) -> None:
         ("image", 3, "saved", 3),
     ],
 )
-def test_every_whole_episode_is_recovered(
-    recorded: Recorded, truth: dict, tmp_path: Path, case: tuple[str, int, str, int]
-) -> None:
+def test_every_whole_episode_is_recovered(recorded, truth, tmp_path, case):
     video, episodes, die, recovered = case
     root = recorded(tmp_path / "d", video, episodes, die)
     report = repair(root)
@@ -225,9 +223,7 @@ def test_nothing_left_changes_nothing(recorded: Recorded, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("by", "episodes"), [("folder", 5), ("file", 1), ("hand", 5)])
-def test_info_of_another_recording_is_used(
-    recorded: Recorded, truth: dict, tmp_path: Path, by: str, episodes: int
-) -> None:
+def test_info_of_another_recording_is_used(recorded, truth, tmp_path, by, episodes):
     """Whatever it counts: that is no loss of this one."""
     root = recorded(tmp_path / "d", "none", 4, "saved")
     another = recorded(tmp_path / "another", "none", episodes)
@@ -373,9 +369,7 @@ def test_a_lost_file_costs_its_own_episodes_only(sessions: Path, tmp_path: Path,
     assert_valid(root)
 
 
-def test_a_video_that_was_being_moved_is_taken_from_the_folder_for_temporary_files(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_video_that_was_being_moved_is_taken_from_the_folder_for_temporary_files(recorded, tmp_path, monkeypatch):
     """Unless it is another user's, for that folder is everybody's."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for owner in (os.getuid(), *([65534] if not os.getuid() else [])):

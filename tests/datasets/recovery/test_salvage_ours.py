@@ -78,9 +78,7 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
 
 
 @pytest.mark.parametrize("damage", [cut(20), Path.unlink, lambda path: shutil.rmtree(path.parents[1])])
-def test_episodes_without_rows_are_recovered_and_lost_columns_are_named(
-    recorded: Path, tmp_path: Path, damage: Callable[[Path], None]
-) -> None:
+def test_episodes_without_rows_are_recovered_and_lost_columns_are_named(recorded, tmp_path, damage):
     root = copied(recorded, tmp_path / "d")
     damage(root / EPISODES)
     remedies = [finding.remedy for finding in check_dataset(root).findings]
@@ -179,9 +177,7 @@ def test_marks_are_restored_unless_episodes_were_renumbered(tmp_path: Path) -> N
     assert outcomes(origin) == [(None, None)] * 3
 
 
-def test_files_that_cannot_be_read_now_are_not_given_up(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_cannot_be_read_now_are_not_given_up(recorded, tmp_path, monkeypatch):
     for is_ours in (True, False):
         root = copied(recorded, tmp_path / f"d{is_ours}")
         if not is_ours:

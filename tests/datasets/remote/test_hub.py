@@ -11,12 +11,7 @@ from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import (
-    ConfigError,
-    DatasetError,
-    DatasetExistsError,
-    TransferError,
-)
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import EPISODES, send, stored
@@ -122,12 +117,7 @@ def test_branches_and_tags(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     assert stored(hub) == first  # neither main nor its tag moved
     assert stored(hub, "more") == stored(hub, "seven") == content(root)
     assert stored(hub, "v3.0") == first
-    for revision, episodes in (
-        (None, 6),
-        ("more", 7),
-        ("seven", 7),
-        (hub.dataset("me/d").tags["v3.0"], 6),
-    ):
+    for revision, episodes in ((None, 6), ("more", 7), ("seven", 7), (hub.dataset("me/d").tags["v3.0"], 6)):
         assert pull(HubDataset("me/d", revision), tmp_path / f"to_{revision}").total_episodes == episodes
     with pytest.raises(TransferError, match="is a tag"):
         send(root, "seven")
@@ -150,9 +140,7 @@ def test_two_pushes_at_once_do_not_mix(hub: FakeHub, root: Path, monkeypatch) ->
         push(root, remote)
 
 
-def test_loading_by_name_downloads_only_the_wanted_episodes(
-    hub: FakeHub, root: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_loading_by_name_downloads_only_the_wanted_episodes(hub, root, tmp_path, monkeypatch):
     send(root)
     hub.reset()
     recorded = {path for path in content(root) if path.startswith(("data/", "videos/"))}

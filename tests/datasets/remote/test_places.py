@@ -51,9 +51,7 @@ def test_a_longer_dataset_replaces_what_differs_and_removes_what_is_old(root: Pa
         assert repository.tags["v3.0"] == repository.branches["main"]
 
 
-def test_a_dataset_that_changes_during_the_upload_is_not_shown(
-    root: Path, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dataset_that_changes_during_the_upload_is_not_shown(root, place, monkeypatch):
     remote = place.remote()
     files = remote.files
 
@@ -67,9 +65,7 @@ def test_a_dataset_that_changes_during_the_upload_is_not_shown(
     assert layout.INFO not in place.stored()
 
 
-def test_a_dataset_that_was_changed_here_is_kept_unless_it_is_given_up(
-    root: Path, place: Place, tmp_path: Path
-) -> None:
+def test_a_dataset_that_was_changed_here_is_kept_unless_it_is_given_up(root, place, tmp_path):
     push(root, place.remote())
     target = tmp_path / "e"
     pull(place.remote(), target)

@@ -12,13 +12,7 @@ from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
-from bhd_lerobot.errors import (
-    DatasetError,
-    DatasetExistsError,
-    DatasetLockedError,
-    DatasetWriteError,
-    TransferError,
-)
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError, DatasetWriteError, TransferError
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import EPISODES, send
@@ -113,19 +107,6 @@ def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: FakeHub, ro
     assert not hub.asked("GET .*/resolve/.*/data/")  # refused before everything was fetched
 
 
-def test_files_that_hold_all_episodes_are_the_dataset(hub: FakeHub, tmp_path: Path) -> None:
-    packed, target = tmp_path / "packed", tmp_path / "e"
-    with support.create(packed) as recorder:
-        for _ in range(3):
-            support.record(recorder)
-    send(packed)
-    report = pull(HubDataset("me/d"), target, select=lambda folder: [1])
-    assert (report.episodes, report.is_whole) == ([1], True)
-    assert content(target) == content(packed)
-    assert pull(HubDataset("me/d"), target, select=lambda folder: [2]).episodes == [2]
-    assert content(target) == content(packed)
-
-
 def test_another_pull_of_the_same_folder_is_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     send(root)
     (tmp_path / ".e.pull").mkdir()
@@ -145,9 +126,7 @@ def break_off(hub: FakeHub, target: Path, path: str) -> None:
     hub.faults = []
 
 
-def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
-    hub: FakeHub, root: Path, tmp_path: Path
-) -> None:
+def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(hub, root, tmp_path):
     send(root)
     target, old = tmp_path / "e", content(root)
     commit = hub.dataset("me/d").branches["main"]

@@ -9,11 +9,7 @@ from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import Card, MakeCard, is_generated, sign
 from bhd_lerobot.datasets.storage.disk import RootLock
-from bhd_lerobot.errors import (
-    DatasetCorruptError,
-    DatasetError,
-    DatasetLockedError,
-)
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
 from tests.datasets import support
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.fixtures import send, stored
@@ -106,9 +102,7 @@ def test_a_card_beside_the_dataset_is_the_card(hub: FakeHub, root: Path, tmp_pat
     assert b"anew" in stored(hub)["README.md"]
 
 
-def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
-    hub: FakeHub, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_behind_a_link_is_not_removed_from_the_hub(hub, root, tmp_path, monkeypatch):
     """What is not seen must not be removed at the other end."""
     copied = Path(shutil.copytree(root, tmp_path / "copied"))
     send(root)

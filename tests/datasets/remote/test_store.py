@@ -168,9 +168,7 @@ def test_names_are_no_patterns(root: Path, near_url: str) -> None:
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("place", ["there/d/", ""])
-def test_the_folders_of_a_console_are_no_files(
-    root: Path, s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
-) -> None:
+def test_the_folders_of_a_console_are_no_files(root, s3_url, tmp_path, monkeypatch, place):
     """An S3 console makes a folder by an empty object whose name ends in a slash."""
     use_s3(s3_url, monkeypatch)
     s3 = fsspec.filesystem("s3")
@@ -206,9 +204,7 @@ def test_a_snapshot_by_hard_links_stays_as_it_was(root: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("changed", [layout.STATS, layout.INFO])
-def test_what_is_written_there_during_a_pull_is_noticed(
-    root: Path, near_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
-) -> None:
+def test_what_is_written_there_during_a_pull_is_noticed(root, near_url, tmp_path, monkeypatch, changed):
     push(root, StoreDataset(near_url))
     source = StoreDataset(near_url)
     get = source._fs.get_file

@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import subprocess
-import threading
 from pathlib import Path
 
 import pytest
@@ -213,9 +212,7 @@ def test_unusual_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert support.read_back(tmp_path / "left") == 1
 
 
-def test_files_that_another_program_creates_at_the_place_stay(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_another_program_creates_at_the_place_stay(root, tmp_path, monkeypatch):
     move = Disk.move
     places = (tmp_path / "new", tmp_path / "empty", tmp_path / "fixed")
     for place in places:
@@ -408,20 +405,4 @@ def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, 
     assert "The change is committed, and the next command completes it." in message
     assert "nothing was changed" not in message
     assert main.main(["info", str(root), "--short"]) == 0
-    assert len(content(root)) == 2
-
-
-def test_an_edit_in_another_thread_leaves_signals_alone(root: Path) -> None:
-    failed: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            delete(root, [1])
-        except BaseException as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    assert failed == []
     assert len(content(root)) == 2

@@ -85,9 +85,7 @@ CASES = [
 
 @pytest.mark.timeout(0 if IS_FULL else 900)  # all changes of one command: an hour on a busy machine
 @pytest.mark.parametrize(("operation", "place"), CASES, ids=[f"{one.name}, {place}" for one, place in CASES])
-def test_nothing_is_lost_and_messages_are_true(
-    runner: Runner, tmp_path: Path, operation: Operation, place: str
-) -> None:
+def test_nothing_is_lost_and_messages_are_true(runner, tmp_path, operation, place):
     origin = tmp_path / "origin"
     origin.mkdir()
     operation.prepare(origin)

@@ -349,9 +349,7 @@ def record_with_lerobot(root: Path) -> Path:
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("source", ["ours", "stock"])
-def test_datasets_edited_by_lerobot_have_warnings_of_unused_statistics(
-    valid, tmp_path, source, capsys, monkeypatch
-) -> None:
+def test_datasets_edited_by_lerobot_have_warnings_of_unused_statistics(valid, tmp_path, source, capsys, monkeypatch):
     root = copy(valid, tmp_path) if source == "ours" else record_with_lerobot(tmp_path / "stock")
     monkeypatch.setenv("COLUMNS", "200")
     dataset, again = loader_support.stock(root), loader_support.stock(root)

@@ -253,9 +253,7 @@ def test_a_corrupt_file_is_named_and_nothing_is_overwritten(tmp_path: Path) -> N
         (root / name).write_bytes(origin)
 
 
-def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(tmp_path, monkeypatch):
     recorder = support.create(tmp_path / "d")
     support.record(recorder)
     with pytest.raises(ZeroDivisionError) as caught, stop_at(monkeypatch, 3, OSError(errno.EIO, "broken")), recorder:

@@ -142,9 +142,7 @@ def test_what_does_not_fit_together_is_refused() -> None:
 @each_case(
     ("name", "goals"), [("pick", PickBrainConfig), ("reach", ReachBrainConfig), ("language", LanguageBrainConfig)]
 )
-def test_a_brain_that_gives_goals_is_refused_when_the_options_are_read_and_when_it_is_made(
-    name: str, goals: Any
-) -> None:
+def test_a_brain_that_gives_goals_is_refused_when_the_options_are_read_and_when_it_is_made(name, goals):
     learns, advises = DaggerConfig(goals(), PickServoConfig()), DaggerConfig(NoopConfig(), goals())
     for who, settings in (("learner", learns), ("expert", advises)):
         message = rf"brain\.{who}\.type is '{name}', which gives goals.*pick_servo.*reach_servo.*tool_pose"

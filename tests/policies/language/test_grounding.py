@@ -45,9 +45,7 @@ def scenes(draw: Callable[..., Any]) -> list[SceneObject]:
 
 
 @given(scenes(), st.sampled_from(Relation), st.sampled_from([None, *KINDS]))
-def test_a_relation_chooses_the_most_extreme_of_those_that_fit_without_it(
-    scene: list[SceneObject], relation: Relation, kind: str | None
-) -> None:
+def test_a_relation_chooses_the_most_extreme_of_those_that_fit_without_it(scene, relation, kind):
     without = fitting(Description(kind), scene)
     found = fitting(Description(kind, None, relation), scene)
     assert all(each in without for each in found)
@@ -79,9 +77,7 @@ def test_mirroring_the_table_swaps_left_and_right_and_nothing_else(scene: list[S
     ],
 )
 @each_case(("factor", "decided"), [(0.0, False), (0.99, False), (1.01, True)])
-def test_a_difference_counts_from_the_margin_on(
-    measure: str, relation: Relation, further: int, factor: float, decided: bool
-) -> None:
+def test_a_difference_counts_from_the_margin_on(measure, relation, further, factor, decided):
     change = {
         "x": 0.5 + factor * DISTANCE_MARGIN,
         "y": factor * DISTANCE_MARGIN,

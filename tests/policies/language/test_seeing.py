@@ -123,9 +123,7 @@ BOTH = (seen(CUP, 0), seen(BOX, 1))
 @each_case(
     ("instruction", "meant"), [("pick up the red cup", CUP), ("拿起蓝色盒子", BOX), ("take the thing on the left", BOX)]
 )
-def test_it_goes_where_it_sees_what_is_meant_and_needs_nothing_that_the_task_tells(
-    instruction: str, meant: TableObject
-) -> None:
+def test_it_goes_where_it_sees_what_is_meant_and_needs_nothing_that_the_task_tells(instruction, meant):
     table = Table([seen(CUP, 0, off=0.01), seen(BOX, 1, off=0.01)], instruction=instruction)
     goal = table.frame()
     assert goal is not None
@@ -196,9 +194,7 @@ def test_it_takes_the_side_of_a_box_that_leaves_room_for_errors_unless_something
         ([(seen(CUP, 0, error=0.01),)], {"max_error_m": 0.005}, "known to 10 mm only"),
     ],
 )
-def test_what_it_does_not_see_or_not_surely_enough_it_does_not_touch(
-    looks: list[Any], options: dict[str, Any], problem: str
-) -> None:
+def test_what_it_does_not_see_or_not_surely_enough_it_does_not_touch(looks, options, problem):
     table = Table(*looks, **options)
     assert table.brain.needs_images({}).tolist() == [True]
     assert table.frame() is None

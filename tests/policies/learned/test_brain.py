@@ -188,9 +188,7 @@ def test_what_is_recorded_names_the_weights(checkpoints: dict[str, Path]) -> Non
 @pytest.mark.parametrize(
     ("kind", "frames"), [("pixels_image", {0}), ("act_image", {0, 3, 6}), ("diffusion_image", set(range(8)))]
 )
-def test_images_that_it_does_not_look_at_need_not_be_there(
-    checkpoints: dict[str, Path], kind: str, frames: set[int]
-) -> None:
+def test_images_that_it_does_not_look_at_need_not_be_there(checkpoints, kind, frames):
     brain, seen = make_brain(checkpoints[kind]), list(observations(3, 8))
     wanted = drive(brain, seen, [0, 1, 2])
     brain.reset(np.arange(3), [0, 1, 2], 3, [INSTRUCTION] * 3)

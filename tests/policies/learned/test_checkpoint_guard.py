@@ -91,9 +91,7 @@ def test_lerobots_own_loader_would_have_called_it(folder: Path, made: list[str])
     assert made == ["Counter"]
 
 
-def test_no_command_that_takes_a_checkpoint_calls_it(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_that_takes_a_checkpoint_calls_it(folder, tmp_path, capfd):
     data, run = make_dataset(tmp_path / "set", episodes=2), tmp_path / "run"
     run_train(options(data, run, MLP, steps=2, save_freq=2))
     plant(run / "checkpoints" / "000002" / "pretrained_model", STEPS[0])

@@ -56,6 +56,15 @@ def make_dataset(root: Path) -> Path:
     return root
 
 
+def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
+    folder = make_checkpoint(tmp_path / "model")
+    file = CONTRACT.save(folder)
+    assert file == folder / CONTRACT_FILE
+    assert PolicyContract.load(folder) == CONTRACT
+    assert CONTRACT.is_known
+    assert [one.name for one in folder.iterdir() if one.name.startswith(".")] == []
+
+
 def test_a_dataset_tells_everything(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "data")
     (root / "meta" / "bhd.json").write_text(json.dumps({"recording": {"task": {"type": "avoid", "arena": "random"}}}))

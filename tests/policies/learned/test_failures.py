@@ -116,9 +116,7 @@ def test_a_robot_or_a_task_that_does_not_fit(folder: Path) -> None:
             brain.bind(RobotFeatures(*arguments))
 
 
-def test_without_a_contract_the_shapes_are_checked_and_it_says_so(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_contract_the_shapes_are_checked_and_it_says_so(folder, caplog):
     (folder / CONTRACT_FILE).unlink()
     with caplog.at_level(logging.WARNING):
         rig.make_brain(folder)
@@ -228,9 +226,7 @@ def rename_statistics(folder: Path, old: str, new: str, *files: str) -> None:
         ("action.std", "action.deviation", ("'action' by", "no std of it")),
     ],
 )
-def test_what_is_normalised_without_statistics_of_its_name_is_refused(
-    original: Path, tmp_path: Path, old: str, new: str, parts: tuple[str, ...]
-) -> None:
+def test_what_is_normalised_without_statistics_of_its_name_is_refused(original, tmp_path, old, new, parts):
     folder = Path(shutil.copytree(original, tmp_path / "policy"))
     rename_statistics(folder, old, new)
     message = refused(folder)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from lerobot.datasets import LeRobotDataset
 
 import bhd_lerobot
 from bhd_lerobot.cli import train
@@ -152,9 +151,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Tr
         *((kind, program) for kind in ("bhd_pixels", "bhd_cnn") for program in ("lerobot-train", "bhd-train")),
     ],
 )
-def test_a_checkpoint_does_the_same_in_all_three_programs(
-    kind: str, program: str, trained: Callable[[str, str], Trained], tmp_path: Path
-) -> None:
+def test_a_checkpoint_does_the_same_in_all_three_programs(kind, program, trained, tmp_path):
     made = trained(kind, program)
     assert (made.checkpoint / CONTRACT_FILE).exists() == (program == "bhd-train")
     ours = trace_bhd_eval(tmp_path / "bhd", [*made.bhd_eval, f"--brain.path={made.checkpoint}"])
@@ -188,9 +185,7 @@ def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_pat
 
 
 @pytest.mark.thorough
-def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(
-    trained: Callable[[str, str], Trained],
-) -> None:
+def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(trained):
     """It imports our package as a plug-in, and nothing else of it; here, other tests have imported everything."""
     made = [("bhd_mlp", "lerobot-train"), *((kind, "bhd-train") for kind in ("act", "bhd_pixels", "bhd_cnn"))]
     paths = [str(trained(*one).checkpoint) for one in made]
@@ -210,32 +205,6 @@ print(*ProcessorStepRegistry.list())
     ours = re.findall(r'^@ProcessorStepRegistry\.register\(name="(\w+)"\)', source, re.MULTILINE)
     assert len(ours) >= 5
     assert {*ours} <= {*done.stdout.split()}
-
-
-def test_lerobot_rollout_ends_after_its_duration_and_what_it_records_is_a_dataset(
-    trained: Callable[[str, str], Trained], tmp_path: Path
-) -> None:
-    made = trained("bhd_mlp", "lerobot-train")
-    options = arguments(
-        policy__path=made.checkpoint,
-        strategy__type="sentry",
-        fps=10,
-        duration=0.5,
-        return_to_initial_position="false",
-        play_sounds="false",
-        dataset__repo_id="test/rollout_avoid",
-        dataset__root=tmp_path / "rollout",
-        dataset__fps=10,
-        dataset__single_task="Roam.",
-        dataset__push_to_hub="false",
-    )
-    run_stock("lerobot-rollout", [*made.lerobot_rollout, *options])
-    dataset = LeRobotDataset("test/rollout_avoid", root=tmp_path / "rollout")
-    names = [f"scan_{beam:03}.pos" for beam in range(BEAMS)]
-    assert dataset.meta.features["observation.state"]["names"] == ["x.vel", "theta.vel", *names]
-    assert dataset.meta.robot_type == "turtlebot3"
-    assert 0 < dataset.num_frames <= 6
-    assert dataset[0]["action"].abs().max() > 0
 
 
 def test_what_a_robots_sensors_do_not_tell_is_named(tmp_path: Path) -> None:

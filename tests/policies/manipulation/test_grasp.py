@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
-from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, read_objects
+from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
 from tests.cases import each_case
 
 angles = st.floats(-math.pi, math.pi)
@@ -46,9 +46,7 @@ def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: fl
 
 
 @given(angles, st.floats(0.01, 0.09), st.floats(0.01, 0.09), st.floats(0, 0.03))
-def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_left(
-    yaw: float, length: float, width: float, wider: float
-) -> None:
+def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_left(yaw, length, width, wider):
     one = box(length, width, yaw=yaw)
     usual, wide = (plan_grasp(one, [], MAX_OPENING, wider=more) for more in (0.0, wider))
     careful = plan_grasp(one, [], MAX_OPENING, wider=wider, least=wider)
@@ -76,9 +74,7 @@ def test_a_box_turned_by_half_a_turn_is_the_same_box(yaw: float, x: float, y: fl
 
 
 @given(angles, angles, st.floats(0.3, 0.65), st.floats(-0.3, 0.3))
-def test_of_two_ways_round_it_is_the_one_with_less_turn_of_the_wrist(
-    yaw: float, other: float, x: float, y: float
-) -> None:
+def test_of_two_ways_round_it_is_the_one_with_less_turn_of_the_wrist(yaw, other, x, y):
     for one in (box(0.08, 0.05, x=x, y=y, yaw=yaw), cup(x=x, y=y, yaw=other)):
         grasp = plan_grasp(one, [], MAX_OPENING)
         assert grasp is not None
@@ -130,6 +126,15 @@ def test_fingers_never_stand_in_a_neighbour_when_another_way_has_room(seed: int)
     if best > 0:
         for tip in fingers(grasp):
             assert min(np.linalg.norm(tip - other.position[:2]) for other in others) > 0.025
+
+
+@given(st.floats(0.3, 0.7), st.floats(-0.4, 0.4), st.floats(0.1, 0.5), st.floats(-10, 10))
+def test_the_tool_points_straight_down_with_its_fingers_on_the_line(x: float, y: float, z: float, yaw: float) -> None:
+    matrix = pointing_down(x, y, z, yaw).matrix()
+    assert matrix[:3, 3].tolist() == [x, y, z]
+    assert np.allclose(matrix[:3, 2], [0, 0, -1], atol=1e-12)
+    assert np.allclose(matrix[:3, 1], [math.cos(yaw), math.sin(yaw), 0], atol=1e-9)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
 
 
 @given(st.floats(0.005, 0.3))

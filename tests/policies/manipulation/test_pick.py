@@ -119,23 +119,6 @@ def test_a_missed_grasp_is_tried_exactly_once_more() -> None:
     assert desk.brain.plan(0)["attempts"] == 2
 
 
-@each_case("when", ["above", "down", "close", "lift", "slips"])
-def test_what_fails_or_slips_out_on_the_way_up_is_tried_again(when: str) -> None:
-    desk = Desk(PickBrain(), [scene(CUP)])
-    desk.look()
-    desk.state[0, 1] = GRASPED
-    while desk.steps()[-1] != ("lift" if when == "slips" else when):
-        desk.end()
-    if when == "slips":
-        desk.lift(0, by=0.04)
-    desk.end(success=when == "slips", message="something is in its way")
-    assert desk.steps()[-1] == "back"
-    problem = "the object was not lifted" if when == "slips" else "something is in its way"
-    assert desk.brain.plan(0)["problem"] == problem
-    desk.end()
-    assert desk.steps()[-1] == "above"
-
-
 @each_case("attempts", [1, 2, 5])
 def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
     desk = Desk(PickBrain(PickBrainConfig(attempts=attempts)), [scene(CUP)])
@@ -171,6 +154,20 @@ def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
     desk = Desk(PickBrain(), [scene(TableObject("box", "green", 0.05, 0.05, 0.1, 0.5, 0.0))])
     assert desk.look() == {}
     assert "green box does not fit" in desk.brain.plan(0)["problem"]
+
+
+def test_a_new_episode_starts_from_nothing() -> None:
+    desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
+    desk.look()
+    grasp(desk, 0, opening=0.02)
+    desk.end(0)
+    old = CommandResult(desk.given[0][-1].task_id, True, ResultCode.SUCCEEDED, "")
+    desk.brain.reset(np.array([0]), [1], 2, ["again"])
+    desk.given[0].clear()
+    assert desk.look({0: [old]})[0].task_id == "1-above"
+    assert desk.brain.plan(0)["attempts"] == 1
+    assert desk.brain.plan(0)["instruction"] == "again"
+    assert desk.steps(1) == ["above"]
 
 
 def test_it_picks() -> None:

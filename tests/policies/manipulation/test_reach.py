@@ -45,6 +45,14 @@ def test_it_asks_for_the_target_once_and_holds() -> None:
     assert desk.look() == {}
 
 
+def test_a_known_camera_error_is_subtracted() -> None:
+    desk = Desk(camera_error_m=[0.02, -0.01, 0.1])
+    goal = desk.look()[0]
+    assert goal.target_pose is not None
+    assert goal.target_pose.position == pytest.approx(TARGET[:3] - (0.02, -0.01, 0.1), abs=1e-15)
+    assert goal.target_pose.quaternion == pytest.approx(tuple(TARGET[3:]))
+
+
 def test_a_quaternion_in_single_precision_is_made_a_unit_again() -> None:
     desk = Desk()
     desk.targets[0, 3:] = np.array([0.1, 0.7, 0.7, 0.1]).astype(np.float32)

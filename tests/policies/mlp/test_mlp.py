@@ -252,6 +252,18 @@ def test_where_two_ways_are_shown_it_takes_the_likelier_and_not_what_is_between_
     assert float((forward - state[:, 1].sin()).abs().mean()) < 0.15
 
 
+def test_samples_scatter_as_the_deviation_says() -> None:
+    made = config(gaussian=True, initial_log_std=math.log(0.2))
+    policy, given = MlpPolicy(made), batch(made, rows=1)
+    mean = policy.predict_action_chunk(given)
+    noise = torch.randn(mean.shape)
+    assert torch.allclose(policy.predict_action_chunk(given, noise=noise), mean + 0.2 * noise)
+    made.sample = True
+    torch.manual_seed(1)
+    drawn = torch.stack([policy.predict_action_chunk(given) for _ in range(500)])
+    assert drawn.std(0).mean().item() == pytest.approx(0.2, rel=0.1)
+
+
 def test_features_that_it_cannot_be_built_for() -> None:
     with pytest.raises(ConfigError, match="the dataset has neither"):
         MlpPolicy(MlpConfig(device="cpu", output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))}))

@@ -51,9 +51,7 @@ def test_the_edges_belong_to_the_sector(degrees: int, expected: tuple[float, flo
         (np.inf, AHEAD),
     ],
 )
-def test_exactly_the_safe_distance_is_free_and_invalid_readings_are_not_there(
-    distance: float, expected: tuple[float, float]
-) -> None:
+def test_exactly_the_safe_distance_is_free_and_invalid_readings_are_not_there(distance, expected):
     assert tuple(decide(one_reading(0, distance))[0]) == expected
 
 

@@ -199,3 +199,17 @@ def test_what_it_cannot_drive_is_refused_with_what_is_missing() -> None:
         bound(beams=20)
     with pytest.raises(ConfigError, match="reset for 1 robots and sees 2"):
         see(bound(), np.vstack([goal_at(1, 0)] * 2), np.vstack([OPEN] * 2))
+
+
+def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
+    rng, n = np.random.default_rng(7), 5
+    goals = np.vstack([goal_at(*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)) for _ in range(n)])
+    scans = np.clip(np.cumsum(rng.normal(0, 0.1, (6, n, 360)), axis=2) / 2 + 1.5, 0.3, 3.5)
+
+    def drive(ids: list[int]) -> np.ndarray:
+        brain = bound(len(ids))
+        return np.array([see(brain, goals[ids], scan[ids]) for scan in scans])
+
+    together = drive(list(range(n)))
+    for sim in range(n):
+        assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()

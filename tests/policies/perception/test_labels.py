@@ -59,15 +59,3 @@ def test_corners_go_where_the_larger_image_shows_them() -> None:
     torch.testing.assert_close(standing, torch.zeros_like(standing), atol=1e-6, rtol=0)
     assert torch.equal(zoomed.present, labels.present)
     assert torch.equal(zoomed.colour, labels.colour)
-
-
-def test_nothing_changes_at_factor_1_and_back_again() -> None:
-    rng = np.random.default_rng(1)
-    labels = table(rng, 100)
-    about = rng.uniform((60, 40), (260, 200), (100, 2)).astype(np.float32)
-    factor = np.exp(rng.uniform(-0.3, 0.3, 100)).astype(np.float32)
-    same = labels.zoomed(CAMERA, about, np.ones(100, np.float32))
-    back = labels.zoomed(CAMERA, about, factor).zoomed(CAMERA, about, 1 / factor)
-    for got in (same, back):
-        for name in ("position", "size", "yaw"):
-            torch.testing.assert_close(getattr(got, name), getattr(labels, name), atol=1e-6, rtol=1e-5)

@@ -19,9 +19,7 @@ LOW, HIGH = (0.35, -0.3, 0.02), (0.65, 0.3, 0.1)
     roll=st.floats(-0.1, 0.1),
     seed=st.integers(0, 99),
 )
-def test_points_are_shown_where_they_were_seen_though_some_were_taken_for_others(
-    shift: tuple[float, ...], target: tuple[float, ...], roll: float, seed: int
-) -> None:
+def test_points_are_shown_where_they_were_seen_though_some_were_taken_for_others(shift, target, roll, seed):
     position, middle = np.add(SCENE_CAMERA.position, shift), np.add(SCENE_CAMERA.target, target)
     true = CameraView(tuple(position), tuple(middle), SCENE_CAMERA.fovy, roll)  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)

@@ -13,7 +13,6 @@ from torch import Tensor
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
-from bhd_lerobot.policies.pixels import modeling_pixels
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
@@ -110,34 +109,6 @@ def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytes
     assert {"reader.said.weight", "named.key.weight", "others.key.weight", "actor.0.weight"} <= changed
     # Without weights that were read, there is nothing to keep: it learns to see.
     assert all(one.requires_grad for one in PixelsPolicy(made()).perception.parameters())
-
-
-def test_an_image_that_differs_anywhere_is_another_and_not_all_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, samples = PixelsPolicy(made(perception="read before"), initialise=False).train(), batch()
-    looks: list[int] = []
-    look = policy._look
-    monkeypatch.setattr(policy, "_look", lambda image: looks.append(len(image)) or look(image))
-    monkeypatch.setattr(modeling_pixels, "_KEPT", 20)
-    image = samples[IMAGE][:, 0]
-    policy._cells(image)
-    for pixel in ((0, 1), (3, 5), (image.shape[-2] - 1, image.shape[-1] - 1)):
-        image[2, 1, *pixel] += 0.01
-        policy._cells(image)
-    assert looks == [1] * 11
-    for number in range(1, 5):
-        policy._cells(image + number / 100)
-    assert len(policy._looked) == 20
-
-
-def test_what_is_seen_of_an_image_does_not_depend_on_the_others_of_a_batch() -> None:
-    image = batch()[IMAGE][:, 0]
-    policy = PixelsPolicy(made(perception="read before"), initialise=False).train()
-    together = policy._cells(image)
-    for parts in ((3, 5), (1, 6, 1), (1,) * 8):
-        policy._looked.clear()  # as in a training that goes on from a checkpoint
-        apart = [torch.cat(found) for found in zip(*map(policy._cells, image.split(list(parts))), strict=True)]
-        for one, other in zip(together, apart, strict=True):
-            assert torch.equal(one, other)
 
 
 @pytest.mark.law

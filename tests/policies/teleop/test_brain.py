@@ -39,9 +39,7 @@ def test_a_leader_in_other_units_than_the_robot_is_refused_unless_they_are_trans
 
 
 @pytest.mark.parametrize("raises", [False, True])
-def test_what_a_teleoperator_answers_too_late_is_not_of_the_next_episode(
-    brain: TeleopBrain, monkeypatch: pytest.MonkeyPatch, raises: bool
-) -> None:
+def test_what_a_teleoperator_answers_too_late_is_not_of_the_next_episode(brain, monkeypatch, raises):
     calls = []
 
     def get_action() -> dict[str, float]:
@@ -59,9 +57,7 @@ def test_what_a_teleoperator_answers_too_late_is_not_of_the_next_episode(
     assert brain.act(SEEN).tolist() == [[2.0] * 3]  # type: ignore[union-attr]
 
 
-def test_what_a_teleoperator_answers_late_within_an_episode_counts(
-    brain: TeleopBrain, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_teleoperator_answers_late_within_an_episode_counts(brain, monkeypatch):
     def get_action() -> dict[str, float]:
         time.sleep(0.05)
         return dict.fromkeys(JOINTS, 1.0)

@@ -60,9 +60,7 @@ def test_the_rate_of_a_simulation_may_change() -> None:
 @pytest.mark.parametrize("latency", [0.0, 0.45, 0.8])
 @pytest.mark.parametrize("network", [0.0, 0.1])
 @pytest.mark.parametrize("is_synchronised", [True, False])
-def test_on_the_senders_own_clock_the_age_is_that_of_the_stamp(
-    latency: float, network: float, is_synchronised: bool
-) -> None:
+def test_on_the_senders_own_clock_the_age_is_that_of_the_stamp(latency, network, is_synchronised):
     """The way through the network is known where the clocks are the same; otherwise the least of it counts as none."""
     clock = ClockOffset(is_synchronised=is_synchronised)
     ahead = 0 if is_synchronised else -5000 * SECOND

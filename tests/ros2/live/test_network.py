@@ -9,9 +9,7 @@ from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 
 
 @pytest.mark.parametrize(("text", "number"), [(None, 0), ("", 0), ("42", 42), ("232", 232)])
-def test_the_domain_is_that_of_the_shell_unless_it_is_given(
-    monkeypatch: pytest.MonkeyPatch, text: str | None, number: int
-) -> None:
+def test_the_domain_is_that_of_the_shell_unless_it_is_given(monkeypatch, text, number):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     if text is not None:
         monkeypatch.setenv("ROS_DOMAIN_ID", text)
@@ -49,9 +47,7 @@ def test_what_cannot_be_is_refused(options: dict[str, object], text: str) -> Non
         (NetworkConfig(interface="auto"), "true", []),
     ],
 )
-def test_only_this_machine_is_looked_at_unless_an_interface_is_named(
-    network: NetworkConfig, multicast: str, peers: list[str]
-) -> None:
+def test_only_this_machine_is_looked_at_unless_an_interface_is_named(network, multicast, peers):
     tree = ElementTree.fromstring(network.cyclonedds_xml())
     assert tree.findtext(".//AllowMulticast") == multicast
     assert [peer.get("address") for peer in tree.iter("Peer")] == peers

@@ -20,10 +20,7 @@ ODOMETRY, SCAN, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "sen
 
 
 def test_a_real_node_is_heard_and_named_and_mismatches_are_said(domain: int) -> None:
-    with (
-        Node("robot", NetworkConfig(domain)) as node,
-        Peer("standin_turtlebot3.py", "--open", domain=domain) as peer,
-    ):
+    with Node("robot", NetworkConfig(domain)) as node, Peer("standin_turtlebot3.py", "--open", domain=domain) as peer:
         peer.wait_event("ready")
         scans = node.subscription("/scan", SCAN, SENSOR_DATA)
         received = until(scans.take, "a scan comes")
@@ -103,9 +100,7 @@ def stand(domain: int, name: str, subscribed: tuple[str, ...], published: tuple[
     return 0
 
 
-def test_another_robot_of_the_same_topics_is_named_and_a_recorder_or_a_brain_is_not(
-    domain: int, tmp_path: Path
-) -> None:
+def test_another_robot_of_the_same_topics_is_named_and_a_recorder_or_a_brain_is_not(domain, tmp_path):
     with contextlib.ExitStack() as others, Node("robot", NetworkConfig(domain)) as node:
 
         def add(name: str, subscribed: tuple[str, ...], published: tuple[str, ...]) -> None:

@@ -30,11 +30,7 @@ def taken(stamps: list[float]) -> list[float]:
     ]
     topic: Any = SimpleNamespace(take=lambda: [arrived.pop(0)] if arrived else [])
     node: Any = SimpleNamespace(subscription=lambda *_: topic, graph=SimpleNamespace(endpoints=list))
-    spec = NodeSpec(
-        "test",
-        NetworkConfig(),
-        (InputSpec.of(fields_of("/battery", BATTERY, ["voltage"])),),
-    )
+    spec = NodeSpec("test", NetworkConfig(), (InputSpec.of(fields_of("/battery", BATTERY, ["voltage"])),))
     channel = Channel(spec)
     receiver = Receiver(spec, channel, node)
     found = []
@@ -59,7 +55,5 @@ def taken(stamps: list[float]) -> list[float]:
         ([10.0, 10.2, 3610.3, 10.1, 3610.4, 10.2, 3610.3, 3610.5], [0, 1, 2, 4, 7]),  # one is late from before
     ],
 )
-def test_a_message_is_taken_unless_it_comes_after_a_later_one_of_the_same_clock(
-    stamps: list[float], wanted: list[float]
-) -> None:
+def test_a_message_is_taken_unless_it_comes_after_a_later_one_of_the_same_clock(stamps, wanted):
     assert taken(stamps) == wanted

@@ -1,7 +1,5 @@
 """Definitions of types that are found where a ROS installation has them."""
 
-from pathlib import Path
-
 import pytest
 
 from bhd_lerobot.errors import ConfigError
@@ -9,9 +7,7 @@ from bhd_lerobot.ros2.messages.definitions import find_type
 from bhd_lerobot.ros2.messages.types import type_store
 
 
-def test_types_are_found_in_a_ros_installation_with_those_that_they_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_types_are_found_in_a_ros_installation_with_those_that_they_name(tmp_path, monkeypatch):
     files = {
         "installed_msgs/msg/Outer.msg": "int32 LEAST=1  # a constant\nstd_msgs/Header header\nInner[] inner\n"
         'other_installed_msgs/Third third\nstring<=5 name "x"\n',

@@ -73,9 +73,7 @@ def test_it_reads_and_moves_the_joints_and_names_what_the_driver_does(plant: Arm
 
 
 @pytest.mark.parametrize("latched", [True, False])
-def test_the_safety_mode_is_read_of_drivers_that_keep_it_and_of_those_that_do_not(
-    plant: ArmPlant, domain: int, latched: bool
-) -> None:
+def test_the_safety_mode_is_read_of_drivers_that_keep_it_and_of_those_that_do_not(plant, domain, latched):
     """`ur_robot_driver` publishes it volatile before 2024; a node that receives no gripper's commands is no problem."""
     joints = [f"{joint}_joint" for joint in ur5().arm.chain.joints]
     out = reading()

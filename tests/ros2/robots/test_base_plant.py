@@ -101,9 +101,7 @@ def stands(robot: Peer) -> bool:
     return report["twist"] == [0.0, 0.0] and report["command"] == [0.0, 0.0]
 
 
-def test_it_reads_and_drives_the_robot_and_stops_it_when_commands_cease_and_when_it_is_closed(
-    robot: Peer, plant: BasePlant, shared: int
-) -> None:
+def test_it_reads_and_drives_the_robot_and_stops_it_when_commands_cease_and_when_it_is_closed(robot, plant, shared):
     out = reading()
     plant.read(out)
     now = time.monotonic_ns()
@@ -139,9 +137,7 @@ def test_it_stops_when_the_node_is_killed_or_stopped(robot: Peer, plant: BasePla
         os.kill(plant.link.pids["node"], signal.SIGCONT)
 
 
-def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_that_is_gone_are_faults(
-    plant: BasePlant, shared: int
-) -> None:
+def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_that_is_gone_are_faults(plant, shared):
     def is_well() -> bool:
         return not plant.link.problem
 
@@ -271,9 +267,7 @@ def test_a_namespace_and_another_scanner() -> None:
         ({"realtime": RealtimeConfig(brain_timeout_s=0.5)}, 0.5, 0.5),
     ],
 )
-def test_the_brain_of_a_ros_robot_is_waited_for_as_long_as_its_commands(
-    options: dict[str, Any], brain_s: float, plant_s: float
-) -> None:
+def test_the_brain_of_a_ros_robot_is_waited_for_as_long_as_its_commands(options, brain_s, plant_s):
     realtime = TurtleBot3Config(plant="ros2", **options).realtime
     assert (realtime.brain_timeout_s, realtime.plant_timeout_s) == (brain_s, plant_s)
 

@@ -121,9 +121,7 @@ def element(field: str, kind: str = FLOATS) -> dict[str, str]:
         ([element("pose.orientation", "geometry_msgs/msg/PoseStamped")], "a quaternion .* cannot be sent"),
     ],
 )
-def test_what_would_be_sent_as_zero_or_without_a_name_is_refused(
-    tmp_path: Path, action: list[dict[str, str]], message: str
-) -> None:
+def test_what_would_be_sent_as_zero_or_without_a_name_is_refused(tmp_path, action, message):
     tree = {"observation": {"x.vel": SPEED}, "action": {f"a{k}.pos": one for k, one in enumerate(action)}}
     with pytest.raises(ConfigError, match=message):
         Ros2Robot(config(tmp_path, tree, domain=1))
@@ -262,9 +260,7 @@ def test_a_frame_is_taken_when_it_is_asked_for_and_each_topic_has_an_age(tmp_pat
         until(lambda: 1.0 < device.sensor_period_s < 2.0, "the slowest topic's period is known")
 
 
-def test_a_command_that_no_node_receives_is_named_before_the_first_episode(
-    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_that_no_node_receives_is_named_before_the_first_episode(tmp_path, domain, monkeypatch):
     monkeypatch.setattr("bhd_lerobot.ros2.live.link._RECEIVED_S", 2.0)
 
     def fails(message: str, *receives: tuple[str, str]) -> None:
@@ -282,9 +278,7 @@ def test_a_command_that_no_node_receives_is_named_before_the_first_episode(
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_robot_that_stands_against_its_commands_is_named(
-    tmp_path: Path, domain: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, moves: bool
-) -> None:
+def test_a_robot_that_stands_against_its_commands_is_named(tmp_path, domain, capsys, monkeypatch, moves):
     monkeypatch.setattr("bhd_lerobot.ros2.robots.robot._STANDS_NS", 300_000_000)
     started: list[bool] = []
     with (

@@ -138,8 +138,6 @@ def test_stock_lerobot_record(tmp_path: Path, domain: int) -> None:
         (MAPPING.replace("linear.x}", "linear.w}"), {}, "Did you mean|Unknown field"),
     ],
 )
-def test_a_mapping_that_cannot_be_used_is_refused(
-    tmp_path: Path, text: str, options: dict[str, object], message: str
-) -> None:
+def test_a_mapping_that_cannot_be_used_is_refused(tmp_path, text, options, message):
     with pytest.raises(ConfigError, match=message):
         Ros2Robot(config_of(tmp_path, 1, text, **options))

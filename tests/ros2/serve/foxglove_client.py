@@ -12,13 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 
 class Client:
-    """A client.
-
-    Attributes:
-        schemas: the definition of each topic's type, by topic.
-        messages: the decoded messages, by topic.
-        notices: what the server reported.
-    """
+    """A client."""
 
     def __init__(self, port: int) -> None:
         self._url = f"ws://127.0.0.1:{port}"

@@ -71,9 +71,7 @@ def test_setpoints_of_a_brain_move_an_arm(domain: int, tmp_path: Path) -> None:
         assert result.message == "The robot is no longer served."
 
 
-def test_a_base_is_driven_within_limits_and_stands_when_twists_cease_or_it_is_stopped(
-    domain: int, tmp_path: Path
-) -> None:
+def test_a_base_is_driven_within_limits_and_stands_when_twists_cease_or_it_is_stopped(domain, tmp_path):
     with base(domain, tmp_path) as (side, _, log):
         until(lambda: drives(side, log), "it drives")
         until(lambda: twist(log) == STAND, "it stands without twists")
@@ -119,17 +117,12 @@ def test_a_base_stands_whichever_process_ends(part: str, number: signal.Signals,
                 os.kill(pid, signal.SIGCONT)
 
 
-def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_is_back(
-    domain: int, tmp_path: Path
-) -> None:
+def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_is_back(domain, tmp_path):
     with arm(domain, tmp_path, silence_s=0.5) as (bridge, robot, _):
         robot.signal(signal.SIGKILL)
         bridge.wait_for("FAULT: ")
         assert "/joint_states has sent no message for" in bridge.text or "newest reading is" in bridge.text
-        with (
-            Peer("ur_driver_standin.py", domain=domain) as back,
-            Node("brain", NetworkConfig(domain=domain)) as node,
-        ):
+        with Peer("ur_driver_standin.py", domain=domain) as back, Node("brain", NetworkConfig(domain=domain)) as node:
             back.wait_event("ready")
             side = Side(bridge, node)
 
@@ -164,8 +157,6 @@ def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> Non
         (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant is not given"),
     ],
 )
-def test_a_bridge_in_front_of_nothing_is_refused(
-    options: list[str], error: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bridge_in_front_of_nothing_is_refused(options, error, capsys):
     assert ros2.main(["bridge", *options]) == 2
     assert error in " ".join(capsys.readouterr().err.split())

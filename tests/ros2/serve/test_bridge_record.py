@@ -48,9 +48,7 @@ def once(outcomes: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
     return [one for one, _ in itertools.groupby(outcomes)]
 
 
-def test_twists_are_an_episode_until_they_cease_and_after_a_stop_and_at_the_end_too(
-    domain: int, tmp_path: Path
-) -> None:
+def test_twists_are_an_episode_until_they_cease_and_after_a_stop_and_at_the_end_too(domain, tmp_path):
     root = tmp_path / "drives"
     with base(domain, tmp_path, *options(root)) as (side, _, log):
         for _ in range(20):  # to stand is no command of a robot that stands

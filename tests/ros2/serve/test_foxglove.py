@@ -70,9 +70,7 @@ def as_plain(message: Any) -> Any:
     return message if isinstance(message, str) else f"{float(message)!r}"
 
 
-def test_a_client_receives_what_is_published_with_a_schema_that_others_decode(
-    node: MirroredNode, foxglove: FoxgloveServer, port: int
-) -> None:
+def test_a_client_receives_what_is_published_with_a_schema_that_others_decode(node, foxglove, port):
     publishers = {topic: node.publisher(topic, msgtype) for topic, (msgtype, _) in SENT.items()}
     messages = {topic: encode(msgtype, fields, 1)[0] for topic, (msgtype, fields) in SENT.items()}
     foxglove.start()
@@ -92,9 +90,7 @@ def test_a_client_receives_what_is_published_with_a_schema_that_others_decode(
     asyncio.run(scenario())
 
 
-def test_who_comes_later_receives_what_is_latched_and_nothing_else(
-    node: MirroredNode, foxglove: FoxgloveServer, port: int
-) -> None:
+def test_who_comes_later_receives_what_is_latched_and_nothing_else(node, foxglove, port):
     latched, other = node.publisher("/latched", BOOL, LATCHED), node.publisher("/other", BOOL)
     for publisher in (latched, other):
         publisher.send(encode(BOOL, {"data": True}, 1)[0])
@@ -126,9 +122,7 @@ SPOILT = {
 }
 
 
-def test_what_a_client_publishes_is_taken_by_the_topics_input_or_refused_and_counted(
-    node: MirroredNode, foxglove: FoxgloveServer, port: int
-) -> None:
+def test_what_a_client_publishes_is_taken_by_the_topics_input_or_refused_and_counted(node, foxglove, port):
     taken: list[float] = []
     counts = Counts()
     entries = [

@@ -57,9 +57,7 @@ def results(folder: Path) -> Any:
     return json.loads((folder / "run" / "rounds.json").read_text())
 
 
-def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(tmp_path, monkeypatch, capsys):
     called: list[tuple[str, list[str]]] = []
 
     def watched(name: str, fails: bool = False) -> Any:
@@ -187,9 +185,7 @@ def test_what_was_reported_stays(finished: Path, tmp_path: Path) -> None:
     assert (run / "rounds.json").read_bytes() == before
 
 
-def test_after_a_failure_the_same_command_is_said_to_repeat_the_step_and_not_to_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_after_a_failure_the_same_command_is_said_to_repeat_the_step_and_not_to_go_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(dagger._PROGRAMS, "bhd-record", lambda _: 2)
     assert main([f"--config_path={settings(tmp_path)}"]) == 2
     printed = " ".join(capsys.readouterr().err.split())
@@ -197,9 +193,7 @@ def test_after_a_failure_the_same_command_is_said_to_repeat_the_step_and_not_to_
     assert "continues there" not in printed
 
 
-def test_files_that_say_something_else_than_before_are_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_that_say_something_else_than_before_are_not_gone_on_with(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda _: 130))
     argument = f"--config_path={settings(tmp_path)}"
     stages = yaml.safe_load((tmp_path / "dagger.yaml").read_text())
@@ -220,9 +214,7 @@ def test_files_that_say_something_else_than_before_are_not_gone_on_with(
     assert f"policy.config.policy.optimizer_lr was {before}, and is 0.5." in printed
 
 
-def test_a_training_that_had_ended_before_it_was_noted_is_not_gone_on_with(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_that_had_ended_before_it_was_noted_is_not_gone_on_with(finished, tmp_path, monkeypatch):
     run = shutil.copytree(finished / "run", tmp_path / "run", symlinks=True)
     (run / "round_0" / "done.json").write_text(json.dumps({"done": ["record"], "seconds": 1.0}))
     called: list[str] = []
@@ -237,9 +229,7 @@ def test_the_expert_is_judged_as_it_is_configured(finished: Path) -> None:
     assert judged["brains"]["expert"]["margin_m"] == 0.08
 
 
-def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(tmp_path, monkeypatch, capsys):
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -253,9 +243,7 @@ def test_the_reason_for_a_stop_is_said_also_where_nothing_more_can_be_written(
 
 
 @pytest.mark.thorough
-def test_every_round_learns_from_data_that_was_recorded_before_as_well(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_round_learns_from_data_that_was_recorded_before_as_well(tmp_path, capsys):
     folders = [tmp_path / name for name in ("before", "after")]
     for folder in folders:
         folder.mkdir()
@@ -289,9 +277,7 @@ def without_advice(folder: Path) -> dict[str, Any]:
     return {"config": str(file), "options": []}
 
 
-def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_learned(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_learned(tmp_path, monkeypatch):
     called: list[list[str]] = []
     monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda given: called.append(given) or 1))
     stages = {
@@ -367,13 +353,7 @@ def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_l
         ),
     ],
 )
-def test_what_cannot_be_is_said_before_the_first_round(
-    changed: dict[str, Any],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_is_said_before_the_first_round(changed, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     held_out = yaml.safe_load((CONFIGS / "record/turtlebot3_avoid.yaml").read_text())
     Path("held_out.yaml").write_text(yaml.safe_dump({**held_out, "split": "held_out"}))

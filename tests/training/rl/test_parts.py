@@ -61,9 +61,7 @@ def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
 @pytest.mark.law
 @each_case("case", CASES)
 @each_case("steps", [None, (3, 2)])
-def test_it_does_the_same_at_first_and_learns_from_what_it_did_not_see(
-    case: str, steps: tuple[int, int] | None
-) -> None:
+def test_it_does_the_same_at_first_and_learns_from_what_it_did_not_see(case, steps):
     """Whatever the ignored numbers are, and what was before."""
     narrow = policy(**CASES[case] | ({} if steps is None else {"n_obs_steps": 1, "obs_stride": 1}))
     wide = seeing_more(narrow, ignored=True) if steps is None else seeing_more(narrow, ignored=True, steps=steps)

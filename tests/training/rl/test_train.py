@@ -142,6 +142,8 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: 
 def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded(tmp_path: Path) -> None:
     run(tmp_path / "run", steps=32)
     command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"]
+    with pytest.raises(ConfigError, match="has done 32 of 32"):
+        train(parse_rl(command[:2]), Console(file=io.StringIO()))
     with pytest.raises(ConfigError, match="cannot be resumed"):
         train(parse_rl([*command, "--policy.critic_dims=[4]"]), Console(file=io.StringIO()))
     state = tmp_path / "run" / "checkpoints" / "last" / "training_state"
@@ -181,9 +183,7 @@ def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_chec
 
 
 @pytest.mark.parametrize(("channels", "privileged"), [([], False), ([4], True)])
-def test_the_exported_policy_does_what_the_learners_actor_does(
-    tmp_path: Path, channels: list[int], privileged: bool
-) -> None:
+def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path, channels, privileged):
     config = parse_rl(options(**{"policy.scan.channels": channels, "policy__layer_norm": "true"}))
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
@@ -219,18 +219,14 @@ def test_the_actor_is_frozen_while_the_critic_warms_up(finished: RlResult, tmp_p
     np.testing.assert_array_equal(actions(frozen.checkpoint, states), actions(finished.checkpoint, states))
 
 
-def test_the_learning_rate_follows_the_steps_and_never_the_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_learning_rate_follows_the_steps_and_never_the_time(tmp_path, monkeypatch):
     monkeypatch.setattr(module.Run, "_minutes", lambda _: 0.9)
     result = run(tmp_path / "run", max_minutes=1, steps=90)  # the last update is after 96
     found = {row["step"]: row["lr"] for row in rows(result.output_dir) if "lr" in row}
     assert found == {step: pytest.approx(3e-4 * max(0.0, 1 - step / 90)) for step in (32, 64, 96)}
 
 
-def test_the_best_checkpoint_is_the_one_of_most_successes_and_the_start_is_among_the_candidates(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_checkpoint_is_the_one_of_most_successes_and_the_start_is_among_the_candidates(tmp_path, monkeypatch):
     wanted = {"validation__freq": 32, "validation__select": "success"}
     for case, (levels, best) in enumerate(  # success and score, at the start and after each update
         [([(0.8, 0.2), (0.9, 0.3), (1.0, 0.1), (1.0, 0.3)], 96), ([(1.0, 0.3), (0.9, 0.9), (1.0, 0.1), (0.8, 1.0)], 0)]
@@ -265,9 +261,7 @@ def test_ctrl_c_saves_and_prints_the_resume_command(tmp_path: Path, monkeypatch:
     assert main([f"--config_path={tmp_path / 'run'}", "--resume=true"]) == 0
 
 
-def test_without_stable_baselines3_the_message_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_without_stable_baselines3_the_message_says_how_to_install_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     assert main(options(tmp_path / "run")) == 2
     assert "pip install -e '.[rl]'" in capsys.readouterr().err

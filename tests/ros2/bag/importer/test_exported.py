@@ -85,9 +85,7 @@ def described(episode: EpisodeSummary) -> tuple[Any, ...]:
 @pytest.mark.law
 @pytest.mark.parametrize("layout", [(), ONE_BAG])
 @pytest.mark.parametrize("robot", ["turtlebot3", "ur5", "ros2", "toy"])
-def test_an_exported_dataset_comes_back_equal(
-    recorded: dict[str, Path], tmp_path: Path, robot: str, layout: tuple[str, ...]
-) -> None:
+def test_an_exported_dataset_comes_back_equal(recorded, tmp_path, robot, layout):
     """To the bit: episodes, frames, columns, instructions and outcomes; without an option, of every layout."""
     root, back = recorded[robot], tmp_path / "back"
     assert run(back, export(root, tmp_path / "bags", *layout)) == 0
@@ -122,9 +120,7 @@ MAP = [f"--map.observation.turn={{{NUMBERS}}}", f"--map.action.lift.pos={{{COMMA
         ("ros2", (), [*MAP, "--stamps=auto"]),  # resampled
     ],
 )
-def test_a_preset_or_a_mapping_reads_what_each_episode_states(
-    recorded: dict[str, Path], tmp_path: Path, robot: str, layout: Any, arguments: list[str]
-) -> None:
+def test_a_preset_or_a_mapping_reads_what_each_episode_states(recorded, tmp_path, robot, layout, arguments):
     root, back = recorded[robot], tmp_path / "back"
     assert run(back, export(root, tmp_path / "bags", *layout), *arguments) == 0
     old, new = dataset_info(root), dataset_info(back)
@@ -143,9 +139,7 @@ def test_a_preset_or_a_mapping_reads_what_each_episode_states(
 
 
 @pytest.mark.parametrize("layout", [(), ONE_BAG])
-def test_options_have_precedence_over_what_a_bag_states(
-    recorded: dict[str, Path], tmp_path: Path, layout: tuple[str, ...]
-) -> None:
+def test_options_have_precedence_over_what_a_bag_states(recorded, tmp_path, layout):
     bags, back = export(recorded["toy"], tmp_path / "bags", *layout), tmp_path / "back"
     assert run(back, bags, "--fps=10", "--task=Wave.", "--outcome=collision", "--min_episode_s=0.5") == 0
     info = dataset_info(back)
@@ -165,9 +159,7 @@ def test_options_have_precedence_over_what_a_bag_states(
         ("tool", "of 'toy' at 30 fps, and .* of 'other toy' at 30 fps"),
     ],
 )
-def test_bags_of_another_robot_or_rate_are_refused(
-    recorded: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], other: str, message: str
-) -> None:
+def test_bags_of_another_robot_or_rate_are_refused(recorded, tmp_path, capsys, other, message):
     bags = [export(recorded[name], tmp_path / name, f"--start_time={len(name)}000") for name in ("toy", other)]
     assert run(tmp_path / "back", *bags) == 2
     assert not (tmp_path / "back").exists()

@@ -7,15 +7,7 @@ import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.ros2.bag.importer.resample import (
-    NANO,
-    apart,
-    frame_times,
-    grids,
-    message_times,
-    newest,
-    newest_before,
-)
+from bhd_lerobot.ros2.bag.importer.resample import NANO, apart, frame_times, grids, message_times, newest, newest_before
 from bhd_lerobot.ros2.messages.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
 from tests.cases import each_case
 
@@ -120,17 +112,6 @@ def test_scanners_of_every_kind_become_ours_by_angle():
         wanted = 2 * np.pi * np.arange(beams) / beams
         # Off by at most half a measured step, and the world's slope is below 1.1 m/rad.
         assert np.abs(found[0] - world(wanted)).max() <= 1.1 * abs(step) / 2 + 1e-9, (count, angle_min, sign, beams)
-
-
-def test_a_turned_and_an_upside_down_scanner():
-    wanted = 2 * np.pi * np.arange(360) / 360
-    quarter = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    beam = nearest_beams(Sweep(360, 0.0, 2 * np.pi / 360), 360, quarter, "/scan")
-    assert beam.tolist() == [(k - 90) % 360 for k in range(360)]
-    over = (1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)  # half a turn about x
-    beam = nearest_beams(Sweep(360, 0.0, 2 * np.pi / 360), 360, over, "/scan")
-    assert np.allclose(np.cos(wanted[beam]), np.cos(wanted))
-    assert np.allclose(np.sin(wanted[beam]), -np.sin(wanted))
 
 
 def test_a_scanner_that_does_not_see_all_around_is_refused():

@@ -62,9 +62,7 @@ def texts(messages: Messages) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_what_is_played_is_recorded_again_with_its_quality_of_service(
-    storage: str, domain: int, tmp_path: Path
-) -> None:
+def test_what_is_played_is_recorded_again_with_its_quality_of_service(storage, domain, tmp_path):
     first, second = write(tmp_path / "first", storage), tmp_path / "second"
     recorder = Fork(main, ["record", "--all", f"--output={second}", f"--domain={domain}"])
     player = Fork(main, ["play", str(first), f"--domain={domain}", "--wait=60"], output=tmp_path / "printed")

@@ -110,9 +110,7 @@ def recorded(domain: int, tmp_path: Path, *arguments: str) -> Iterator[tuple[For
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(
-    storage: str, domain: int, tmp_path: Path
-) -> None:
+def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(storage, domain, tmp_path):
     with recorded(domain, tmp_path, "--all", f"--storage={storage}", "--exclude=/rosout|/parameter.*") as (fork, bag):
         fork.send_signal(signal.SIGINT)
         assert fork.wait() == 0
@@ -137,9 +135,7 @@ def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_what_was_recorded_before_a_kill_can_be_read_with_metadata_and_without(
-    storage: str, domain: int, tmp_path: Path
-) -> None:
+def test_what_was_recorded_before_a_kill_can_be_read_with_metadata_and_without(storage, domain, tmp_path):
     with recorded(domain, tmp_path, "--all", f"--storage={storage}") as (fork, bag):
         fork.kill()
     file = bag / f"bag.{ENDINGS[storage]}"
@@ -249,9 +245,7 @@ def test_times_go_on_when_a_clock_jumps(domain: int, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_a_disk_that_is_nearly_full_ends_the_recording(
-    storage: str, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_nearly_full_ends_the_recording(storage, domain, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     options = RecordOptions(tmp_path / "bag", storage=storage)
     with Recording(domain, options, ("/a", TEXT, Qos())) as recording:
@@ -273,9 +267,7 @@ def limited(size: int, arguments: list[str]) -> int:
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_where_nothing_can_be_written_any_more_what_was_written_can_be_read(
-    storage: str, domain: int, tmp_path: Path
-) -> None:
+def test_where_nothing_can_be_written_any_more_what_was_written_can_be_read(storage, domain, tmp_path):
     bag, printed = tmp_path / "bag", tmp_path / "printed"
     arguments = ["record", "/a", f"--output={bag}", f"--domain={domain}", f"--storage={storage}"]
     fork = Fork(limited, 16 << 20, arguments, output=printed)
@@ -311,9 +303,7 @@ def source_of_own(domain: int) -> None:
             time.sleep(0.01)
 
 
-def test_a_type_that_nobody_defines_is_named_and_left_out_unless_it_is_defined_here(
-    domain: int, tmp_path: Path
-) -> None:
+def test_a_type_that_nobody_defines_is_named_and_left_out_unless_it_is_defined_here(domain, tmp_path):
     mapping, printed = tmp_path / "map.yaml", tmp_path / "printed"
     mapping.write_text(f"types:\n  {OWN}: int32 number\n")
     source = Fork(source_of_own, domain)
@@ -353,9 +343,7 @@ def test_a_type_that_nobody_defines_is_named_and_left_out_unless_it_is_defined_h
         (("/tf", "/tf_static"), "/tf.+", {"/tf"}),
     ],
 )
-def test_named_topics_or_all_but_those_of_actions_are_recorded_without_the_excluded(
-    topics: tuple[str, ...], exclude: str | None, recorded_ones: set[str]
-) -> None:
+def test_named_topics_or_all_but_those_of_actions_are_recorded_without_the_excluded(topics, exclude, recorded_ones):
     options = RecordOptions(Path("bag"), topics, exclude)
     names = ("/tf", "/tf_static", "/robot1/tf", "/a/_action/status")
     assert {name for name in names if options.wants(name)} == recorded_ones

@@ -69,9 +69,7 @@ def test_a_link_to_nothing_stays(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["link"]
 
 
-def test_a_full_disk_leaves_no_dataset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_leaves_no_dataset(tmp_path, monkeypatch, capsys):
     """The recorder's message about saved episodes, and `repair`, does not hold for an import."""
     write(tmp_path / "bag", drive(seconds=2))
     move = Disk.move

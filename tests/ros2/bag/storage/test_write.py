@@ -34,9 +34,7 @@ def read(path: Path) -> list[int]:
 
 @pytest.mark.law
 @pytest.mark.parametrize("step", range(3, 31))  # after the two by which the file begins
-def test_an_mcap_file_is_complete_before_and_after_every_step_of_writing_it(
-    step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_mcap_file_is_complete_before_and_after_every_step_of_writing_it(step, tmp_path, monkeypatch):
     bag, copy, steps, real = tmp_path / "bag", tmp_path / "copy.mcap", 0, os.pwrite
 
     def pwrite(file: int, data: bytes, place: int) -> int:
