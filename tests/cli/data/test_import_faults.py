@@ -14,7 +14,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
-from tests.cli.data.import_support import TASK, imported, refused
+from tests.cli.data.import_support import TASK, imported, refused, run
 from tests.ros2.bag import support as bags
 from tests.ros2.bag.support import NANO, START, STORE, changed, drive, write
 
@@ -261,6 +261,24 @@ def test_a_bag_without_messages_is_refused(tmp_path, capsys):
         writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=STORE)
     assert "no topic /scan" in refused(tmp_path / "none", tmp_path / "d", capsys)
     assert "no message of /scan" in refused(tmp_path / "silent", tmp_path / "d", capsys)
+
+
+def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
+    types = bags.T
+    still = types["geometry_msgs/msg/TransformStamped"](
+        header=bags.header(START, "tb3_1/base_link"),
+        child_frame_id="tb3_1/laser",
+        transform=types["geometry_msgs/msg/Transform"](
+            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=bags.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+        ),
+    )
+    named = changed(messages, "/scan", lambda at: bags.scan(at - 5 * 10**6, frame="tb3_1/laser"))
+    named = changed(named, "/odom", lambda at: bags.odometry(at, child="tb3_1/base_footprint"))
+    named = [("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=[still])), *named]
+    named = [(f"/tb3_1{topic}", at, message) for topic, at, message in named]
+    topics = [f"--{role}=/tb3_1/{topic}" for role, topic in (("scan", "scan"), ("odom", "odom"), ("cmd", "cmd_vel"))]
+    assert run(write(tmp_path / "bag", named), tmp_path / "d", *topics) == 0
+    assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
 
 
 def jpegs(count=40):

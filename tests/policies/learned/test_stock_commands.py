@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets import LeRobotDataset
 
 import bhd_lerobot
 from bhd_lerobot.cli import train
@@ -205,6 +206,32 @@ print(*ProcessorStepRegistry.list())
     ours = re.findall(r'^@ProcessorStepRegistry\.register\(name="(\w+)"\)', source, re.MULTILINE)
     assert len(ours) >= 5
     assert {*ours} <= {*done.stdout.split()}
+
+
+def test_lerobot_rollout_ends_after_its_duration_and_what_it_records_is_a_dataset(
+    trained: Callable[[str, str], Trained], tmp_path: Path
+) -> None:
+    made = trained("bhd_mlp", "lerobot-train")
+    options = arguments(
+        policy__path=made.checkpoint,
+        strategy__type="sentry",
+        fps=10,
+        duration=0.5,
+        return_to_initial_position="false",
+        play_sounds="false",
+        dataset__repo_id="test/rollout_avoid",
+        dataset__root=tmp_path / "rollout",
+        dataset__fps=10,
+        dataset__single_task="Roam.",
+        dataset__push_to_hub="false",
+    )
+    run_stock("lerobot-rollout", [*made.lerobot_rollout, *options])
+    dataset = LeRobotDataset("test/rollout_avoid", root=tmp_path / "rollout")
+    names = [f"scan_{beam:03}.pos" for beam in range(BEAMS)]
+    assert dataset.meta.features["observation.state"]["names"] == ["x.vel", "theta.vel", *names]
+    assert dataset.meta.robot_type == "turtlebot3"
+    assert 0 < dataset.num_frames <= 6
+    assert dataset[0]["action"].abs().max() > 0
 
 
 def test_what_a_robots_sensors_do_not_tell_is_named(tmp_path: Path) -> None:

@@ -119,6 +119,23 @@ def test_a_missed_grasp_is_tried_exactly_once_more() -> None:
     assert desk.brain.plan(0)["attempts"] == 2
 
 
+@each_case("when", ["above", "down", "close", "lift", "slips"])
+def test_what_fails_or_slips_out_on_the_way_up_is_tried_again(when: str) -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    desk.state[0, 1] = GRASPED
+    while desk.steps()[-1] != ("lift" if when == "slips" else when):
+        desk.end()
+    if when == "slips":
+        desk.lift(0, by=0.04)
+    desk.end(success=when == "slips", message="something is in its way")
+    assert desk.steps()[-1] == "back"
+    problem = "the object was not lifted" if when == "slips" else "something is in its way"
+    assert desk.brain.plan(0)["problem"] == problem
+    desk.end()
+    assert desk.steps()[-1] == "above"
+
+
 @each_case("attempts", [1, 2, 5])
 def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
     desk = Desk(PickBrain(PickBrainConfig(attempts=attempts)), [scene(CUP)])
