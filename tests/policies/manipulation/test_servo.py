@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -98,6 +98,19 @@ def test_what_is_to_be_done_depends_on_nothing_but_what_is_seen() -> None:
     # In which row an object is told of is of no account.
     rows = told.reshape(60, MAX_OBJECTS, -1)[:, rng.permutation(MAX_OBJECTS)].reshape(60, -1)
     assert np.allclose(brain.act(Observation(TOOL_NAMES, state, {}, rows)), action)
+
+
+def test_a_known_error_of_the_camera_is_taken_away() -> None:
+    error = [0.01, -0.02, 0.005]
+    state, told = tools(60, np.random.default_rng(2)), tables(60)
+    wrong = told.reshape(60, MAX_OBJECTS, -1).copy()
+    place = OBJECT_FIELDS.index("x")
+    wrong[:, :, place : place + 3] += error * (wrong[:, :, :1] > 0)
+    right = pick().act(Observation(TOOL_NAMES, state, {}, told))
+    config = PickServoConfig(camera_error_m=error)
+    seen = pick(config).act(Observation(TOOL_NAMES, state, {}, wrong.reshape(60, -1)))
+    # The turn of the wrist follows from where the object seems to be.
+    assert np.allclose(seen[:, :3], right[:, :3], atol=1e-6)
 
 
 def test_it_opens_wider_only_where_there_is_room() -> None:
