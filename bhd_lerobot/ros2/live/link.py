@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import hashlib
+import math
 import os
 import socket
 import subprocess
@@ -23,6 +24,7 @@ from bhd_lerobot.ros2.live.spec import NodeSpec
 
 _START_S = 30.0
 _END_S = 3.0
+_TOLD_S = 2.0  # of waiting until it is told what for
 _CHECKS = 3  # looks at who else is there, before a command is sent
 _RECEIVED_S = 8.0  # that it may take until nodes are found that receive commands
 _GHOST_S = 25.0  # a node that was killed counts for up to 20 s
@@ -91,6 +93,7 @@ class NodeLink:
             raise RealtimeError(f"The ROS 2 node {self.spec.name} {answer}")
 
     def _wait_for_topics(self, end: float) -> None:
+        told = time.monotonic() + _TOLD_S
         while True:
             state = self.state
             heard = state is not None and all(
@@ -100,6 +103,10 @@ class NodeLink:
                 return
             if time.monotonic() > end:
                 raise RealtimeError(self.problem or "No topic has sent anything yet.")
+            if time.monotonic() > told:
+                told = math.inf
+                why = self.problem.partition(". ")[0] or "No topic has sent anything yet"
+                print(f"Waiting for the robot, {end - time.monotonic():.0f} s more: {why}.", file=sys.stderr)
             self.check()
             time.sleep(0.01)
 

@@ -241,12 +241,13 @@ def test_a_flood_is_read(domain: int) -> None:
             plant.close()
 
 
-def test_a_network_with_nobody_is_named(domain: int) -> None:
+def test_a_network_with_nobody_is_named(domain: int, capsys: pytest.CaptureFixture[str]) -> None:
     plant = make(domain)
     where = rf"Nobody publishes /joint_states .* in ROS domain {domain} on 'lo'\..*No node publishes anything.*domain"
     with pytest.raises(RealtimeError, match=where):
-        plant.link.open(patience_s=2.0)
+        plant.link.open(patience_s=8.0)
     plant.close()
+    assert "Waiting for the robot, " in capsys.readouterr().err
 
 
 def test_a_namespace_and_another_scanner() -> None:
