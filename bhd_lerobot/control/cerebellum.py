@@ -60,6 +60,7 @@ class Cerebellum:
         numbers: the record of their limits, shape (1,).
         written: what is written to the plant, shape (n, actuators).
         readings: checks that what the plant reads can be a measurement of the present.
+        now_ns: the time of the last tick [ns].
         may_write: whether it is known where the robots are: before, nothing is written.
         requested: the setpoint that was last taken, before all limits, shape (n, width).
     """
@@ -113,7 +114,7 @@ class Cerebellum:
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
         numbers["timeout_ns"], numbers["width"], numbers["has_sensors"] = self._timeout_ns, width, sensors > 0
         self._is_compiled = controller.is_compiled
-        self._now_ns = 0
+        self.now_ns = 0
         self.may_write = False
         self._dropped = np.zeros(n, np.int64)
         self._fifo = CommandFifo(n, width) if fifo is None else fifo
@@ -180,7 +181,19 @@ class Cerebellum:
         Args:
             now_ns: the time that the tick is for [ns].
         """
-        self._now_ns = now_ns
+        try:
+            self._tick(now_ns)
+        except BaseException:
+            self._keep_stops()
+            raise
+
+    def _keep_stops(self) -> None:
+        """Begin stops again in the next tick: what interrupted this one may have interrupted their beginning."""
+        for mode in (Mode.STOPPING, Mode.ESTOP, Mode.FAULT):
+            self._entered[self.mode == mode] |= 1 << mode
+
+    def _tick(self, now_ns: int) -> None:
+        self.now_ns = now_ns
         self._read()
         if self._is_compiled:
             if self.controller.arms is None:
@@ -199,13 +212,17 @@ class Cerebellum:
 
     def serve(self) -> None:
         """Let the controller do what ticks wait for."""
-        for sim in np.flatnonzero(self.controller.arms["stage"]).tolist():
-            self.controller.serve(sim)
+        try:
+            for sim in np.flatnonzero(self.controller.arms["stage"]).tolist():
+                self.controller.serve(sim)
+        except BaseException:
+            self._keep_stops()
+            raise
 
     def _read(self) -> None:
         reading = self.reading
         self.plant.read(reading)
-        self._stamp_ns[:] = self._now_ns if reading.stamp_ns is None else reading.stamp_ns
+        self._stamp_ns[:] = self.now_ns if reading.stamp_ns is None else reading.stamp_ns
         self._has_stamps[0] = reading.stamp_ns is not None
         if self._has_effort is not None:
             self._has_effort[0] = reading.has_effort

@@ -21,7 +21,7 @@ LOOKS = 64
 """Most looks at the wheels' progress within a robot's latency."""
 SHAPES = 64
 """Most capsules of an arm, of what stands around it, and of what it holds."""
-PAIRS = 512
+PAIRS = 1024
 """Most pairs of these whose distance is checked."""
 SAMPLES = 5
 """Times of a stop at which distances are checked."""

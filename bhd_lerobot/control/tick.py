@@ -14,7 +14,7 @@ from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
-from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Mode, Reason, Watchdog
+from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.plant import SafetyStatus
 from bhd_lerobot.control.reading_check import LARGEST, are_motions_wrong, are_positions_wrong, is_time_wrong
 from bhd_lerobot.control.record import NEVER
@@ -25,6 +25,7 @@ _ACCEPTED, _STALE, _NOT_ACTIVE = int(Reason.ACCEPTED), int(Reason.STALE), int(Re
 _OUT_OF_ORDER, _BEYOND_HORIZON = int(Reason.OUT_OF_ORDER), int(Reason.BEYOND_HORIZON)
 _ESTOP_REASON, _FAULT_REASON = int(Reason.ESTOP), int(Reason.FAULT)
 _COMMAND_AGE, _PLANT, _GUARD = int(Watchdog.COMMAND_AGE), int(Watchdog.PLANT), int(Watchdog.GUARD)
+_NON_FINITE = int(Limit.NON_FINITE)
 _NONE, _BEGUN, _ENDED = int(Stage.NONE), int(Stage.BEGUN), int(Stage.ENDED)
 _NORMAL, _EMERGENCY_STOP = int(SafetyStatus.NORMAL), int(SafetyStatus.EMERGENCY_STOP)
 _LEAST, _MOST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
@@ -111,14 +112,14 @@ def end_tick(state: Any, limits: Any) -> None:
     if not guard(state, limits):
         # As hard as possible, from the last that was safe.
         state.watchdog |= _GUARD
-        state.goes_back = True
-        if limits.is_drive:
-            drive_back(state, limits)
-            state.goes_back = False
         if state.mode >= _ESTOP:
             state.entered |= 1 << _FAULT  # the present stop is not safe either
         else:
             set_mode(state, _FAULT)
+        if limits.is_drive:
+            drive_back(state, limits)
+        else:
+            state.goes_back = True
 
 
 @kernel()
@@ -169,7 +170,7 @@ def judge_reading(state: Any, limits: Any) -> None:
     is_finite, has_effort = True, True
     for k in range(limits.joints):
         is_finite &= abs(state.velocity[k]) < LARGEST
-        has_effort &= math.isfinite(state.effort[k])
+        has_effort &= abs(state.effort[k]) < LARGEST
     is_bad = is_bad or not is_finite or not has_effort
     state.is_distrusted = is_bad
     if is_bad:
@@ -195,6 +196,15 @@ def refusal(state: Any, estop: Counts) -> int:
     if state.mode == _FAULT:
         return _FAULT_REASON
     return _ACCEPTED if _HOLD <= state.mode <= _STOPPING else _NOT_ACTIVE
+
+
+@kernel()
+def is_number(queue: Any, entry: int, limits: Any) -> bool:
+    """Return whether a command of an arm is finite: what another process wrote was not checked when it was sent."""
+    is_finite = True
+    for k in range(limits.width):
+        is_finite = is_finite and (limits.is_drive or math.isfinite(queue.values[entry, k]))
+    return is_finite
 
 
 @kernel()
@@ -233,6 +243,10 @@ def take_command(state: Any, queue: Any, estop: Counts, limits: Any, now_ns: int
         if reason != _ACCEPTED:
             state.refusals[reason] += 1
             continue
+        if not is_number(queue, entry, limits):
+            state.limits |= _NON_FINITE
+            fail(state, _GUARD)
+            return
         if state.mode != _TRACKING:
             set_mode(state, _TRACKING)
         for k in range(limits.width):

@@ -398,6 +398,7 @@ class Frames:
         while len(ids := ids[self._numbers[ids] < first_tick + ticks]):
             own.serve()
             self._run(ids, first_tick, ticks)
+        own.now_ns = (first_tick + ticks - 1) * NANOSECONDS // own.control_hz
         if self._late is not None and self._late.is_late:
             self._late.pass_by(ticks)
         return True

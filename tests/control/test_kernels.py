@@ -1,5 +1,6 @@
 """Compiled loops: the same bits as plain Python, whoever compiles them, and never inside a tick."""
 
+import ast
 import importlib
 import os
 import re
@@ -119,6 +120,17 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
             assert one(*map(kernels.as_objects, plain)) == one.compiled(*compiled)
         for k, (mine, other) in enumerate(zip(plain, compiled, strict=True)):
             assert_same(np.asarray(mine), np.asarray(other), f"argument {k}")
+
+
+def test_no_kernel_raises_to_a_power() -> None:
+    """In Python ``x ** 2`` is a call of pow, which rounds otherwise than machine code's x * x."""
+    for path in sorted((ROOT / "bhd_lerobot").rglob("*.py")):
+        for one in ast.walk(ast.parse(path.read_text())):
+            if isinstance(one, ast.FunctionDef) and any("kernel(" in ast.unparse(by) for by in one.decorator_list):
+                powers = [
+                    each for each in ast.walk(one) if isinstance(each, ast.BinOp) and isinstance(each.op, ast.Pow)
+                ]
+                assert not powers, f"{path}: {one.name}"
 
 
 @pytest.fixture

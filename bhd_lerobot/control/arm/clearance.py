@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import ArmChain
+from bhd_lerobot.bodies.body import HELD, ArmChain, Capsule
 from bhd_lerobot.control.geometry.chain import find_distances
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.kernels import clamp, kernel
@@ -53,7 +53,10 @@ def fill_geometry(row: Any, chain: ArmChain) -> None:
 def new_geometries(chain: ArmChain, n: int) -> NDArray[Any]:
     """Return the geometry of an arm, and room for those of n arms that hold something, shape (1 + n,)."""
     geometries = np.zeros(1 + n, GEOMETRY)
-    fill_geometry(geometries[0], chain)
+    held = Capsule(HELD, len(chain.joints), chain.tool, (0.0, 0.0, 0.2), 0.02)
+    for one in (chain.holding(held), chain):  # both have to fit
+        geometries[0] = 0
+        fill_geometry(geometries[0], one)
     return geometries
 
 

@@ -19,7 +19,7 @@ from bhd_lerobot.control.geometry.dynamics import acceleration_share
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.guard import WireLimits
 from bhd_lerobot.control.kernels import as_objects, largest_change
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.motion.supervision import most_away, put_goal_limits
@@ -122,7 +122,7 @@ class ArmController(Controller):
         # that is wrong moves an arm no farther.
         self._aim, self._top = np.zeros((2, n, dof))
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
-        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:-1]
+        self._bend = 0.9 * WireLimits.of(body, control_hz).bend
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (
             f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
@@ -201,10 +201,10 @@ class ArmController(Controller):
             self._go_back(sim)
             state["goes_back"] = False
         if entered := int(state["entered"]):
-            state["entered"] = 0
             for mode in _ENTERED:
                 if entered & (1 << mode):
                     self._stop(sim, mode)
+            state["entered"] = 0  # now: a stop that is interrupted is begun again by the next tick
         if state["is_distrusted"]:
             state["is_distrusted"] = False
             self._blind[sim] = True
@@ -216,11 +216,6 @@ class ArmController(Controller):
 
     def _set_setpoint(self, sim: int) -> None:
         """Head for a new setpoint; goals that are still followed end, because the newer command counts."""
-        # Commands are checked when they are sent; a queue in shared memory is written by another process.
-        if not np.isfinite(self.states["requested"][sim, : self.width]).all():
-            self.limits[sim] |= int(Limit.NON_FINITE)
-            self._stop(sim, Mode.FAULT)
-            return
         if self.busy[sim]:
             if self.goals.following[sim] and not self.arms["follows_setpoints"][sim]:
                 # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at
@@ -258,7 +253,7 @@ class ArmController(Controller):
         speed = np.clip(state["written_rate"][: self.width] * self._hz, -self._speed, self._speed)
         self.velocity[sim], self.acceleration[sim] = speed, 0.0
         reference = state["written"][: self.width] - speed * self._lead
-        self.command[sim] = np.clip(reference, self._lower, self._upper)
+        self.command[sim] = reference  # what is written may be a little out of range: to leave that at once is a jump
 
     def _hold(self, sim: int) -> None:
         """Note what a gripper holds now."""
@@ -375,22 +370,26 @@ class ArmController(Controller):
         commanded to brakes with all that it has.
         """
         dof, arm = self._dof, self.arms[sim]
-        now, position = self.actuators[sim, :dof], self.states["position"][sim, :dof]
+        now, position, bend = self.actuators[sim, :dof], self.states["position"][sim, :dof], self._bend[:dof]
         off = self._aim[sim] - now
-        step = largest_change(np.abs(off) / self._bend) * self._bend
+        step = largest_change(np.abs(off) / bend) * bend
         step = np.copysign(np.minimum(step, self._top[sim] / self._hz), off)
         # Towards where a joint is it may go at once. A joint that bounces back is on the other side of its command.
         rate, way = now - arm["before"][:dof], position - now
-        gradual = np.minimum(np.maximum(step, rate - self._bend), rate + self._bend)
+        gradual = np.minimum(np.maximum(step, rate - bend), rate + bend)
         step = np.where((step * way > 0.0) & (np.abs(step) <= np.abs(way)), step, gradual)
         self.command[sim, :dof] = now + step
+        # The gripper is in nobody's way: it comes to rest.
+        last = self.actuators[sim, dof:] - arm["before"][dof : dof + 1]
+        last -= np.clip(last, -self._bend[dof:], self._bend[dof:])
+        self.command[sim, dof:] = self.actuators[sim, dof:] + last
         self.velocity[sim] = self.acceleration[sim] = 0.0
         largest = self._effort[:dof] / self._stiffness[:dof]
         there = (np.abs(off) <= largest) & (np.abs(self.states["velocity"][sim, :dof]) < _SLOW)
-        there &= np.abs(step) <= self._bend  # then it may stand still in the next tick
+        there &= np.abs(step) <= bend  # then it may stand still in the next tick
         self._yield_ticks[sim] += 1
         waits = self._yield_ticks[sim] < self._most_yield_ticks or (np.abs(off) > _ARRIVED_RAD).any()
-        arm["yields"] = not there.all() and bool(waits)
+        arm["yields"] = bool((np.abs(last) > self._bend[dof:]).any()) or (not there.all() and bool(waits))
         if not arm["yields"]:
             self.command[sim] = np.clip(self.command[sim], self._lower, self._upper)
 
@@ -422,6 +421,7 @@ class ArmController(Controller):
         late_s = self.arms["late_s"][ids]
         self.goals.restart(ids)
         self.arms[ids] = new_arms(1)
+        self.actuators[ids] = self.command[ids]  # at rest, without a lead
         self.set_latency(ids, late_s)
         self._blind[ids] = False
         for sim in np.asarray(ids).tolist():

@@ -194,6 +194,12 @@ def find_lone_force(arm: Any, limits: Any) -> None:
 
 
 @kernel()
+def length(vector: Array) -> float:
+    """Return the length of a vector; ``x ** 2`` is a call of pow in Python, and rounds otherwise than x * x."""
+    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+@kernel()
 def find_force(arm: Any, limits: Any, geometry: Any) -> None:
     """Find the force with which an arm presses, and whether that is too much."""
     arm.force = arm.pressing = arm.pull = 0.0
@@ -207,9 +213,9 @@ def find_force(arm: Any, limits: Any, geometry: Any) -> None:
         return
     find_jacobian(arm, geometry, arm.felt_position)
     find_wrench(arm, limits)
-    size, arm.pull = math.sqrt(arm.side[0] ** 2 + arm.side[1] ** 2 + arm.side[2] ** 2), arm.side[2]
+    size, arm.pull = length(arm.side), arm.side[2]
     find_lone_force(arm, limits)
-    alone = math.sqrt(arm.side[0] ** 2 + arm.side[1] ** 2 + arm.side[2] ** 2)
+    alone = length(arm.side)
     arm.force = max(size, alone)
     if alone >= size:
         arm.pull = arm.side[2]  # the tool pulls it up

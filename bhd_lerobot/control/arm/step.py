@@ -4,7 +4,6 @@ Where something rare is to be done, such as a plan, a tick waits for its control
 from there when it is called again.
 """
 
-import math
 from enum import IntEnum
 from typing import Any
 
@@ -62,9 +61,6 @@ def has_to_be_told(state: Any, arm: Any, limits: Any) -> bool:
     if state.goes_back or state.entered != 0 or state.is_distrusted:
         return True
     if state.has_setpoint:
-        for k in range(limits.width):
-            if not math.isfinite(state.requested[k]):
-                return True
         if state.busy:
             return True
         take_setpoint(state, arm, limits)
