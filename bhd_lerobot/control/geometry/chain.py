@@ -18,6 +18,13 @@ _GRAVITY = 9.81  # [m/s^2]
 
 
 @kernel()
+def sine_and_cosine(angle: float) -> tuple[float, float]:
+    """Return both; no numbers of an infinity, for which Python raises."""
+    angle = angle if math.isfinite(angle) else math.nan
+    return math.sin(angle), math.cos(angle)
+
+
+@kernel()
 def find_frames(arm: Any, geometry: Any, q: Array) -> None:
     """Write the frame behind each joint in a posture, in the base frame; the first is the base frame."""
     frames = arm.frames
@@ -25,7 +32,7 @@ def find_frames(arm: Any, geometry: Any, q: Array) -> None:
         for j in range(4):
             frames[0, i, j] = 1.0 if i == j else 0.0
     for k in range(geometry.dof):
-        c, s = math.cos(q[k]), math.sin(q[k])
+        s, c = sine_and_cosine(q[k])
         ca, sa = geometry.cos_alpha[k], geometry.sin_alpha[k]
         for i in range(3):
             x, y, z = frames[k, i, 0], frames[k, i, 1], frames[k, i, 2]
@@ -170,7 +177,7 @@ def find_torques(arm: Any, limits: Any, q: Array, speed: Array, change: Array) -
 @kernel()
 def put_turn(turn: Array, placed: Array, axis: Array, angle: float) -> None:
     """Write the rotation from a link's frame to the one before: as the joint is placed, then about its axis."""
-    c, s = math.cos(angle), math.sin(angle)
+    s, c = sine_and_cosine(angle)
     x, y, z, v = axis[0], axis[1], axis[2], 1.0 - c
     for i in range(3):
         a, b, d = placed[i, 0], placed[i, 1], placed[i, 2]
