@@ -234,7 +234,10 @@ ARM = record(
         ("is_stopped", _b),  # hard, since it was last reset
         ("yields", _b),
         ("gives_way", _b),
+        ("follows", _b),  # a trajectory, with its reference
         ("rest_ticks", _i),  # for which a stopped arm's reference has followed nothing
+        ("relief_ticks", _i),  # for which it has been settled
+        ("is_blind", _b),  # it is not known where it is
         ("off_ticks", _i),  # for which a joint has been too far from its reference
         ("is_blocked", _b),
         ("is_driven", _b),  # its motors are on: before, and after SAFE_OFF, that is not known
@@ -296,12 +299,16 @@ ARM_LIMITS = record(
         # Servos.
         ("lead", *_vector),
         ("largest_error", *_vector),
+        ("stiffness", *_vector),
+        ("damping", *_vector),
+        ("effort", *_vector),
         # Goals and what is in their way.
         ("blocked_rad", _f),
         ("latency_s", _f),
         ("acceleration", *_vector),
         ("blocked_ticks", _i),
         ("settled_ticks", _i),
+        ("relief_period", _i),
         ("settling_ticks", _i),
         ("gripping_ticks", _i),
         ("stall_ticks", _i),

@@ -12,7 +12,7 @@ from bhd_lerobot.control.arm.force_limit import explain_force, forget_force, put
 from bhd_lerobot.control.arm.held import held_capsule
 from bhd_lerobot.control.arm.relief import ContactRelief, Sensed
 from bhd_lerobot.control.arm.setpoints import leave_setpoints, put_setpoint_limits, take_setpoint
-from bhd_lerobot.control.arm.step import Stage, is_arm_at_rest, move_arm
+from bhd_lerobot.control.arm.step import SURE, Stage, is_arm_at_rest, move_arm
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import acceleration_share
@@ -35,7 +35,6 @@ _YIELD_S = 0.2  # [s] for which joints that do not come to rest are waited for w
 _PRESSED_N = 30.0  # [N] an arm that presses more is neither reset nor activated
 _GIVES = 0.5  # the least share of its largest torque that the servo of a blocked joint gives
 _ARRIVED_RAD = 2e-4  # [rad]
-_SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 _TINY = 1e-9
 _STANDS = 0.01  # [rad, m] a joint that moved by less has not moved
 _LOST = (
@@ -115,9 +114,10 @@ class ArmController(Controller):
         self.goals = GoalManager(body, states, arms, control_hz, planning)
         self._hz, self._forward = control_hz, ForwardKinematics(arm.chain)
         self._most_yield_ticks = round(_YIELD_S * control_hz)
-        self._reliefs = [ContactRelief(arm, 1, control_hz) for _ in range(n)]
+        self._reliefs = [self._new_relief(sim) for sim in range(n)]
+        self._limits["relief_period"] = self._reliefs[0].period
         self._yield_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._blind = np.zeros(n, np.bool_)  # it is not known where it is
+        self._blind: NDArray[np.bool_] = arms["is_blind"]
         # Where a protective stop brings the servos' commands, and how fast. Both are fixed when it begins: a reading
         # that is wrong moves an arm no farther.
         self._aim, self._top = np.zeros((2, n, dof))
@@ -149,10 +149,19 @@ class ArmController(Controller):
         row["ramp_s"][:dof] = acceleration / (2 * np.asarray(limits.jerk[:dof]))
         row["ramp_s"][:dof] += 2 * acceleration / np.asarray(limits.setpoint_jerk[:dof])
         put(row, "lead", arm.lead_s)
+        for name, values in (
+            ("stiffness", arm.servo_stiffness),
+            ("damping", arm.servo_damping),
+            ("effort", limits.effort),
+        ):
+            put(row, name, values)
         put(row, "largest_error", np.asarray(limits.effort) / arm.servo_stiffness)
         row["largest_error"][dof] = np.inf  # a gripping gripper is always commanded more than its effort
         row["blocked_ticks"] = max(1, round(arm.blocked_s * control_hz))
         row["settled_ticks"] = round(_SETTLED_S * control_hz)
+
+    def _new_relief(self, sim: int) -> ContactRelief:
+        return ContactRelief(self.arm, 1, self._hz, self.arms["relief_ticks"][sim : sim + 1])
 
     @property
     def rows(self) -> Array:
@@ -331,7 +340,7 @@ class ArmController(Controller):
         wanted = (self._stiffness * off - self._damping * state["velocity"][: self.width])[:dof]
         torque = self.arms["torque"][sim, :dof] if self._limits["feels"] else state["effort"][:dof]
         wrong = torque * np.sign(wanted) < _GIVES * self._effort[:dof]
-        wrong &= np.abs(wanted) > _SURE * self._effort[:dof]
+        wrong &= np.abs(wanted) > SURE * self._effort[:dof]
         return np.asarray(wrong & self._is_measured(sim))
 
     def _is_measured(self, sim: int) -> bool:
@@ -423,9 +432,8 @@ class ArmController(Controller):
         self.arms[ids] = new_arms(1)
         self.actuators[ids] = self.command[ids]  # at rest, without a lead
         self.set_latency(ids, late_s)
-        self._blind[ids] = False
         for sim in np.asarray(ids).tolist():
-            self._reliefs[sim] = ContactRelief(self.arm, 1, self._hz)
+            self._reliefs[sim] = self._new_relief(sim)
 
     # --- reports -----------------------------------------------------------------------------------------------------
 

@@ -78,19 +78,20 @@ class ContactRelief:
 
     Args:
         control_hz: ticks a second [Hz].
+        ticks: for which each arm has been settled, shape (n,): where they are kept.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, ticks: NDArray[np.int64] | None = None) -> None:
         limits, dof = arm.limits, len(arm.chain.joints)
         self._dof = dof
-        self._hz, self._period = control_hz, max(1, round(_PERIOD_S * control_hz))
+        self._hz, self.period = control_hz, max(1, round(_PERIOD_S * control_hz))
         self._stiffness = np.asarray(arm.servo_stiffness[:dof])
         self._largest = np.asarray(limits.effort[:dof]) / self._stiffness  # stretch [rad]
         self._change = _GENTLE * np.asarray(limits.stop_deceleration[:dof]) / control_hz  # of a speed in a tick [rad/s]
         self._forward = ForwardKinematics(arm.chain)
         self._lower = np.asarray(limits.lower[:dof]) + _MARGIN_RAD
         self._upper = np.asarray(limits.upper[:dof]) - _MARGIN_RAD
-        self._ticks = np.zeros(n, np.int64)  # since the arm came to rest
+        self.ticks = np.zeros(n, np.int64) if ticks is None else ticks  # since the arm came to rest
         self._wanted, self._stretch = np.zeros((n, dof)), np.zeros((n, dof))
         self._level, self._vain = np.zeros(n), np.zeros(n)  # a force that stays as it is [N], and the way since [rad]
         self._stood: NDArray[np.int64] = np.zeros(n, np.int64)  # decisions since it moved last
@@ -117,11 +118,11 @@ class ContactRelief:
             velocity: its speed [rad/s], shape (n, dof or more).
         """
         trusted = mask & known
-        self._ticks[~trusted] = 0
+        self.ticks[~trusted] = 0
         self._tries[~trusted] = 0
         self._wanted[~trusted] = self._level[~trusted] = self._vain[~trusted] = 0.0
-        self._ticks[trusted] += 1
-        due = trusted & (self._ticks % self._period == 0)
+        self.ticks[trusted] += 1
+        due = trusted & (self.ticks % self.period == 0)
         if due.any():
             self._decide(np.flatnonzero(due), sensed, command, velocity)
         if not self._wanted.any() and not velocity[mask].any():
@@ -162,7 +163,7 @@ class ContactRelief:
         presses &= room > 0.0
         moving = self._wanted[ids].any(axis=1, keepdims=True)
         push = _FOLLOW * stretch + _EASE * np.where(moving, stretch - self._stretch[ids], 0.0)
-        wanted = self._wanted[ids] - push * (self._hz / self._period)
+        wanted = self._wanted[ids] - push * (self._hz / self.period)
         wanted *= wanted * stretch < 0.0  # never against the push
         tools = self._forward.tool_speed(command[ids, : self._dof], wanted) / _TOOL_SPEED
         joints = np.abs(wanted).max(axis=1) / _SPEED
@@ -172,7 +173,7 @@ class ContactRelief:
         slower[np.abs(slower).max(axis=1) < _CREEP] = 0.0
         self._wanted[ids] = np.where(presses[:, None], wanted, slower)
         self._stretch[ids] = stretch
-        way = np.abs(self._wanted[ids]).sum(axis=1) * self._period / self._hz
+        way = np.abs(self._wanted[ids]).sum(axis=1) * self.period / self._hz
         self._vain[ids] += way
         self._room[ids] = np.minimum(self._room[ids] + np.where(confirmed, way, -way), bound)
 
@@ -192,7 +193,7 @@ class ContactRelief:
         self._level[ids] = np.where(same, self._level[ids], force)
         self._vain[ids] *= same
         waits = self._vain[ids] >= _VAIN_RAD
-        self._waited[ids] = (self._waited[ids] + self._period / self._hz) * waits
+        self._waited[ids] = (self._waited[ids] + self.period / self._hz) * waits
         again = ids[(self._waited[ids] > _AGAIN_S) & (self._tries[ids] < _TRIES)]
         self._vain[again] = _VAIN_RAD - _AGAIN_RAD
         self._tries[again] += 1

@@ -20,6 +20,7 @@ from bhd_lerobot.control.motion.supervision import has_goals_to_serve, most_away
 
 Array = NDArray[np.float64]
 
+SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 _EFFORT = int(Limit.EFFORT)
 
@@ -97,7 +98,7 @@ def move_arm(state: Any, arm: Any, limits: Any, geometry: Any, rows: Array, has_
         arm.has_left = False
         play(state, arm, limits, rows)
         arm.stage = _STOPPED
-        if arm.is_stopped:
+        if arm.is_stopped and not rests_quietly(state, arm, limits):
             return False
     if arm.stage == _STOPPED:
         state.protective_stop = 0
@@ -106,6 +107,32 @@ def move_arm(state: Any, arm: Any, limits: Any, geometry: Any, rows: Array, has_
         presses = limits.feels and feel(state, arm, limits, geometry)
         if arm.is_blocked or presses or arm.is_lost:
             return False
+    return True
+
+
+@kernel()
+def rests_quietly(state: Any, arm: Any, limits: Any) -> bool:
+    """Return whether a stopped arm just goes on resting in this tick, and count it.
+
+    Not where it comes to rest or gives way, it is decided whether it does, or a joint may be misread.
+    """
+    if arm.yields or arm.follows or arm.gives_way or arm.is_blind:
+        return False
+    is_settled = arm.rest_ticks + 1 > limits.settled_ticks
+    for k in range(limits.width):
+        if arm.speed[k] != 0.0:
+            return False
+        off = state.actuators[k] - state.position[k]
+        wanted = limits.stiffness[k] * off - limits.damping[k] * state.velocity[k]
+        if is_settled and k < limits.dof and not abs(wanted) <= SURE * limits.effort[k]:
+            return False
+    if is_settled and (arm.relief_ticks + 1) % limits.relief_period == 0:
+        return False
+    if not is_settled and arm.relief_ticks != 0:
+        return False
+    arm.rest_ticks += 1
+    if is_settled:
+        arm.relief_ticks += 1
     return True
 
 

@@ -56,7 +56,7 @@ class GoalManager:
         self.planner = GoalPlanner(body, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = states["busy"]
-        self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.following: NDArray[np.bool_] = arms["follows"]
         self.player = TrajectoryPlayer(arms, dof + 1)
         self._states, self._arms, self._follows = states, arms, states["follows_goal"]
         self._reference = states["command"][:, : dof + 1], arms["speed"][:, : dof + 1], arms["change"][:, : dof + 1]
