@@ -47,6 +47,7 @@ WHOLE = {  # the smallest and the largest; others are from 0 to 3
     "count": (0, 40),
     "next_entry": (0, 256),
     "ticks": (3, 9),
+    "relief_period": (1, 4),
     "refusals": (0, 99),
 }
 
