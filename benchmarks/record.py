@@ -30,10 +30,10 @@ from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
+from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
@@ -60,7 +60,7 @@ def real_time(folder: Path, robot: str, n: int, episodes: int, *options: str) ->
 
 def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
     """Return simulated seconds in a second of the physics steps, and of the TurtleBot3 the scans, alone."""
-    simulation: Any = BaseSimulation(TurtleBot3Config(), n) if robot == "turtlebot3" else UR5Simulation(UR5Config(), n)
+    simulation: Any = BaseSimulation(TurtleBot3Config(), n) if robot == "turtlebot3" else ArmSimulation(UR5Config(), n)
     fps = simulation.rates.fps
     task = AvoidTask(AvoidConfig(), n, fps) if robot == "turtlebot3" else PickTask(PickConfig(), n, fps)
     simulation.reset(np.arange(n), [task.sample(2 * i) for i in range(n)], range(n))

@@ -30,10 +30,10 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 Array = NDArray[np.float64]
@@ -125,7 +125,7 @@ def make(space: str, n: int) -> Any:
     options: dict[str, Any] = {"joints": {}, "tool": {"action_space": "tool"}}.get(
         space, {"action_space": "tool", "control": "impedance"}
     )
-    arm = UR5Simulation(UR5Config(**options), n)
+    arm = ArmSimulation(UR5Config(**options), n)
     arm.reset(np.arange(n), [TableScene("empty", (), arm.body.arm.home)] * n, range(n))
     return arm
 

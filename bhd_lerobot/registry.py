@@ -76,7 +76,7 @@ class _Blanked(BlankedBrain):
 
 _SIMULATIONS: dict[str, Any] = {
     "turtlebot3": "bhd_lerobot.robots.base_simulation:BaseSimulation",
-    "ur5": "bhd_lerobot.robots.ur5_simulation:UR5Simulation",
+    "ur5": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
 }
 ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""

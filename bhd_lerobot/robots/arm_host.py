@@ -22,7 +22,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.host import Host
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
-    from bhd_lerobot.robots.config_ur5 import UR5Config
+    from bhd_lerobot.robots.config_arm import ArmConfig
 
 TOOL_NAMES = (
     "tool_x.pos",
@@ -84,7 +84,7 @@ class ArmHost(Host):
 
     knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
 
-    def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
+    def __init__(self, config: "ArmConfig", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
         body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
         arm = body.need(Arm)
         self.plant = plant

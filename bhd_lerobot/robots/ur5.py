@@ -1,70 +1,11 @@
 """The simulated UR5 as a LeRobot robot."""
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.robots.arm_host import TOOL_NAMES, observation_names
+from bhd_lerobot.robots.arm import SimulatedArm
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.robot import BhdRobot
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.tasks.pick import PickConfig, PickTask
-from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 
 
-class UR5(BhdRobot):
-    """UR5 with a parallel gripper.
-
-    Action: `shoulder_pan.pos`, `shoulder_lift.pos`, `elbow.pos`, `wrist_1.pos`, `wrist_2.pos`, `wrist_3.pos` [rad] and
-    `gripper.pos` [m of opening]; or, with `action_space = "tool"`, `tool_x.pos`, `tool_y.pos`, `tool_z.pos` [m], the
-    quaternion `tool_qw.pos` … `tool_qz.pos`, and `gripper.pos`. Observation: `.pos` and `.vel` of the joints and of the
-    gripper; by option the pose of the tool, under the names that it has in actions, and the images `scene` and `wrist`.
-
-    Args:
-        config: the configuration.
-    """
+class UR5(SimulatedArm):
+    """UR5 with a parallel gripper: `shoulder_pan`, `shoulder_lift`, `elbow`, `wrist_1`, `wrist_2`, `wrist_3`."""
 
     config_class = UR5Config
-    simulation_class = UR5Simulation
     name = "ur5"
-
-    def __init__(self, config: UR5Config) -> None:
-        super().__init__(config)
-        self._task: Any = None
-        if config.scene == "reach":
-            self._task = ReachTask(ReachConfig(), 1, config.fps, self.body)
-        elif config.scene == "pick":
-            self._task = PickTask(PickConfig(), 1, config.fps, self.body)
-        self._scene: TableScene | None = None
-
-    def make_scene(self) -> TableScene:
-        """Return the configured scene."""
-        scene = UR5Simulation.start_scene(self.config)
-        if self._task is not None:
-            self._task.begin(np.zeros(1, np.intp), [scene])
-        self._scene = scene
-        return scene
-
-    @property
-    def environment(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Environment state of the scene: target and objects, names and values of shape (k,)."""
-        if self._task is None:
-            return (), np.zeros(0)
-        return self._task.environment_names, self._task.environment_state(self.host.truth())[0]
-
-    @property
-    def instruction(self) -> str:
-        """What a person would ask for in the scene."""
-        return "" if self._task is None or self._scene is None else self._task.instruction(self._scene)
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Names of the observation's floats, in order."""
-        return observation_names(self.body, tool_pose=self.config.tool_pose)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action's floats, in order."""
-        return TOOL_NAMES if self.config.action_space == "tool" else super().action_names

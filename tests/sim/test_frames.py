@@ -13,10 +13,10 @@ from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control import kernels
 from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
 from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim import frames
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.variation import RandomisationConfig
@@ -102,7 +102,7 @@ class Reacher:
 
     def __init__(self, n: int, threads: int | None, options: dict[str, Any]) -> None:
         config = UR5Config(**options)
-        self.arm = UR5Simulation(config, n, threads)
+        self.arm = ArmSimulation(config, n, threads)
         self.task = PickTask(
             PickConfig(randomisation=RandomisationConfig(enabled=True, latency_s=0.02)), n, config.fps, config.body()
         )

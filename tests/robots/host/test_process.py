@@ -34,7 +34,7 @@ for spec in pickle.loads(sys.stdin.buffer.read()):
     plant.read(host.cerebellum.reading)
     host.observe(), host.truth(), host.step(None)
 print({"torch", "lerobot", "mujoco"} & set(sys.modules))
-import bhd_lerobot.robots.base_simulation, bhd_lerobot.robots.ur5_simulation
+import bhd_lerobot.robots.base_simulation, bhd_lerobot.robots.arm_simulation
 print({"torch", "lerobot"} & set(sys.modules))
 """
 

@@ -1,4 +1,4 @@
-"""n simulated UR5s under one cerebellum."""
+"""n simulated arms under one cerebellum."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -23,14 +23,14 @@ from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
-    from bhd_lerobot.robots.config_ur5 import UR5Config
+    from bhd_lerobot.robots.config_arm import ArmConfig
 
 _MAX_TORQUE_LATENCY = 0.01  # [s] the default impedance becomes unstable somewhere between 0.02 and 0.05
 _SPEED_NOISE = 10.0  # [1/s] noise on speeds, as a multiple of the noise on positions
 
 
-class UR5Simulation(ArmHost, Simulation):
-    """n simulated UR5s.
+class ArmSimulation(ArmHost, Simulation):
+    """n simulated arms.
 
     Attributes:
         table: what lies on the tables.
@@ -49,7 +49,7 @@ class UR5Simulation(ArmHost, Simulation):
 
     def __init__(
         self,
-        config: "UR5Config",
+        config: "ArmConfig",
         n: int = 1,
         threads: int | None = None,
         planning: Planning | None = None,
@@ -75,7 +75,7 @@ class UR5Simulation(ArmHost, Simulation):
             self._frames = Frames(world, self.cerebellum, touches, late=self.plant)
 
     @classmethod
-    def start_scene(cls, config: "UR5Config") -> TableScene:
+    def start_scene(cls, config: "ArmConfig") -> TableScene:
         """Return the configured scene: empty, or one of a task."""
         from bhd_lerobot.tasks.pick import PickConfig, PickTask
         from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
