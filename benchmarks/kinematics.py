@@ -9,7 +9,6 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from itertools import pairwise
 
 import mink
 import mujoco
@@ -20,7 +19,7 @@ from eaik.IK_DH import DhRobot
 
 from benchmarks._report import Report, parse_options
 from benchmarks._turns import seconds
-from bhd_lerobot.bodies.body import ArmChain
+from bhd_lerobot.bodies.body import ArmChain, Placement
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -99,23 +98,17 @@ def reaches(kinematics: ArmKinematics, answer: np.ndarray, pose: np.ndarray) -> 
     return bool((error < TOLERANCE).any())
 
 
-def tool_from(chain: ArmChain) -> np.ndarray:
-    """Return the tool frame in the flange frame, shape (4, 4)."""
-    tool = np.eye(4)
-    tool[:3, 3] = chain.tool
-    return tool
-
-
 def eaik_solver(chain: ArmChain) -> Solver:
     """Return EAIK's closed form; taking the tool off belongs to its time."""
-    robot = DhRobot(np.array(chain.alpha), np.array(chain.a), np.array(chain.d))
-    flange_from_tool = np.linalg.inv(tool_from(chain))
+    a, _, d = np.array([link.position for link in chain.links]).T
+    alpha = np.array([math.atan2(link.rotation[2][1], link.rotation[1][1]) for link in chain.links])
+    robot, flange_from_tool = DhRobot(alpha, a, d), np.linalg.inv(chain.tool.matrix())
     return lambda pose, seed: np.asarray(robot.IK(pose @ flange_from_tool).Q)
 
 
 def ur_solver(chain: ArmChain) -> Solver:
     """Return ur_analytic_ik's closed form, which has the UR5's numbers built in."""
-    tool = tool_from(chain)
+    tool = chain.tool.matrix()
     return lambda pose, seed: np.array(ur_analytic_ik.ur5.inverse_kinematics_with_tcp(pose, tool)).reshape(-1, 6)
 
 
@@ -123,11 +116,11 @@ def pink_solver(chain: ArmChain) -> Solver:
     """Return Pink's differential inverse kinematics, iterated with full steps."""
     model, parent, placement = pinocchio.Model(), 0, pinocchio.SE3.Identity()
     effort, speed, lower, upper = (np.array([value]) for value in (100.0, 1e3, -2 * math.pi - 1, 2 * math.pi + 1))
-    for name, a, d, alpha in zip(chain.joints, chain.a, chain.d, chain.alpha, strict=True):
+    for name, link in zip(chain.joints, chain.links, strict=True):
         joint = pinocchio.JointModelRZ()
         parent = model.addJoint(parent, joint, placement, name, effort, speed, lower, upper)
-        placement = pinocchio.SE3(pinocchio.utils.rotate("x", alpha), np.array([a, 0.0, d]))
-    placement = placement * pinocchio.SE3(np.eye(3), np.array(chain.tool))
+        placement = pinocchio.SE3(link.matrix())
+    placement = placement * pinocchio.SE3(chain.tool.matrix())
     model.addFrame(pinocchio.Frame("tool", parent, placement, pinocchio.FrameType.OP_FRAME))
     data = model.createData()
     task = pink.FrameTask("tool", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3)
@@ -165,20 +158,23 @@ def mink_solver(chain: ArmChain) -> Solver:
 
 def mjcf(chain: ArmChain) -> str:
     """Return the chain as a MuJoCo model: bodies with joints and a site, and masses because it wants some."""
-    links = [(0.0, 0.0, 0.0), *zip(chain.a, chain.d, chain.alpha, strict=True)]
-    bodies = ""
-    for name, ((a, d, alpha), _) in zip(chain.joints, pairwise(links), strict=True):
+    bodies, places = "", [place_of(link) for link in (chain.base, *chain.links, chain.tool)]
+    for name, place in zip(chain.joints, places, strict=False):
         bodies += (
-            f'<body name="{name}" pos="{a} 0 {d}" axisangle="1 0 0 {alpha}">'
+            f'<body name="{name}" {place}>'
             f'<joint name="{name}" axis="0 0 1" range="-7.3 7.3"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
         )
-    a, d, alpha = links[-1]
-    x, y, z = chain.tool
-    site = f'<body pos="{a} 0 {d}" axisangle="1 0 0 {alpha}"><site name="tool" pos="{x} {y} {z}"/></body>'
+    site = f'<body {places[-2]}><site name="tool" {places[-1]}/></body>'
     return (
         '<mujoco><compiler angle="radian" autolimits="true"/>'
         f"<worldbody>{bodies}{site}{'</body>' * len(chain.joints)}</worldbody></mujoco>"
     )
+
+
+def place_of(place: Placement) -> str:
+    """Return MuJoCo's attributes of a placement."""
+    numbers = [*place.matrix()[:3, 0].tolist(), *place.matrix()[:3, 1].tolist()]
+    return f'pos="{" ".join(map(str, place.position))}" xyaxes="{" ".join(map(str, numbers))}"'
 
 
 if __name__ == "__main__":

@@ -5,15 +5,17 @@ it from a `Body`, so that a simulated and a real robot are limited by the same f
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 
 _NO_JERK_LIMIT = 1e12
+_ROTATION_ERROR = 1e-6  # how far the rows of a rotation may be from orthonormal
 
 
 def _is_count(value: object) -> bool:
@@ -247,13 +249,50 @@ _PAD, _EDGE = 0.02, 0.001  # [m] what is held reaches at least so far to the sid
 _SLIPS = 0.003  # [m] farther out its edges are assumed: it may have slipped down in the fingers
 
 
+_Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A frame in another one.
+
+    Attributes:
+        position: its origin [m].
+        rotation: the rows of its rotation matrix.
+    """
+
+    position: _Three = (0.0, 0.0, 0.0)
+    rotation: tuple[_Three, _Three, _Three] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    def __post_init__(self) -> None:
+        position, rotation = (np.array(values, np.float64) for values in (self.position, self.rotation))
+        if (position.shape, rotation.shape) != ((3,), (3, 3)) or not np.isfinite([*position, *rotation.flat]).all():
+            raise ConfigError(
+                f"position is {self.position} and rotation {self.rotation}; they need 3 and 3 x 3 finite numbers."
+            )
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
+            raise ConfigError(f"{self.rotation} is no rotation: its rows are not orthonormal, or it is mirrored.")
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64]) -> "Placement":
+        """Return the placement of a homogeneous transform, shape (4, 4)."""
+        rows: Any = tuple(tuple(row) for row in matrix[:3, :3].tolist())
+        return cls(tuple(matrix[:3, 3].tolist()), rows)
+
+    def matrix(self) -> NDArray[np.float64]:
+        """Return the homogeneous transform, shape (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.position
+        return matrix
+
+
 @dataclass(frozen=True)
 class Capsule:
     """All points within `radius` of a segment that is fixed to a link of an arm.
 
     Attributes:
         name: its name.
-        frame: the Denavit-Hartenberg frame that it is fixed to: 0 is the base, i the frame behind joint i.
+        frame: the frame of the chain that it is fixed to: 0 is the base frame, i the frame behind joint i.
         start: one end of the segment in that frame [m].
         end: the other end [m].
         radius: [m].
@@ -261,39 +300,79 @@ class Capsule:
 
     name: str
     frame: int
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: _Three
+    end: _Three
     radius: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArmChain:
-    """The geometry of a serial arm, in the standard Denavit-Hartenberg convention.
+    """The geometry of a serial arm: any chain of joints that turn.
 
-    The transform from frame i - 1 to frame i is Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i).
+    The transform from the base frame to frame 1 is base Rz(q_1) links_1, and that from frame i - 1 to frame i
+    Rz(q_i) links_i: joint 1 turns about the z axis of `base`, joint i about that of frame i - 1. The last frame is that
+    of the flange, and its transform to the tool frame is `tool`. A chain in the standard Denavit-Hartenberg convention
+    is made by `from_dh`, one of a MuJoCo model by `sim.chain.chain_from_mjcf`.
 
     Attributes:
         joints: joint names, from the base to the flange.
-        a: link lengths [m].
-        d: link offsets [m].
-        alpha: link twists [rad].
-        tool: the tool centre point in the flange frame, the last of the chain [m]. The tool frame is parallel to the
-            flange frame: its z axis points out of the gripper, its y axis from the left to the right finger.
+        links: for each joint, where the next frame is in the one that turns with the joint.
+        base: the frame that joint 1 turns in, in the base frame.
+        tool: the tool frame in the flange frame. Its origin is the tool centre point, its z axis points out of the
+            gripper, its y axis from the left to the right finger.
         capsules: what the collision checks take the arm for.
         disjoint: pairs of capsule names whose distance is checked; pairs that cannot meet are left out.
         min_distance: smallest permitted distance between two capsules, and between a capsule and the table [m].
-        min_manipulability: below this product of the Jacobian's singular values a posture counts as singular [m^3].
+        min_manipulability: below this product of the Jacobian's singular values a posture counts as singular [m^3 with
+            six joints or more].
     """
 
     joints: tuple[str, ...]
-    a: tuple[float, ...]
-    d: tuple[float, ...]
-    alpha: tuple[float, ...]
-    tool: tuple[float, float, float]
+    links: tuple[Placement, ...]
+    base: Placement = Placement()
+    tool: Placement
     capsules: tuple[Capsule, ...]
     disjoint: tuple[tuple[str, str], ...]
     min_distance: float
     min_manipulability: float
+
+    def __post_init__(self) -> None:
+        if not self.joints or len(self.joints) != len(self.links):
+            raise ConfigError(f"The chain has {len(self.joints)} joints and {len(self.links)} links; one link a joint.")
+
+    @classmethod
+    def from_dh(
+        cls, joints: tuple[str, ...], a: Sequence[float], d: Sequence[float], alpha: Sequence[float], **others: Any
+    ) -> "ArmChain":
+        """Return a chain in the standard Denavit-Hartenberg convention, whose links are Tz(d) Tx(a) Rx(alpha).
+
+        Args:
+            joints: joint names, from the base to the flange.
+            a: link lengths [m].
+            d: link offsets [m].
+            alpha: link twists [rad].
+            others: the other attributes; `tool` may be a position alone.
+        """
+        if not len(joints) == len(a) == len(d) == len(alpha):
+            raise ConfigError(f"There are {len(joints)} joints, {len(a)} a, {len(d)} d and {len(alpha)} alpha.")
+        links = []
+        for length, offset, twist in zip(a, d, alpha, strict=True):
+            # What is exactly 0 or 1 is so in sums, too.
+            c, s = (round(value, 15) for value in (math.cos(twist), math.sin(twist)))
+            links.append(Placement((length, 0.0, offset), ((1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c))))
+        tool = others.pop("tool")
+        tool = tool if isinstance(tool, Placement) else Placement(tool)
+        return cls(joints=joints, links=tuple(links), tool=tool, **others)
+
+    @property
+    def dof(self) -> int:
+        """How many joints it has."""
+        return len(self.joints)
+
+    @property
+    def reach(self) -> float:
+        """How far the tool centre point can be from the base frame's origin at the most [m]."""
+        return sum(math.hypot(*place.position) for place in (self.base, *self.links, self.tool))
 
     def holding(self, held: Capsule | None) -> "ArmChain":
         """Return the geometry with something in the gripper, whose distances are checked like those of the gripper.
@@ -304,12 +383,13 @@ class ArmChain:
             return self
         tooling = {capsule.name for capsule in self.capsules if capsule.frame == held.frame}
         partners = {one: None for pair in self.disjoint for one in pair if tooling & set(pair) and one not in tooling}
-        parts = (*_edges(held), held)
+        fingers_way = tuple(row[1] for row in self.tool.rotation)
+        parts = (*_edges(held, fingers_way), held)
         pairs = tuple((one, part.name) for one in partners for part in parts)
         return replace(self, capsules=(*self.capsules, *parts), disjoint=(*self.disjoint, *pairs))
 
 
-def _edges(held: Capsule) -> list[Capsule]:
+def _edges(held: Capsule, fingers_way: tuple[float, ...]) -> list[Capsule]:
     """Return the edges of a square bar along a capsule, with sides along the fingers' way and across it."""
     start, end = np.array(held.start), np.array(held.end)
     way = end - start
@@ -317,7 +397,7 @@ def _edges(held: Capsule) -> list[Capsule]:
     if length < _EDGE:
         return []
     along = way / length
-    across = np.cross(along, (0.0, 1.0, 0.0))
+    across = np.cross(along, fingers_way)
     size = float(np.linalg.norm(across))
     if size < _EDGE:  # it lies along the fingers' way
         return []
@@ -375,7 +455,7 @@ class Workspace:
 class Arm:
     """An arm with a gripper, mounted on a table.
 
-    The base frame is frame 0 of the chain; the table's top is its plane z = 0. A command is the position of each joint
+    The table's top is the plane z = 0 of the chain's base frame. A command is the position of each joint
     [rad] in the chain's order, and then the gripper's opening [m].
 
     Attributes:

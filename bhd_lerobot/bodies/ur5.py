@@ -113,7 +113,7 @@ def ur5(
                 effort=(*effort, 60.0),
                 command_timeout_s=command_timeout_s,
             ),
-            chain=ArmChain(
+            chain=ArmChain.from_dh(
                 joints=JOINTS,
                 a=_A,
                 d=_D,

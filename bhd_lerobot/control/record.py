@@ -338,11 +338,9 @@ GEOMETRY = record(
     "geometry",
     [
         ("dof", _i),
-        ("a", *_vector),
-        ("d", *_vector),
-        ("cos_alpha", *_vector),
-        ("sin_alpha", *_vector),
-        ("tool", _f, (3,)),
+        ("base", _f, (1, 3, 4)),  # the frame that the first joint turns in
+        ("link", _f, (JOINTS, 3, 4)),  # the next frame in the one that turns with each joint
+        ("tool", _f, (3, 4)),  # in the last frame
         ("shapes", _i),
         ("pairs", _i),
         ("frame", np.int64, (SHAPES,)),

@@ -79,7 +79,7 @@ def test_what_the_gripper_holds_arrives() -> None:
     link, server, _, _ = linked(PLANNER)
     state = State.of(*np.stack((HOME, 0 * HOME, 0 * HOME)))
     command = BrainCommand("down", target_pose=moved(dz=-0.1), motion="line")
-    for held in (None, Capsule(HELD, 6, ARM.arm.chain.tool, (0.0, 0.01, 0.32), 0.01), None):
+    for held in (None, Capsule(HELD, 6, ARM.arm.chain.tool.position, (0.0, 0.01, 0.32), 0.01), None):
         expected = PLANNER.plan(command, *np.array((state.position, state.velocity, state.acceleration)), held=held)
         link.request(0, command, state, None, 0, held)
         server.serve_once()

@@ -37,11 +37,9 @@ def fill_geometry(row: Any, chain: ArmChain) -> None:
             f"The arm and what is declared around it are {shapes} capsules, of which {pairs} pairs are kept apart; an "
             f"arm's record holds {SHAPES} and {PAIRS}. Declare fewer obstacles, larger ones in place of several."
         )
-    row["dof"] = dof = len(chain.joints)
-    row["a"][:dof], row["d"][:dof], row["tool"] = chain.a, chain.d, chain.tool
-    # What is exactly 0 or 1 is so in sums, too.
-    row["cos_alpha"][:dof] = np.round(np.cos(chain.alpha), 15)
-    row["sin_alpha"][:dof] = np.round(np.sin(chain.alpha), 15)
+    row["dof"] = dof = chain.dof
+    row["base"][0], row["tool"] = (place.matrix()[:3] for place in (chain.base, chain.tool))
+    row["link"][:dof] = [link.matrix()[:3] for link in chain.links]
     row["shapes"], row["pairs"] = shapes, pairs
     model.fill(row)
     near = np.concatenate(model.slopes())
@@ -53,7 +51,7 @@ def fill_geometry(row: Any, chain: ArmChain) -> None:
 def new_geometries(chain: ArmChain, n: int) -> NDArray[Any]:
     """Return the geometry of an arm, and room for those of n arms that hold something, shape (1 + n,)."""
     geometries = np.zeros(1 + n, GEOMETRY)
-    held = Capsule(HELD, len(chain.joints), chain.tool, (0.0, 0.0, 0.2), 0.02)
+    held = Capsule(HELD, chain.dof, chain.tool.position, (0.0, 0.0, 0.2), 0.02)
     for one in (chain.holding(held), chain):  # both have to fit
         geometries[0] = 0
         fill_geometry(geometries[0], one)

@@ -43,5 +43,7 @@ def held_capsule(chain: ArmChain, forward: ForwardKinematics, state: Any, arm: A
     if not 0.0 < below < _HIGHEST:
         return None
     radius = min(float(state["position"][dof]) / 2, 0.9 * below)  # a capsule with a direction
-    x, y, z = chain.tool - tool[2, :3] * (below - radius)  # the third row is the vertical in the tool's frame
-    return Capsule(HELD, dof, chain.tool, (float(x), float(y), float(z)), radius)
+    at = chain.tool.matrix()
+    down = at[:3, :3] @ tool[2, :3]  # the third row is the vertical in the tool's frame
+    x, y, z = at[:3, 3] - down * (below - radius)
+    return Capsule(HELD, dof, chain.tool.position, (float(x), float(y), float(z)), radius)

@@ -103,7 +103,7 @@ class ImpedanceController(SteppedController):
         joint_speed = np.outer(arm.limits.velocity[:dof], _JOINT_SPEED)
         self._tool_speed, self._joint_speed = tool_speed, joint_speed  # shape (2, 3), (dof, 3)
         # An opening and positions beyond what the arm can ever reach; nearer ones are for the spring to find out.
-        reach = float(np.abs((*arm.chain.a, *arm.chain.d, *arm.chain.tool)).sum())
+        reach = arm.chain.reach
         self._lower = np.array([*(-reach,) * 3, arm.limits.lower[-1]])
         self._upper = np.array([*(reach,) * 3, arm.limits.upper[-1]])
         self._swung, self._swings = np.zeros((n, dof + 6)), np.zeros((n, dof))  # last directions, turns of the joints'

@@ -27,20 +27,24 @@ def sine_and_cosine(angle: float) -> tuple[float, float]:
 @kernel()
 def find_frames(arm: Any, geometry: Any, q: Array) -> None:
     """Write the frame behind each joint in a posture, in the base frame; the first is the base frame."""
-    frames = arm.frames
     for i in range(3):
         for j in range(4):
-            frames[0, i, j] = 1.0 if i == j else 0.0
+            arm.frames[0, i, j] = 1.0 if i == j else 0.0
     for k in range(geometry.dof):
         s, c = sine_and_cosine(q[k])
-        ca, sa = geometry.cos_alpha[k], geometry.sin_alpha[k]
+        before, after, link = turned_in(arm, geometry, k), arm.frames[k + 1], geometry.link[k]
         for i in range(3):
-            x, y, z = frames[k, i, 0], frames[k, i, 1], frames[k, i, 2]
+            x, y, z = before[i, 0], before[i, 1], before[i, 2]
             ahead, across = c * x + s * y, c * y - s * x
-            frames[k + 1, i, 0] = ahead
-            frames[k + 1, i, 1] = ca * across + sa * z
-            frames[k + 1, i, 2] = ca * z - sa * across
-            frames[k + 1, i, 3] = frames[k, i, 3] + geometry.a[k] * ahead + geometry.d[k] * z
+            for j in range(3):
+                after[i, j] = link[0, j] * ahead + link[1, j] * across + link[2, j] * z
+            after[i, 3] = before[i, 3] + link[0, 3] * ahead + link[1, 3] * across + link[2, 3] * z
+
+
+@kernel()
+def turned_in(arm: Any, geometry: Any, joint: int) -> Array:
+    """Return the frame about whose z axis a joint turns."""
+    return geometry.base[0] if joint == 0 else arm.frames[joint]
 
 
 @kernel()
@@ -103,18 +107,19 @@ def between(arm: Any, geometry: Any, one: int, other: int) -> float:
 def find_jacobian(arm: Any, geometry: Any, q: Array) -> None:
     """Write the geometric Jacobian at the tool centre point, linear velocity first, in the base frame."""
     find_frames(arm, geometry, q)
-    frames, last, jacobian = arm.frames, arm.frames[geometry.dof], arm.jacobian
+    last, jacobian = arm.frames[geometry.dof], arm.jacobian
     for k in range(geometry.dof):
+        frame = turned_in(arm, geometry, k)
         for row in range(3):
             i, j = (row + 1) % 3, (row + 2) % 3
             arms = arm.side
             for at in range(3):
                 tip = last[at, 3]
                 for axis in range(3):
-                    tip += last[at, axis] * geometry.tool[axis]
-                arms[at] = tip - frames[k, at, 3]
-            jacobian[row, k] = frames[k, i, 2] * arms[j] - frames[k, j, 2] * arms[i]
-            jacobian[row + 3, k] = frames[k, row, 2]
+                    tip += last[at, axis] * geometry.tool[axis, 3]
+                arms[at] = tip - frame[at, 3]
+            jacobian[row, k] = frame[i, 2] * arms[j] - frame[j, 2] * arms[i]
+            jacobian[row + 3, k] = frame[row, 2]
 
 
 @kernel()

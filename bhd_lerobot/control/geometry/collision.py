@@ -6,13 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import ArmChain, Capsule
+from bhd_lerobot.bodies.body import ArmChain
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.control.record import JOINTS
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 Array = NDArray[np.float64]
 
 _TINY = 1e-12  # [m^2]; keeps the divisions of capsules without length finite
+# Postures in which an end of a capsule has another height if any joint lifts it, and by which it differs then [m].
+_POSTURES = np.random.default_rng(0).uniform(-3.0, 3.0, (16, JOINTS))
+_LIFTED = 1e-9
 
 
 class CollisionModel:
@@ -42,7 +46,8 @@ class CollisionModel:
         squares = self._squares[:, None]
         self._square1, self._square2 = squares[self._first], squares[self._second]
         self._radii = (radii[self._first] + radii[self._second])[:, None]
-        below = [[c.radius if _is_lifted(chain, c, end) else -np.inf for c in chain.capsules] for end in (0, 1)]
+        start, way = self._placed(_POSTURES[:, : chain.dof])
+        below = [np.where(np.ptp(z, axis=-1) > _LIFTED, radii, -np.inf) for z in (start[2], start[2] + way[2])]
         self._below_start, self._below_end = np.array(below)[:, :, None]
 
     def fill(self, row: Any) -> None:
@@ -64,7 +69,7 @@ class CollisionModel:
         """Return the smallest self distance and the smallest table distance of postures.
 
         Args:
-            q: joint positions [rad], shape (..., 6).
+            q: joint positions [rad], shape (..., dof).
 
         Returns:
             Distance of the closest checked pair of capsules and of the lowest capsule from the table [m], each of
@@ -78,11 +83,11 @@ class CollisionModel:
         """Return how much a distance can change at the most when a joint turns [m/rad].
 
         Returns:
-            For each checked pair, shape (pairs, 6), and for each capsule's distance from the table, shape (capsules,
-            6). A pair's distance depends on the joints between its capsules only.
+            For each checked pair, shape (pairs, dof), and for each capsule's distance from the table, shape (capsules,
+            dof). A pair's distance depends on the joints between its capsules only.
         """
         chain, joints = self.chain, np.arange(self._forward.dof)
-        lengths = np.abs((chain.a, chain.d)).sum(axis=0)
+        lengths = np.array([math.hypot(*link.position) for link in chain.links])
         heights = np.zeros((self._count, len(joints)))
         for row, capsule in zip(heights, chain.capsules, strict=True):
             end = max(math.hypot(*capsule.start), math.hypot(*capsule.end))
@@ -99,31 +104,36 @@ class CollisionModel:
         """Return every distance that `distances` takes the smallest of, shape (pairs + capsules, n): first the pairs.
 
         Args:
-            q: joint positions [rad], shape (n, 6).
+            q: joint positions [rad], shape (n, dof).
         """
         return np.concatenate(self._distances(q))
 
     def closest_pair(self, q: Array) -> tuple[str, str]:
-        """Return the names of the two capsules that come closest in a posture of shape (6,)."""
+        """Return the names of the two capsules that come closest in a posture of shape (dof,)."""
         return self.chain.disjoint[int(self._distances(q)[0].argmin())]
 
     def lowest(self, q: Array) -> str:
-        """Return the name of the capsule that is closest to the table in a posture of shape (6,)."""
+        """Return the name of the capsule that is closest to the table in a posture of shape (dof,)."""
         return self.chain.capsules[int(self._distances(q)[1].argmin())].name
 
     def _distances(self, q: Array) -> tuple[Array, Array]:
         """Return the distances of pairs, and of capsules from the table, shapes (pairs, n) and (capsules, n)."""
-        frames = self._forward.components(np.reshape(q, (-1, self._forward.dof))).transpose(1, 2, 0, 3)
+        start, way = self._placed(np.reshape(q, (-1, self._forward.dof)))
+        heights = np.minimum(start[2] - self._below_start, start[2] + way[2] - self._below_end)
+        way1, way2 = way[:, self._first], way[:, self._second]
+        apart = start[:, self._first] - start[:, self._second]
+        return _segment_distance(apart, way1, way2, self._square1, self._square2) - self._radii, heights
+
+    def _placed(self, q: Array) -> tuple[Array, Array]:
+        """Return the start of each capsule and the way to its end, shapes (3, capsules, n)."""
+        frames = self._forward.components(q).transpose(1, 2, 0, 3)
         frames = frames[:3, :, self._frame]  # shape (3, 4, 2 capsules, n)
         segments = frames[:, 0] * self._segments[0]
         segments += frames[:, 1] * self._segments[1]
         segments += frames[:, 2] * self._segments[2]
         start, way = segments[:, : self._count], segments[:, self._count :]
         start += frames[:, 3, : self._count]
-        heights = np.minimum(start[2] - self._below_start, start[2] + way[2] - self._below_end)
-        way1, way2 = way[:, self._first], way[:, self._second]
-        apart = start[:, self._first] - start[:, self._second]
-        return _segment_distance(apart, way1, way2, self._square1, self._square2) - self._radii, heights
+        return start, way
 
 
 def _segment_distance(apart: Array, way1: Array, way2: Array, square1: Array, square2: Array) -> Array:
@@ -161,10 +171,3 @@ def _dot(a: Array, b: Array) -> Array:
 def _clipped(share: Array) -> Array:
     np.maximum(share, 0.0, out=share)
     return np.minimum(share, 1.0, out=share)
-
-
-def _is_lifted(chain: ArmChain, capsule: Capsule, end: int) -> bool:
-    """Return whether the height of a capsule's end changes with the posture."""
-    point = (capsule.start, capsule.end)[end]
-    on_second_axis = capsule.frame == 2 and math.hypot(point[0] + chain.a[1], point[1]) < 1e-9
-    return capsule.frame >= 2 and not on_second_axis

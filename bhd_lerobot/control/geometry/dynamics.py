@@ -11,7 +11,7 @@ import pinocchio
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body
-from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.versions import check_version
 
@@ -176,7 +176,7 @@ def _add_tool(whole: pinocchio.Model, arm: Arm, posture: Array) -> None:
     data = whole.createData()
     pinocchio.forwardKinematics(whole, data, posture)
     last = whole.getJointId(arm.chain.joints[-1])
-    tool = pinocchio.SE3(ForwardKinematics(arm.chain).tool(posture[:DOF]))
+    tool = pinocchio.SE3(ForwardKinematics(arm.chain).tool(posture[: arm.chain.dof]))
     whole.addFrame(pinocchio.Frame(TOOL_SITE, last, 0, data.oMi[last].actInv(tool), pinocchio.FrameType.OP_FRAME))
 
 

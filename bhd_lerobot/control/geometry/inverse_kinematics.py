@@ -3,18 +3,18 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import ArmChain
-from bhd_lerobot.control.geometry.forward_kinematics import DOF, components_first, components_last
+from bhd_lerobot.control.geometry.forward_kinematics import UrGeometry, components_first, components_last
 
 Array = NDArray[np.float64]
 
 BRANCHES = 8
+_DOF = 6
 _SIGNS = np.array([1.0, -1.0])
 _ROUNDING = 1e-12  # what lies beyond the workspace by less is on its border [m^2, or share of it]
 _SINE_ZERO = 1e-10  # below this sine of the fifth joint the last one is free: an error of less than this many radians
 
 
-def solutions(chain: ArmChain, pose: Array, last: Array | float = 0.0) -> Array:
+def solutions(arm: UrGeometry, pose: Array, last: Array | float = 0.0) -> Array:
     """Return every posture whose tool frame is `pose`.
 
     Branches are numbered 4 shoulder + 2 wrist + elbow, where shoulder is 0 if the arm's plane is turned so that the
@@ -22,7 +22,7 @@ def solutions(chain: ArmChain, pose: Array, last: Array | float = 0.0) -> Array:
     singularities a posture stays on its branch.
 
     Args:
-        chain: the geometry, of the structure that `ForwardKinematics` checks.
+        arm: the geometry.
         pose: tool frames in the base frame, shape (..., 4, 4).
         last: position of the last joint where the pose leaves it free because the fourth and the sixth axis coincide
             [rad], shape (...).
@@ -30,34 +30,33 @@ def solutions(chain: ArmChain, pose: Array, last: Array | float = 0.0) -> Array:
     Returns:
         Joint positions in [-pi, pi] [rad], shape (..., 8, 6); NaN where the branch does not reach the pose.
     """
-    q, reached = _branches(chain, components_first(np.asarray(pose, np.float64), 2), last)
+    q, reached = _branches(arm, components_first(np.asarray(pose, np.float64), 2), last)
     np.copyto(q, np.nan, where=~reached)
-    return components_last(q.reshape(DOF, BRANCHES, *q.shape[4:]).swapaxes(0, 1), 2)
+    return components_last(q.reshape(_DOF, BRANCHES, *q.shape[4:]).swapaxes(0, 1), 2)
 
 
-def nearest(chain: ArmChain, pose: Array, last: float = 0.0) -> Array:
+def nearest(arm: UrGeometry, pose: Array, last: float = 0.0) -> Array:
     """Return for each branch the posture with the elbow stretched or folded as far as it takes, shape (8, 6).
 
     Those that do not reach `pose`, of shape (4, 4), end where the arm ends on the way to it. Only for poses whose wrist
     is far enough from the base's axis.
     """
-    return _branches(chain, pose, last)[0].reshape(DOF, BRANCHES).T
+    return _branches(arm, pose, last)[0].reshape(_DOF, BRANCHES).T
 
 
-def _branches(chain: ArmChain, T: Array, last: Array | float) -> tuple[Array, NDArray[np.bool_]]:
+def _branches(arm: UrGeometry, T: Array, last: Array | float) -> tuple[Array, NDArray[np.bool_]]:
     """Return postures, shape (6, 2, 2, 2, ...), and whether they reach T of shape (4, 4, ...), shape (2, 2, 1, ...)."""
     rest = T.shape[2:]
-    a2, a3 = chain.a[1:3]
-    d1, d4, d5, d6 = chain.d[0], *chain.d[3:6]
+    a2, a3, d1, d4, d5, d6 = arm.a2, arm.a3, arm.d1, arm.d4, arm.d5, arm.d6
     x6, y6, z6 = T[:3, 0], T[:3, 1], T[:3, 2]
-    tool_x, tool_y, tool_z = chain.tool
+    tool_x, tool_y, tool_z = arm.tool
     p5 = T[:3, 3] - (tool_z + d6) * z6
     if tool_x or tool_y:
         p5 = p5 - tool_x * x6 - tool_y * y6
 
     # Axes 0, 1 and 2 of these arrays are shoulder, wrist and elbow.
     signs = _SIGNS.reshape(2, *(1,) * len(rest))
-    sine, cosine = np.empty((2, DOF, 2, 2, 2, *rest))
+    sine, cosine = np.empty((2, _DOF, 2, 2, 2, *rest))
 
     # Shoulder: the wrist's centre lies d4 beside the arm's plane.
     square = p5[0] * p5[0] + p5[1] * p5[1]
@@ -103,7 +102,7 @@ def _branches(chain: ArmChain, T: Array, last: Array | float) -> tuple[Array, ND
     return q, reached[:, :, None]
 
 
-def wrist_centre(chain: ArmChain, pose: Array) -> Array:
+def wrist_centre(arm: UrGeometry, pose: Array) -> Array:
     """Return where the last two axes meet if the tool frame is `pose` of shape (4, 4), shape (3,) [m]."""
-    x, y, z = chain.tool
-    return pose[:3, 3] - x * pose[:3, 0] - y * pose[:3, 1] - (z + chain.d[5]) * pose[:3, 2]
+    x, y, z = arm.tool
+    return pose[:3, 3] - x * pose[:3, 0] - y * pose[:3, 1] - (z + arm.d6) * pose[:3, 2]

@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.body import ArmChain, Limits
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry import inverse_kinematics
 from bhd_lerobot.control.geometry.collision import CollisionModel
-from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ class IkResult:
     """Postures that were found, or why there are none.
 
     Attributes:
-        postures: joint positions [rad], shape (k, 6); empty unless succeeded.
+        postures: joint positions [rad], shape (k, dof); empty unless succeeded.
         message: what was in the way, with numbers and a remedy; empty if succeeded.
         index: number of the pose of a line that cannot be reached, or None.
     """
@@ -54,21 +54,23 @@ class ArmKinematics(ForwardKinematics):
 
     def __init__(self, chain: ArmChain, limits: Limits) -> None:
         super().__init__(chain)
-        if len(limits.names) < DOF:
-            raise ConfigError(f"There are limits for {len(limits.names)} commands; the arm has {DOF} joints.")
+        if len(limits.names) < self.dof:
+            raise ConfigError(f"There are limits for {len(limits.names)} commands; the arm has {self.dof} joints.")
         self.collision = CollisionModel(chain)
-        self.lower, self.upper = np.array(limits.lower[:DOF]), np.array(limits.upper[:DOF])
+        self.lower, self.upper = np.array(limits.lower[: self.dof]), np.array(limits.upper[: self.dof])
         self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
 
     def solutions(self, pose: Array, last: Array | float = 0.0) -> Array:
         """Return every posture that reaches a pose, permitted or not, see `inverse_kinematics.solutions`."""
-        return inverse_kinematics.solutions(self.chain, pose, last)
+        if self.ur is None:
+            raise ConfigError("Inverse kinematics of this geometry come with the next commit.")
+        return inverse_kinematics.solutions(self.ur, pose, last)
 
     def check(self, q: Array) -> Codes:
         """Return for each posture the first check that it fails, or SUCCEEDED.
 
         Args:
-            q: joint positions [rad], shape (..., 6).
+            q: joint positions [rad], shape (..., dof).
 
         Returns:
             JOINT_LIMIT, SELF_COLLISION, TABLE_COLLISION, SINGULAR or SUCCEEDED as numbers, shape (...).
@@ -86,7 +88,7 @@ class ArmKinematics(ForwardKinematics):
         return codes
 
     def explain(self, q: Array) -> str:
-        """Return what `check` holds against a posture of shape (6,), with numbers and a remedy; empty if nothing."""
+        """Return what `check` holds against a posture of shape (dof,), with numbers and a remedy; empty if nothing."""
         code = ResultCode(int(self.check(q[None])[0]))
         chain = self.chain
         if code == ResultCode.JOINT_LIMIT:
@@ -121,7 +123,7 @@ class ArmKinematics(ForwardKinematics):
 
         Args:
             pose: shape (4, 4).
-            posture: joint positions now [rad], shape (6,).
+            posture: joint positions now [rad], shape (dof,).
 
         Returns:
             The postures, the one with the smallest largest change of a joint first; or the last check that the
@@ -133,7 +135,7 @@ class ArmKinematics(ForwardKinematics):
         found = self.solutions(pose, posture[5])
         found = found[found[:, 0] == found[:, 0]]
         if not len(found):
-            return _failed(ResultCode.UNREACHABLE, self._why_unreachable(pose, posture))
+            return _failed(len(posture), ResultCode.UNREACHABLE, self._why_unreachable(pose, posture))
         found = self._nearest_turns(found, posture)
         change = np.abs(found - posture)
         found = found[np.lexsort((change.sum(axis=1), change.max(axis=1)))]
@@ -143,17 +145,17 @@ class ArmKinematics(ForwardKinematics):
             return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(admissible, self.lower), self.upper))
         # The checks are numbered in their order, so the largest number is the check that removed the last posture.
         worst = int(codes.argmax())
-        return _failed(ResultCode(int(codes[worst])), self.explain(found[worst]))
+        return _failed(len(posture), ResultCode(int(codes[worst])), self.explain(found[worst]))
 
     def line(self, poses: Array, posture: Array) -> IkResult:
         """Return the postures along a path of the tool, all on the branch of the first.
 
         Args:
             poses: the path, close enough together that no joint turns by 1 rad from one to the next, shape (K, 4, 4).
-            posture: the posture in `poses[0]` [rad], shape (6,).
+            posture: the posture in `poses[0]` [rad], shape (dof,).
 
         Returns:
-            Postures of shape (K, 6), continuous from `posture`; or the first pose that cannot be taken and why.
+            Postures of shape (K, dof), continuous from `posture`; or the first pose that cannot be taken and why.
         """
         refused = _check_poses(poses, posture)
         if refused is not None:
@@ -167,7 +169,7 @@ class ArmKinematics(ForwardKinematics):
             message = f"The line starts {away[branch]:.4f} rad from the posture; {_START_ERROR} is the most."
             if np.isinf(away[branch]):
                 message = self._why_unreachable(poses[0], posture)
-            return _failed(ResultCode.UNREACHABLE, message, 0)
+            return _failed(len(posture), ResultCode.UNREACHABLE, message, 0)
         path = found[:, branch]
         before = np.concatenate((posture[None], path[:-1]))
         path = path - TURN * np.cumsum(np.rint((path - before) / TURN), axis=0)
@@ -182,9 +184,11 @@ class ArmKinematics(ForwardKinematics):
             message = (
                 self.explain(path[index]) or "A joint would have to jump between two poses, at a singular posture."
             )
-            return _failed(ResultCode(int(codes[index])), message, index)
+            return _failed(len(posture), ResultCode(int(codes[index])), message, index)
         if missing.any():
-            return _failed(ResultCode.UNREACHABLE, self._why_unreachable(poses[len(path)], path[-1]), len(path))
+            return _failed(
+                len(posture), ResultCode.UNREACHABLE, self._why_unreachable(poses[len(path)], path[-1]), len(path)
+            )
         return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(path, self.lower), self.upper))
 
     def _nearest_turns(self, q: Array, posture: Array) -> Array:
@@ -196,28 +200,31 @@ class ArmKinematics(ForwardKinematics):
 
     def _why_unreachable(self, pose: Array, posture: Array) -> str:
         """Return what keeps every branch from a pose of shape (4, 4), with numbers and a remedy."""
-        centre = inverse_kinematics.wrist_centre(self.chain, pose)
-        beside, least = float(np.hypot(centre[0], centre[1])), abs(self.chain.d[3])
+        assert self.ur is not None
+        centre = inverse_kinematics.wrist_centre(self.ur, pose)
+        beside, least = float(np.hypot(centre[0], centre[1])), abs(self.ur.d4)
         if beside < least:
             return (
                 f"The wrist would be {beside:.3f} m from the base's axis; {least:.3f} m is the least. "
                 "Move the tool away from the axis."
             )
-        nearest = self.tool(inverse_kinematics.nearest(self.chain, pose, float(posture[5])))
+        nearest = self.tool(inverse_kinematics.nearest(self.ur, pose, float(posture[5])))
         short = np.sqrt(np.square(nearest[:, :3, 3] - pose[:3, 3]).sum(axis=1)).min()
-        far = np.sqrt(np.square(centre - (0.0, 0.0, self.chain.d[0])).sum())
-        where = "too far away: move it towards" if far > abs(self.chain.a[1]) else "too near: move it away from"
+        far = np.sqrt(np.square(centre - (0.0, 0.0, self.ur.d1)).sum())
+        where = "too far away: move it towards" if far > abs(self.ur.a2) else "too near: move it away from"
         return f"The arm ends {short:.3f} m short of the pose, which is {where} the base's axis, or turn it."
 
 
 def _check_poses(poses: Array, posture: Array) -> IkResult | None:
     """Return why the numbers themselves are refused, or None; `poses` has shape (K, 4, 4)."""
     if not np.isfinite(posture).all():
-        return _failed(ResultCode.NON_FINITE, f"The posture is {posture.tolist()}; all must be finite.")
+        return _failed(len(posture), ResultCode.NON_FINITE, f"The posture is {posture.tolist()}; all must be finite.")
     finite = np.isfinite(poses)
     if not finite.all():
         index = int(finite.all(axis=(1, 2)).argmin())
-        return _failed(ResultCode.NON_FINITE, f"The pose is {poses[index].tolist()}; all must be finite.", index)
+        return _failed(
+            len(posture), ResultCode.NON_FINITE, f"The pose is {poses[index].tolist()}; all must be finite.", index
+        )
     rotations = poses[:, :3, :3]
     error = np.zeros((len(poses), 5, 3))
     error[:, :3] = (rotations[:, :, :, None] * rotations[:, :, None, :]).sum(axis=1) - _IDENTITY
@@ -229,9 +236,9 @@ def _check_poses(poses: Array, posture: Array) -> IkResult | None:
         index = int(wrong.any(axis=(1, 2)).argmax())
         largest = float(np.abs(error[index]).max())
         message = f"The pose is {largest:.2e} from a rotation and a translation; {_ROTATION_ERROR} is the most."
-        return _failed(ResultCode.NOT_NORMALISED, f"{message} Normalise the orientation.", index)
+        return _failed(len(posture), ResultCode.NOT_NORMALISED, f"{message} Normalise the orientation.", index)
     return None
 
 
-def _failed(code: ResultCode, message: str, index: int | None = None) -> IkResult:
-    return IkResult(code, np.empty((0, DOF)), message, index)
+def _failed(dof: int, code: ResultCode, message: str, index: int | None = None) -> IkResult:
+    return IkResult(code, np.empty((0, dof)), message, index)

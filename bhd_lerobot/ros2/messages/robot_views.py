@@ -90,7 +90,7 @@ def _ur5(body: Body) -> RobotView:
             StaticFrame("base_link", ARM_FRAME, _ORIGIN, _HALF_TURN),
             StaticFrame("wrist_3_link", "flange", _ORIGIN, (0.5, -0.5, -0.5, -0.5)),
             StaticFrame("flange", "tool0", _ORIGIN, (0.5, 0.5, 0.5, 0.5)),
-            StaticFrame("tool0", TOOL_FRAME, chain.tool),
+            StaticFrame("tool0", TOOL_FRAME, chain.tool.position),
             StaticFrame(TOOL_FRAME, "wrist_optical_frame", _three(ahead), _optical(camera)),
         ),
         joints=_links(chain),
@@ -105,13 +105,12 @@ def _links(chain: ArmChain) -> tuple[JointFrame, ...]:
     """
     names = ("base_link_inertia", "shoulder_link", "upper_arm_link", "forearm_link", *_WRISTS)
     links, length, twist = [], 0.0, 0.0
-    for parent, child, joint, a, d, alpha in zip(
-        names, names[1:], chain.joints, chain.a, chain.d, chain.alpha, strict=False
-    ):
+    for parent, child, joint, link in zip(names, names[1:], chain.joints, chain.links, strict=False):
+        a, _, d = link.position
         place = (length, round(-math.sin(twist) * d, 12), round(math.cos(twist) * d, 12))
         turn = (math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0)
         links.append(JointFrame(parent, child, place, turn, joint=f"{joint}_joint"))
-        length, twist = a, alpha
+        length, twist = a, math.atan2(link.rotation[2][1], link.rotation[1][1])
     return tuple(links)
 
 

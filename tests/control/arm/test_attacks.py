@@ -184,7 +184,7 @@ def test_whatever_surrounds_an_arm_leaves_room_for_what_it_holds() -> None:
             geometries = new_geometries(chain, 1)
         except ConfigError:
             continue
-        fill_geometry(geometries[1], chain.holding(Capsule(HELD, 6, chain.tool, (0.0, 0.0, 0.2), 0.02)))
+        fill_geometry(geometries[1], chain.holding(Capsule(HELD, 6, chain.tool.position, (0.0, 0.0, 0.2), 0.02)))
 
 
 def follow(n: int, arm: int) -> np.ndarray:

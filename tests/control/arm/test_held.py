@@ -59,7 +59,7 @@ def test_what_a_stalled_gripper_holds_reaches_down_to_the_table() -> None:
     for arm, (height, tilt) in enumerate(cases):
         capsule = held[arm]
         assert isinstance(capsule, Capsule)
-        assert (capsule.name, capsule.start) == (HELD, ARM.arm.chain.tool)
+        assert (capsule.name, capsule.start) == (HELD, ARM.arm.chain.tool.position)
         assert capsule.radius <= 0.025
         model = CollisionModel(ARM.arm.chain.holding(capsule))
         rows = np.stack([posture(height + up, tilt) for up in (0.0, 0.01, -0.001)])

@@ -8,17 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from bhd_lerobot.bodies.body import ArmChain, Placement
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.geometry.forward_kinematics import UrGeometry
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
 
 ARM = ur5()
 CHAIN = ARM.arm.chain
+A, D = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0), (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
+ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 HOME = np.array(ARM.arm.home[:6])
 KINEMATICS = ArmKinematics(CHAIN, ARM.limits)
-TILTED = ArmKinematics(dataclasses.replace(CHAIN, tool=(0.03, -0.02, 0.15)), ARM.limits)
+TILTED = ArmKinematics(dataclasses.replace(CHAIN, tool=Placement((0.03, -0.02, 0.15))), ARM.limits)
 TURN = 2 * math.pi
 ANGLE = st.floats(-math.pi, math.pi) | st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, -math.pi, 1e-7])
 POSTURE = arrays(np.float64, (6,), elements=ANGLE)
@@ -45,7 +49,7 @@ def moved(pose: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> n
 def product(q: np.ndarray) -> np.ndarray:
     """The frames as the convention defines them."""
     frames = [np.eye(4)]
-    for angle, a, d, alpha in zip(q, CHAIN.a, CHAIN.d, CHAIN.alpha, strict=True):
+    for angle, a, d, alpha in zip(q, A, D, ALPHA, strict=True):
         c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
         step = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
         frames.append(frames[-1] @ np.array(step))
@@ -214,10 +218,30 @@ def test_a_line_starts_where_the_arm_is_and_stops_at_a_limit_and_before_a_singul
         {"d": (0.1, 0.1, 0.0, 0.1, 0.1, 0.1)},
         {"d": (0.1, 0.0, 0.0, 0.0, 0.1, 0.1)},
         {"alpha": (math.pi / 2, 0.0, 0.0, math.pi / 2, math.pi / 2, 0.0)},
-        {"alpha": (0.0,) * 5},
-        {"tool": (0.0, math.inf, 0.0)},
+        {"tool": Placement(rotation=((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))},
+        {"base": Placement((0.0, 0.0, 0.1))},
     ],
 )
-def test_another_geometry_is_refused(change: dict) -> None:
+def test_the_closed_form_is_for_one_geometry(change: dict) -> None:
+    numbers = {"a": A, "d": D, "alpha": ALPHA, "tool": (0.0, 0.0, 0.1)}
+    others = {"capsules": (), "disjoint": (), "min_distance": 0.0, "min_manipulability": 0.0}
+    assert UrGeometry.of(ArmChain.from_dh(CHAIN.joints, **numbers, **others)) is not None
+    assert UrGeometry.of(ArmChain.from_dh(CHAIN.joints, **numbers | change, **others)) is None
+
+
+@each_case(
+    "change",
+    [{"alpha": (0.0,) * 5}, {"tool": (0.0, math.inf, 0.0)}, {"tool": (0.0, 0.0)}],
+)
+def test_numbers_that_are_no_chain_are_refused(change: dict) -> None:
+    others = {"capsules": (), "disjoint": (), "min_distance": 0.0, "min_manipulability": 0.0}
     with pytest.raises(ConfigError):
-        ArmKinematics(dataclasses.replace(CHAIN, **change), ARM.limits)
+        ArmChain.from_dh(CHAIN.joints, **{"a": A, "d": D, "alpha": ALPHA, "tool": (0.0, 0.0, 0.1)} | change, **others)
+
+
+@each_case(
+    "rotation", [((1.0, 0.0, 0.0),) * 3, ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), ((1.0, 0.0),) * 2]
+)
+def test_what_is_no_rotation_is_refused(rotation: tuple) -> None:
+    with pytest.raises(ConfigError, match="rotation"):
+        Placement(rotation=rotation)
