@@ -16,7 +16,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "stock": (),
     "options": (),
     "bodies": ("options",),
-    "sim": ("versions", "bodies.body", "bodies.tabletop", "control", "control.tick", "control.cerebellum"),
+    "sim": (
+        *("versions", "bodies.body", "bodies.tabletop"),
+        *("control", "control.geometry", "control.tick", "control.cerebellum"),
+    ),
     "control": ("bodies.body",),
     "control.geometry": ("versions", "bodies.body", "control"),
     "control.motion": ("versions", "bodies.body", "control", "control.geometry"),

@@ -3,6 +3,7 @@
 __all__ = [
     "backdrop",
     "camera",
+    "chain",
     "description",
     "efforts",
     "engine",

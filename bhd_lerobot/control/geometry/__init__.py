@@ -1,3 +1,12 @@
 """Kinematics, collisions, dynamics and poses."""
 
-__all__ = ["chain", "collision", "dynamics", "forward_kinematics", "inverse_kinematics", "kinematics", "poses"]
+__all__ = [
+    "capsules",
+    "chain",
+    "collision",
+    "dynamics",
+    "forward_kinematics",
+    "inverse_kinematics",
+    "kinematics",
+    "poses",
+]

@@ -1,0 +1,106 @@
+"""Capsules for the collision checks of an arm whose shapes are known: how they enclose shapes, and which may meet."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import ArmChain
+from bhd_lerobot.control.geometry.collision import CollisionModel
+
+Array = NDArray[np.float64]
+
+_RADII = np.linspace(1.0, 2.0, 41)  # of the radius that the sides need; with a larger one a capsule may be shorter
+_ROUNDS = 200  # towards the middle of a disc
+_COVER = 1.0 + 1e-9
+_POSTURES, _BATCH = 2000, 100
+_NEVER = 0.02  # [m] capsules that stay so far apart in all of these postures do not meet
+_ALWAYS = 0.95  # share of the postures; capsules that are too near in more say nothing about a posture
+
+
+@dataclass(frozen=True)
+class Balls:
+    """A shape that balls span: their convex hull. A vertex is a ball without a radius.
+
+    Attributes:
+        centres: shape (n, 3) [m].
+        radii: shape (n,) [m].
+    """
+
+    centres: Array
+    radii: Array
+
+    def __add__(self, other: "Balls") -> "Balls":
+        return Balls(np.concatenate((self.centres, other.centres)), np.concatenate((self.radii, other.radii)))
+
+    def moved(self, pose: Array) -> "Balls":
+        """Return the shape in the frame that its own frame, of shape (4, 4), is given in."""
+        return Balls(self.centres @ pose[:3, :3].T + pose[:3, 3], self.radii)
+
+
+def enclosing(shape: Balls) -> tuple[Array, Array, float]:
+    """Return the ends and the radius of a small capsule around a shape, along one of its principal axes [m]."""
+    centres, radii = shape.centres, shape.radii
+    if len(centres) <= 2 and np.ptp(radii) == 0.0:  # a ball or a capsule
+        return centres[0], centres[-1], float(radii[0])
+    middle = centres.mean(axis=0)
+    _, _, axes = np.linalg.svd(centres - middle, full_matrices=True)
+    found = [_along(axis, middle, centres, radii) for axis in axes]
+    return min(found, key=lambda capsule: _volume(*capsule))
+
+
+def _along(axis: Array, middle: Array, centres: Array, radii: Array) -> tuple[Array, Array, float]:
+    """Return the smallest capsule in a direction."""
+    along = (centres - middle) @ axis
+    across = centres - middle - along[:, None] * axis
+    centre = across.mean(axis=0)
+    best, least = centre, np.inf
+    for number in range(_ROUNDS):  # towards what is farthest, by less and less (Bădoiu and Clarkson)
+        far = np.linalg.norm(across - centre, axis=1) + radii
+        if far.max() < least:
+            best, least = centre, float(far.max())
+        centre = centre + (across[far.argmax()] - centre) / (number + 2)
+    aside = np.linalg.norm(across - best, axis=1)
+    capsules = []
+    for radius in least * _COVER * _RADII:
+        room = np.sqrt(np.maximum((radius - radii) ** 2 - aside**2, 0.0))
+        first, last = (along + room).min(), (along - room).max()
+        if first > last:
+            first = last = (first + last) / 2
+        capsules.append((middle + best + first * axis, middle + best + last * axis, float(radius)))
+    return min(capsules, key=lambda capsule: _volume(*capsule))
+
+
+def _volume(start: Array, end: Array, radius: float) -> float:
+    return float(np.pi * radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius))
+
+
+def with_pairs(chain: ArmChain, home: Array, lower: Array, upper: Array) -> ArmChain:
+    """Return a chain with the pairs of capsules that may meet.
+
+    Pairs are left out that are on one link or on adjacent ones, that are too near at home, and those that are never
+    near, or nearly always too near, in 2,000 random postures: the same each time.
+
+    Args:
+        chain: its own pairs are not looked at.
+        home: a posture that is permitted [rad], shape (dof,).
+        lower: smallest positions [rad], shape (dof,).
+        upper: largest positions [rad], shape (dof,).
+    """
+    capsules = chain.capsules
+    pairs = tuple(
+        (one.name, other.name)
+        for number, one in enumerate(capsules)
+        for other in capsules[number + 1 :]
+        if abs(one.frame - other.frame) > 1
+    )
+    model = CollisionModel(replace(chain, disjoint=pairs))
+    nearest, near = np.full(len(pairs), np.inf), np.zeros(len(pairs))
+    postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, chain.dof))
+    for batch in np.split(postures, _POSTURES // _BATCH):
+        distances = model.each(batch)[: len(pairs)]
+        nearest = np.minimum(nearest, distances.min(axis=1))
+        near += (distances < chain.min_distance).sum(axis=1)
+    at_home = model.each(home[None])[: len(pairs), 0]
+    may = (at_home >= chain.min_distance) & (nearest < _NEVER) & (near < _ALWAYS * _POSTURES)
+    return replace(chain, disjoint=tuple(pair for pair, one in zip(pairs, may, strict=True) if one))
