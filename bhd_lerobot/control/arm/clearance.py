@@ -37,9 +37,7 @@ def fill_geometry(row: Any, chain: ArmChain) -> None:
             f"The arm and what is declared around it are {shapes} capsules, of which {pairs} pairs are kept apart; an "
             f"arm's record holds {SHAPES} and {PAIRS}. Declare fewer obstacles, larger ones in place of several."
         )
-    row["dof"] = dof = chain.dof
-    row["base"][0], row["tool"] = (place.matrix()[:3] for place in (chain.base, chain.tool))
-    row["link"][:dof] = [link.matrix()[:3] for link in chain.links]
+    dof = chain.dof
     row["shapes"], row["pairs"] = shapes, pairs
     model.fill(row)
     near = np.concatenate(model.slopes())

@@ -8,5 +8,6 @@ __all__ = [
     "forward_kinematics",
     "inverse_kinematics",
     "kinematics",
+    "numeric_inverse",
     "poses",
 ]

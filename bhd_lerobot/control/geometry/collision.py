@@ -51,7 +51,8 @@ class CollisionModel:
         self._below_start, self._below_end = np.array(below)[:, :, None]
 
     def fill(self, row: Any) -> None:
-        """Write the capsules and their pairs into the record that a tick finds distances with."""
+        """Write the chain, the capsules and their pairs into the record that a tick finds distances with."""
+        self._forward.fill(row)
         count, pairs = self._count, len(self._first)
         for name, values in (
             ("frame", self._frame[:count]),

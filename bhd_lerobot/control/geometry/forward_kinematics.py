@@ -5,6 +5,7 @@ element: a result does not depend on what it is computed together with.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,11 @@ class ForwardKinematics:
             fixed[1, 2, 3] = ur.d1
         self._fixed = fixed
 
+    def fill(self, row: Any) -> None:
+        """Write the chain into a record of `GEOMETRY`."""
+        row["dof"], row["base"][0], row["tool"] = self.dof, self.base[:3], self.tool_in_flange[:3]
+        row["link"][: self.dof] = self.links[:, :3]
+
     def frames(self, q: Array) -> Array:
         """Return the base frame and the frame behind each joint, shape (..., dof + 1, 4, 4)."""
         return components_last(self.components(q), 3)
@@ -135,13 +141,15 @@ class ForwardKinematics:
         if self.ur is not None:
             return self._ur_components(angles.copy(), frames)
         c, s = np.cos(angles), np.sin(angles)
-        before = np.broadcast_to(self.base.reshape(4, 4, *(1,) * (angles.ndim - 1)), frames.shape[1:])
-        for k, link in enumerate(self.links):
-            x, y, z, origin = (before[:3, column] for column in range(4))
-            ahead, across, after = c[k] * x + s[k] * y, c[k] * y - s[k] * x, frames[k + 1]
-            for column in range(4):
-                after[:3, column] = link[0, column] * ahead + link[1, column] * across + link[2, column] * z
-            after[:3, 3] += origin
+        single = (1,) * (angles.ndim - 1)
+        before = self.base[:3].reshape(3, 4, *single)
+        for k, link in enumerate(self.links.reshape(-1, 4, 4, *single)):
+            x, y, z = before[:, 0], before[:, 1], before[:, 2]
+            ahead, across, after = c[k] * x + s[k] * y, c[k] * y - s[k] * x, frames[k + 1, :3]
+            np.multiply(ahead[:, None], link[0], out=after)
+            after += across[:, None] * link[1]
+            after += z[:, None] * link[2]
+            after[:, 3] += before[:, 3]
             before = after
         return frames
 

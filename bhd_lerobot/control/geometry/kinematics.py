@@ -1,6 +1,6 @@
 """Which postures reach a pose, and may be taken: inverse kinematics with limits, collisions and singularities."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry import inverse_kinematics
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.control.geometry.numeric_inverse import REACHED, NumericInverse
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -20,6 +21,9 @@ _AT_LIMIT = 1e-9  # a joint this far beyond its limit is at its limit [rad]
 _ROTATION_ERROR = 1e-6  # how far the columns of a rotation may be from orthonormal
 _START_ERROR = 1e-3  # how far a line may start from the posture that it is to start from [rad]
 _LARGEST_STEP = 1.0  # a joint that turns further between two poses of a line has changed its branch [rad]
+_TURNED = 1e-3  # [1] by how much more the axes of the tool may be off than they have to be
+_SAME = 1e-4  # [rad] postures that differ by less are one
+_JUMP = "A joint would have to jump between two poses, at a singular posture."
 _ADMISSIBLE = int(ResultCode.SUCCEEDED)
 _IDENTITY = np.eye(3)
 
@@ -32,24 +36,28 @@ class IkResult:
         postures: joint positions [rad], shape (k, dof); empty unless succeeded.
         message: what was in the way, with numbers and a remedy; empty if succeeded.
         index: number of the pose of a line that cannot be reached, or None.
+        turned: angle by which the tool is turned away from the pose in each posture [rad], shape (k,); more than
+            rounding only for an arm with fewer than six joints.
     """
 
     code: ResultCode
     postures: Array
     message: str = ""
     index: int | None = None
+    turned: Array = field(default_factory=lambda: np.empty(0))
 
 
 class ArmKinematics(ForwardKinematics):
     """Forward and inverse kinematics of an arm.
 
-    Poses are tool frames in the base frame, shape (..., 4, 4).
+    Poses are tool frames in the base frame, shape (..., 4, 4). The UR geometry is solved in closed form, every other
+    chain as `numeric_inverse` describes it.
 
     Args:
-        limits: limits of its commands; the first six are the joints'.
+        limits: limits of its commands, the joints' first.
 
     Raises:
-        ConfigError: the chain has another structure than the closed form can solve, or too few limits.
+        ConfigError: the chain has too many joints, or too few limits.
     """
 
     def __init__(self, chain: ArmChain, limits: Limits) -> None:
@@ -59,12 +67,21 @@ class ArmKinematics(ForwardKinematics):
         self.collision = CollisionModel(chain)
         self.lower, self.upper = np.array(limits.lower[: self.dof]), np.array(limits.upper[: self.dof])
         self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
+        self._numeric = NumericInverse(self, self.lower, self.upper) if self.ur is None else None
 
-    def solutions(self, pose: Array, last: Array | float = 0.0) -> Array:
-        """Return every posture that reaches a pose, permitted or not, see `inverse_kinematics.solutions`."""
-        if self.ur is None:
-            raise ConfigError("Inverse kinematics of this geometry come with the next commit.")
-        return inverse_kinematics.solutions(self.ur, pose, last)
+    def solutions(self, pose: Array, posture: Array | None = None) -> Array:
+        """Return postures that reach a pose, permitted or not, shape (..., k, dof); NaN for a branch that does not.
+
+        Args:
+            pose: shape (..., 4, 4); of a chain without a closed form (4, 4).
+            posture: where the arm is [rad], shape (..., dof). What the pose leaves free stays as it is there.
+        """
+        if self.ur is not None:
+            return inverse_kinematics.solutions(self.ur, pose, 0.0 if posture is None else posture[..., -1])
+        assert self._numeric is not None
+        posture = np.clip(np.zeros(self.dof), self.lower, self.upper) if posture is None else posture
+        *_, (found, _) = self._numeric.search(pose, posture)
+        return found
 
     def check(self, q: Array) -> Codes:
         """Return for each posture the first check that it fails, or SUCCEEDED.
@@ -132,17 +149,33 @@ class ArmKinematics(ForwardKinematics):
         refused = _check_poses(pose[None], posture)
         if refused is not None:
             return refused
-        found = self.solutions(pose, posture[5])
-        found = found[found[:, 0] == found[:, 0]]
+        if self._numeric is None:
+            found = self.solutions(pose, posture)
+            found = found[found[:, 0] == found[:, 0]]
+            return self._chosen(pose, posture, found, np.zeros((len(found), 3)))
+        for found, off in self._numeric.search(pose, posture):
+            result = self._chosen(pose, posture, found, off)
+            if result.code == ResultCode.SUCCEEDED and result.turned[0] < REACHED:
+                break
+        return result
+
+    def _chosen(self, pose: Array, posture: Array, found: Array, off: Array) -> IkResult:
+        """Return which of the postures that reach a pose may be taken, the least turned and then the nearest first."""
         if not len(found):
             return _failed(len(posture), ResultCode.UNREACHABLE, self._why_unreachable(pose, posture))
         found = self._nearest_turns(found, posture)
         change = np.abs(found - posture)
-        found = found[np.lexsort((change.sum(axis=1), change.max(axis=1)))]
+        order = np.lexsort((change.sum(axis=1), change.max(axis=1), np.rint(off[:, 2] / _TURNED)))
+        found, off = found[order], off[order]
         codes = self.check(found)
-        admissible = found[codes == _ADMISSIBLE]
-        if len(admissible):
-            return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(admissible, self.lower), self.upper))
+        admissible = codes == _ADMISSIBLE
+        if admissible.any():
+            admissible &= off[:, 2] < off[admissible, 2][0] + _TURNED
+            if self._numeric is not None:
+                same = (np.abs(found[:, None] - found).max(axis=2) < _SAME) & admissible
+                admissible &= same.argmax(axis=1) == np.arange(len(found))
+            postures = np.minimum(np.maximum(found[admissible], self.lower), self.upper)
+            return IkResult(ResultCode.SUCCEEDED, postures, turned=off[admissible, 1])
         # The checks are numbered in their order, so the largest number is the check that removed the last posture.
         worst = int(codes.argmax())
         return _failed(len(posture), ResultCode(int(codes[worst])), self.explain(found[worst]))
@@ -160,36 +193,58 @@ class ArmKinematics(ForwardKinematics):
         refused = _check_poses(poses, posture)
         if refused is not None:
             return refused
-        found = self.solutions(poses, posture[5])
-        away = found[0] - posture
-        away = np.abs(away - TURN * np.rint(away / TURN)).max(axis=1)
-        away[np.isnan(away)] = np.inf
-        branch = int(away.argmin())
-        if not away[branch] < _START_ERROR:
-            message = f"The line starts {away[branch]:.4f} rad from the posture; {_START_ERROR} is the most."
-            if np.isinf(away[branch]):
-                message = self._why_unreachable(poses[0], posture)
-            return _failed(len(posture), ResultCode.UNREACHABLE, message, 0)
-        path = found[:, branch]
-        before = np.concatenate((posture[None], path[:-1]))
-        path = path - TURN * np.cumsum(np.rint((path - before) / TURN), axis=0)
-        missing = np.isnan(path).any(axis=1)
-        if missing.any():
-            path = path[: int(missing.argmax())]
+        path = self._trace(poses, posture) if self._numeric is None else self._follow(self._numeric, poses, posture)
+        if isinstance(path, IkResult):
+            return path
         codes = self.check(path)
         codes[1:][np.abs(np.diff(path, axis=0)).max(axis=1) > _LARGEST_STEP] = ResultCode.SINGULAR
         bad = codes != _ADMISSIBLE
         if bad.any():
             index = int(bad.argmax())
-            message = (
-                self.explain(path[index]) or "A joint would have to jump between two poses, at a singular posture."
-            )
+            message = self.explain(path[index]) or _JUMP
             return _failed(len(posture), ResultCode(int(codes[index])), message, index)
-        if missing.any():
-            return _failed(
-                len(posture), ResultCode.UNREACHABLE, self._why_unreachable(poses[len(path)], path[-1]), len(path)
-            )
+        if len(path) < len(poses):
+            there = poses[len(path)]
+            if self._numeric is not None and self.solve(there, path[-1]).code == ResultCode.SUCCEEDED:
+                return _failed(len(posture), ResultCode.SINGULAR, _JUMP, len(path))
+            why = self._why_unreachable(there, path[-1])
+            return _failed(len(posture), ResultCode.UNREACHABLE, why, len(path))
         return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(path, self.lower), self.upper))
+
+    def _trace(self, poses: Array, posture: Array) -> Array | IkResult:
+        """Return the postures of the closed form along a path, up to the first pose that it does not reach."""
+        found = self.solutions(poses, posture)
+        away = found[0] - posture
+        away = np.abs(away - TURN * np.rint(away / TURN)).max(axis=1)
+        away[np.isnan(away)] = np.inf
+        branch = int(away.argmin())
+        if not away[branch] < _START_ERROR:
+            return self._starts_elsewhere(poses[0], posture, float(away[branch]))
+        path = found[:, branch]
+        before = np.concatenate((posture[None], path[:-1]))
+        path = path - TURN * np.cumsum(np.rint((path - before) / TURN), axis=0)
+        missing = np.isnan(path).any(axis=1)
+        return path[: int(missing.argmax())] if missing.any() else path
+
+    def _follow(self, numeric: NumericInverse, poses: Array, posture: Array) -> Array | IkResult:
+        """Return postures along a path, each solved from the one before, up to the first pose that is not reached."""
+        path, before = np.empty((len(poses), self.dof)), posture
+        for index, pose in enumerate(poses):
+            for limited in (True, False):  # beyond a limit, the check says which
+                found, off = numeric.descend(pose, before, before[None], limited=limited)
+                if numeric.reaches(off)[0]:
+                    break
+            else:
+                return path[:index] if index else self._starts_elsewhere(pose, posture, np.inf)
+            path[index] = before = found[0]
+        away = float(np.abs(path[0] - posture).max())
+        return path if away < _START_ERROR else self._starts_elsewhere(poses[0], posture, away)
+
+    def _starts_elsewhere(self, pose: Array, posture: Array, away: float) -> IkResult:
+        message = f"The line starts {away:.4f} rad from the posture; {_START_ERROR} is the most."
+        if np.isinf(away):
+            message = self._why_unreachable(pose, posture)
+        return _failed(len(posture), ResultCode.UNREACHABLE, message, 0)
 
     def _nearest_turns(self, q: Array, posture: Array) -> Array:
         """Return postures with each joint in that turn within its limits which is nearest to `posture`."""
@@ -199,7 +254,13 @@ class ArmKinematics(ForwardKinematics):
         return q + TURN * turns
 
     def _why_unreachable(self, pose: Array, posture: Array) -> str:
-        """Return what keeps every branch from a pose of shape (4, 4), with numbers and a remedy."""
+        """Return what keeps an arm from a pose of shape (4, 4), with numbers and a remedy."""
+        if self._numeric is not None:
+            short, angle = self._numeric.nearest(pose, posture)
+            return (
+                f"The tool comes no nearer to the pose than {short:.3g} m and {angle:.3g} rad. Move the pose towards "
+                "the base, or turn it."
+            )
         assert self.ur is not None
         centre = inverse_kinematics.wrist_centre(self.ur, pose)
         beside, least = float(np.hypot(centre[0], centre[1])), abs(self.ur.d4)

@@ -93,7 +93,7 @@ def test_every_solution_reaches_the_pose_and_the_generating_posture_is_among_the
 @given(q=POSTURE)
 def test_solutions_at_and_near_the_borders(q: np.ndarray) -> None:
     pose = KINEMATICS.tool(q)
-    found = KINEMATICS.solutions(pose, q[5])
+    found = KINEMATICS.solutions(pose, q)
     exists = np.isfinite(found).all(axis=1)
     assert exists.any()
     assert pose_error(KINEMATICS.tool(found[exists]), pose).max() < 1e-9
@@ -121,7 +121,7 @@ def test_solve_orders_by_the_largest_change_and_answers_can_be_taken() -> None:
         change = np.abs(result.postures - HOME).max(axis=1)
         assert (np.diff(change) >= 0).all()
         assert change.max() <= math.pi + 1e-9  # no longer way round while the limits are far
-        raw = KINEMATICS.solutions(KINEMATICS.tool(q), HOME[5])
+        raw = KINEMATICS.solutions(KINEMATICS.tool(q), HOME)
         raw = raw[np.isfinite(raw).all(axis=1)]
         assert len(result.postures) == (KINEMATICS.check(raw) == ResultCode.SUCCEEDED).sum()
 
@@ -129,7 +129,7 @@ def test_solve_orders_by_the_largest_change_and_answers_can_be_taken() -> None:
 def test_solve_from_a_posture_returns_it_first() -> None:
     admissible = MANY[KINEMATICS.check(MANY) == ResultCode.SUCCEEDED][:100]
     wrist_free = np.array([0.4, -1.2, 1.5, -0.3, 0.0, 0.7])  # its last joint may be anywhere, and stays where it is
-    assert np.nanmin(apart(KINEMATICS.solutions(KINEMATICS.tool(wrist_free), 0.7), wrist_free)) < 1e-7
+    assert np.nanmin(apart(KINEMATICS.solutions(KINEMATICS.tool(wrist_free), wrist_free), wrist_free)) < 1e-7
     for q in (HOME, *admissible, *(admissible[:20] + TURN * np.sign(-admissible[:20]))):
         first = KINEMATICS.solve(KINEMATICS.tool(q), q).postures[0]
         np.testing.assert_allclose(first, q, atol=1e-9)
