@@ -89,7 +89,7 @@ class Rig:
         self.world.step(1)
         self.tool.append(self._tool[0].copy())
         self.force.append(float(self._force[0, 0]))
-        self.felt.append(self.controller.contact.wrench[0].copy())
+        self.felt.append(self.controller.contact_wrench[0].copy())
 
     def keep(self, seconds: float) -> None:
         """Send the target in every frame."""

@@ -58,7 +58,7 @@ class PushWall:
     @property
     def felt(self) -> float:
         """The estimated force along x on the tool [N]."""
-        return float(self.controller.contact.wrench[0, 0])
+        return float(self.controller.contact_wrench[0, 0])
 
     def frame(self) -> None:
         """Send the target and let one frame go by."""

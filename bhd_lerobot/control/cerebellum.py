@@ -1,7 +1,5 @@
 """The cerebellum: turns commands into safe actuator commands, one tick at a time. It owns the modes."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +24,7 @@ from bhd_lerobot.control.messages import (
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 from bhd_lerobot.control.record import JOINTS, new_states, put
-from bhd_lerobot.control.tick import begin_all, drop_all, end_all, judge_all, tick_arms, tick_bases
+from bhd_lerobot.control.tick import drop_all, judge_all, tick_arms, tick_bases, tick_springs
 from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
@@ -92,17 +90,14 @@ class Cerebellum:
         self.requested: NDArray[np.float64] = states["requested"][:, :width]
         self.written: NDArray[np.float64] = states["written"][:, : controller.joints]
         self._rate: NDArray[np.float64] = states["written_rate"][:, : controller.joints]
-        self._actuators: NDArray[np.float64] = states["actuators"][:, : controller.joints]
         # Fields that every tick uses: an index costs as much as a write.
-        self._entered, self._has_setpoint, self._goes_back, self._is_distrusted, self._mode_is_new = (
-            states[name] for name in ("entered", "has_setpoint", "goes_back", "is_distrusted", "mode_is_new")
-        )
-        self._busy, self._follows_goal, self._protective_stop, self._stamp_ns, self._has_stamps = (
-            *(states[name] for name in ("busy", "follows_goal", "protective_stop", "stamp_ns")),
+        self._mode_is_new, self._stamp_ns, self._has_stamps = (
+            states["mode_is_new"],
+            states["stamp_ns"],
             numbers["has_stamps"],
         )
-        self._has_effort = None if controller.arms is None else controller.arm_limits["has_effort"]
-        if controller.is_compiled and controller.arms is None:
+        self._has_effort = None if controller.arm_limits is None else controller.arm_limits["has_effort"]
+        if controller.arm_limits is None:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
             if sensors < needed:  # compiled code would read beyond them
                 raise ConfigError(f"The controller of {body.name!r} takes {needed} sensors; the plant reads {sensors}.")
@@ -113,7 +108,6 @@ class Cerebellum:
             put(numbers[0], name, getattr(wire, name))
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
         numbers["timeout_ns"], numbers["width"], numbers["has_sensors"] = self._timeout_ns, width, sensors > 0
-        self._is_compiled = controller.is_compiled
         self.now_ns = 0
         self.may_write = False
         self._dropped = np.zeros(n, np.int64)
@@ -124,17 +118,16 @@ class Cerebellum:
 
     def _bind(self) -> None:
         states, queues, words = self.states, self.fifo.queues, self.estop.words
-        sensors = self.reading.sensors, self.reading.sensors_ns
-        if self._is_compiled:
-            own, records = self.controller, (states, queues, words)
-            if own.arms is None:
-                self._run = tick_bases.bind(*records, own.monitors, self.numbers, *sensors)
-            else:
-                limits = self.numbers, own.arm_limits, own.geometries
-                self._run_arms = tick_arms.bind(*records, own.arms, *limits, sensors[1])
+        own, records, sensors_ns = self.controller, (states, queues, words), self.reading.sensors_ns
+        self._run_arms = None
+        if own.arms is not None:
+            self._run_arms = tick_arms.bind(
+                *records, own.arms, self.numbers, own.arm_limits, own.geometries, sensors_ns
+            )
+        elif own.springs is not None:
+            self._run = tick_springs.bind(*records, own.springs, self.numbers, own.arm_limits, sensors_ns)
         else:
-            self._begin = begin_all.bind(states, queues, words, self.numbers, sensors[1])
-            self._end = end_all.bind(states, self.numbers)
+            self._run = tick_bases.bind(*records, own.monitors, self.numbers, self.reading.sensors, sensors_ns)
         self._judge = judge_all.bind(states, self.numbers)
         self._drop_all = drop_all.bind(states, queues, self._dropped)
 
@@ -190,20 +183,17 @@ class Cerebellum:
     def _keep_stops(self) -> None:
         """Begin stops again in the next tick: what interrupted this one may have interrupted their beginning."""
         for mode in (Mode.STOPPING, Mode.ESTOP, Mode.FAULT):
-            self._entered[self.mode == mode] |= 1 << mode
+            self.states["entered"][self.mode == mode] |= 1 << mode
 
     def _tick(self, now_ns: int) -> None:
         self.now_ns = now_ns
         self._read()
-        if self._is_compiled:
-            if self.controller.arms is None:
-                self._run(now_ns)
-            elif not self._run_arms(self.controller.rows, now_ns, False):
+        if self._run_arms is None:
+            self._run(now_ns)
+        elif not self._run_arms(self.controller.rows, now_ns, False):
+            self.serve()
+            while not self._run_arms(self.controller.rows, now_ns, True):
                 self.serve()
-                while not self._run_arms(self.controller.rows, now_ns, True):
-                    self.serve()
-        else:
-            self._run_controller(self.controller, now_ns)
         if np.count_nonzero(self._mode_is_new):
             self._mode_is_new[:] = False
             self.plant.set_mode(self.mode)
@@ -227,43 +217,12 @@ class Cerebellum:
         if self._has_effort is not None:
             self._has_effort[0] = reading.has_effort
 
-    def _run_controller(self, controller: Any, now_ns: int) -> None:
-        """Run a tick with a controller that is no part of the compiled one."""
-        if np.count_nonzero(self.mode == _STOPPING):
-            self.states["is_at_rest"] = controller.at_rest()
-        self._begin(now_ns)
-        self._tell_controller()
-        controller.run(self.reading)
-        self._actuators[:], self._busy[:] = controller.actuators, controller.busy
-        self._protective_stop[:], self._follows_goal[:] = controller.protective_stop, controller.following
-        self._end()
-        self._tell_controller()
-
     def _tell_controller(self) -> None:
         """Tell the controller outside of a tick what it is to do."""
-        if self._is_compiled:
-            news = self._goes_back | (self._entered != 0) | self._is_distrusted | self._has_setpoint
-            for sim in np.flatnonzero(news).tolist():
-                self.controller.tell(sim)
-            return
-        controller: Any = self.controller
-        goes_back, entered, has_setpoint = self._goes_back, self._entered, self._has_setpoint
-        if np.count_nonzero(goes_back):
-            controller.go_back(goes_back.copy(), self.written, self._rate)
-            goes_back[:] = False
-        if np.count_nonzero(entered):
-            for mode in _ENTERED:
-                mask = (entered & (1 << mode)) != 0
-                if np.count_nonzero(mask):
-                    controller.stop(mask, mode)
-            entered[:] = 0
-        if np.count_nonzero(self._is_distrusted):
-            controller.distrust(self._is_distrusted.copy())
-            self._is_distrusted[:] = False
-        if np.count_nonzero(has_setpoint):
-            mask = has_setpoint.copy()
-            has_setpoint[:] = False
-            controller.set_setpoint(self.requested, mask)
+        states = self.states
+        news = states["goes_back"] | (states["entered"] != 0) | states["is_distrusted"] | states["has_setpoint"]
+        for sim in np.flatnonzero(news).tolist():
+            self.controller.tell(sim)
 
     def _drop(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Drop what waits for some robots; return how many commands of each that were, shape (n,)."""
@@ -517,10 +476,10 @@ class Cerebellum:
     def _start_writing(self, ids: NDArray[np.intp]) -> None:
         """Start from commands that the next ones need not be near to: robots were put or moved somewhere else."""
         self.written[ids], self._rate[ids] = self.controller.actuators[ids], 0.0
+        self.states["same_effort"][ids] = self.states["written"][ids]  # no joint has to answer to this change
 
 
-_TRACKING, _STOPPING = int(Mode.TRACKING), int(Mode.STOPPING)  # numpy compares plain numbers faster
-_ENTERED = (Mode.STOPPING, Mode.INACTIVE, Mode.HOLD, Mode.SAFE_OFF, Mode.ESTOP, Mode.FAULT)
+_TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
 _MODE_REASON = np.array([mode_reason(mode) for mode in Mode], np.int8)
 _GOAL_REFUSAL = {
     int(Reason.NOT_ACTIVE): ResultCode.NOT_ACTIVE,

@@ -1,13 +1,12 @@
 """What stands between a command and the actuators; the modes are the cerebellum's."""
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
-from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.record import LIMITS, new_states
 
@@ -15,7 +14,7 @@ from bhd_lerobot.control.record import LIMITS, new_states
 class Controller(ABC):
     """Turns commands into actuator commands that respect every limit, for n robots.
 
-    One that is no part of the compiled tick is a `SteppedController`. The arrays are the controller's own and live;
+    What a tick does of it is compiled, see `bhd_lerobot.control.tick`. The arrays are the controller's own and live;
     others only read them.
 
     Args:
@@ -24,9 +23,9 @@ class Controller(ABC):
     Attributes:
         states: the records of the robots, shape (n,).
         numbers: the record of their limits, shape (1,).
-        is_compiled: whether it is a part of the compiled tick.
-        arms: the records of the robots' arms, shape (n,); None if they have none.
-        arm_limits: the record of the arms' limits, shape (1,).
+        arms: the records of arms with position servos, shape (n,); None of other robots.
+        springs: the records of the impedances of arms with torque motors, shape (n,); None of other robots.
+        arm_limits: the record of the arms' limits, shape (1,); None of robots without.
         geometries: what the arms are kept clear with, see `bhd_lerobot.control.arm.clearance`.
         monitors: of bases, the records of their collision monitors, shape (n,); a single one without beams if there
             are none.
@@ -51,15 +50,15 @@ class Controller(ABC):
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
-    is_compiled: ClassVar[bool] = False
     monitors: NDArray
-    arm_limits: NDArray
     geometries: NDArray
 
     def __init__(self, n: int) -> None:
         self.states, self.numbers = new_states(n), np.zeros(1, LIMITS)
         self.numbers["gyro"] = -1
         self.arms: Any = None
+        self.springs: Any = None
+        self.arm_limits: Any = None
 
     def serve(self, sim: int) -> None:
         """Do what the tick of one robot waits for, see `tick`."""
@@ -146,50 +145,3 @@ class Controller(ABC):
     def feedback(self, sim: int) -> Feedback | None:
         """Return how far the goal is that one robot follows, or None."""
         return None
-
-
-class SteppedController(Controller):
-    """A controller that the cerebellum tells where to head for and when to stop, and runs once a tick."""
-
-    @abstractmethod
-    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
-        """Head for new setpoints, in normal motion.
-
-        Args:
-            values: the setpoints, shape (n, width).
-            mask: the robots that they are for, shape (n,).
-        """
-
-    @abstractmethod
-    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
-        """Head for rest: as in normal motion, or as hard as possible if the cause is `ESTOP` or `FAULT`.
-
-        May be called again while the stop continues, and must not make it a gentler one.
-
-        Args:
-            mask: the robots, shape (n,).
-            cause: the mode that they are now in.
-        """
-
-    @abstractmethod
-    def run(self, reading: PlantReading) -> None:
-        """Advance by one tick."""
-
-    @abstractmethod
-    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
-        """Make the reference again what is really written to the actuators, whatever it has become; a stop follows.
-
-        Args:
-            mask: the robots, shape (n,).
-            actuators: the last commands that were written, shape (n, joints).
-            rate: their change in the last tick, shape (n, joints).
-        """
-
-    def distrust(self, mask: NDArray[np.bool_]) -> None:
-        """Do nothing that needs to know where some robots are: what they read now is made up. `mask` has shape (n,)."""
-        return
-
-    @property
-    def following(self) -> NDArray[np.bool_]:
-        """Whether each robot follows a goal, shape (n,)."""
-        return np.zeros(len(self.busy), np.bool_)

@@ -255,7 +255,6 @@ class BaseController(Controller):
     """
 
     joints = width = 2
-    is_compiled = True
 
     def __init__(
         self,

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 _values: float = 40_000  # that a loop handles in Python, until it is compiled
 _LOCK = RLock()  # numba's cache folder is set for the whole process
-_RECORD_VALUES = 8  # that a record counts for
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
 _CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
 
@@ -47,22 +46,23 @@ class Kernel[**P, R]:
         function: the function.
         signature: the types of its arguments, in numba's words and those of `RECORDS`; empty for what only other
             kernels call.
+        work: number of values that a record counts for.
     """
 
-    def __init__(self, function: Callable[P, R], signature: str) -> None:
-        self.function, self.signature = function, signature
+    def __init__(self, function: Callable[P, R], signature: str, work: int = 8) -> None:
+        self.function, self.signature, self.work = function, signature, work
         update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:  # noqa: D102
         return self.function(*args, **kwargs)
 
-    def of(self, name: str, signature: str) -> "Kernel[P, R]":
+    def of(self, name: str, signature: str, work: int = 8) -> "Kernel[P, R]":
         """Return the kernel of the same function for other types, such as None in the place of a record."""
         code, names = self.function.__code__, self.function.__globals__
         copy: Any = FunctionType(code, names, name, self.function.__defaults__, self.function.__closure__)
         copy.__qualname__ = name  # by which its machine code is found again
         copy.__doc__, copy.__module__ = self.function.__doc__, self.function.__module__
-        return Kernel(copy, signature)
+        return Kernel(copy, signature, work)
 
     @cached_property
     def compiled(self) -> Callable[..., R]:
@@ -96,6 +96,10 @@ class Kernel[**P, R]:
         python: Callable[..., Any] = self.function
         return python(*map(as_objects, arguments))
 
+    def handles(self, array: NDArray) -> int:
+        """Return how many values a loop over an array handles; a record stands for many."""
+        return array.size * self.work if array.dtype.names else array.size
+
     def bind(self, *bound: Any) -> Callable[..., R]:
         """Return this kernel with its first arguments, to be called with the others.
 
@@ -113,7 +117,7 @@ class Kernel[**P, R]:
             nonlocal left, is_checked, machine, plain
             if machine is not None:
                 return machine(*arguments)
-            left -= _work(bound[0] if bound else arguments[0])
+            left -= self.handles(bound[0] if bound else arguments[0])
             if left < 0:
                 machine = partial(self.compiled, *bound)
                 return machine(*arguments)
@@ -148,11 +152,6 @@ class Kernel[**P, R]:
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
-
-
-def _work(array: NDArray) -> int:
-    """Return how many values a loop handles; a record stands for many."""
-    return array.size * _RECORD_VALUES if array.dtype.names else array.size
 
 
 def as_objects(array: Any) -> Any:
@@ -217,9 +216,9 @@ def never_compiled() -> Iterator[None]:
         _values = before
 
 
-def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:
+def kernel[**P, R](signature: str = "", work: int = 8) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     """Make a kernel of a function, see `Kernel`."""
-    return lambda function: Kernel(function, signature)
+    return lambda function: Kernel(function, signature, work)
 
 
 @cache

@@ -323,7 +323,13 @@ ARM_LIMITS = record(
         ("most_lost", _i),
         ("most_hung", _i),
         ("certain", *_vector),
-        # Rigid bodies: placement and axis of each joint, inertia of each link about its centre of mass.
+        # Impedance: see `spring`.
+        ("most_reach", _f),  # [m] of the tool's position, in each direction
+        ("most_speed", *_vector),  # [rad/s] beyond these the arm is stopped
+        ("most_tool_speed", _f, (2,)),  # [m/s, rad/s]
+        ("most_torque", *_vector),  # [N m] of the surroundings
+        ("most_swings", _f),
+        # Rigid bodies: placement and axis of each joint, inertia of each link about its centre of mass, tool frame.
         ("turn", _f, (JOINTS, 3, 3)),
         ("offset", _f, (JOINTS, 3)),
         ("axis", _f, (JOINTS, 3)),
@@ -331,6 +337,92 @@ ARM_LIMITS = record(
         ("centre", _f, (JOINTS, 3)),
         ("inertia", _f, (JOINTS, 3, 3)),
         ("rotor", *_vector),
+        ("tool_turn", _f, (3, 3)),
+        ("tool_offset", _f, (3,)),
+    ],
+)
+
+SPRING = record(
+    "spring",
+    [
+        # The equilibrium: see `equilibrium`. Orientations are quaternions w, x, y, z.
+        ("place", _f, (3,)),  # [m]
+        ("turn", _f, (4,)),
+        ("opening", _f),  # [m]
+        ("speed", _f, (6,)),  # [m/s, rad/s]
+        ("opening_speed", _f),
+        ("is_active", _b),  # a setpoint is followed
+        ("left", _i),  # ticks until the target is at the setpoint
+        ("target", _f, (3,)),
+        ("target_turn", _f, (4,)),
+        ("target_opening", _f),
+        ("goal", _f, (3,)),
+        ("goal_turn", _f, (4,)),
+        ("goal_opening", _f),
+        ("feed", _f, (6,)),
+        ("opening_feed", _f),
+        # What a brain has set: see `Compliance`.
+        ("stiffness", _f, (6, 6)),
+        ("wanted_stiffness", _f, (6, 6)),
+        ("ratio", _f),
+        ("is_fixed", _b),  # the damping is
+        ("fixed_damping", _f, (6, 6)),
+        ("largest", _f, (2,)),  # [N, N m]
+        ("wrench", _f, (6,)),  # fed forward [N, N m]
+        ("wanted_wrench", _f, (6,)),
+        # Stops.
+        ("is_braked", _b),  # in a mode without motion
+        ("is_still", _b),
+        ("is_refused", _b),  # the setpoint that was taken last: it was no pose
+        ("position", *_vector),  # [rad] that was read last
+        ("carried", *_vector),  # [rad] the posture whose weight is carried while it is braked
+        ("swung", _f, (JOINTS + 6,)),  # last directions of joints and equilibrium
+        ("swings", *_vector),  # how often the joints' turned
+        # What the surroundings put on it: see `wrench`.
+        ("contact", _f, (6,)),  # [N, N m]
+        ("torque", *_vector),  # [N m]
+        ("expected", *_vector),
+        ("rate", *_vector),
+        ("is_fresh", _b),
+        # Dynamics: see `rigid_bodies`.
+        ("rotations", _f, (JOINTS, 3, 3)),
+        ("origins", _f, (JOINTS, 3)),
+        ("axes", _f, (JOINTS, 3)),
+        ("levers", _f, (JOINTS, 3)),
+        ("rates", _f, (JOINTS, 6)),
+        ("masses", *_vector),
+        ("firsts", _f, (JOINTS, 3)),
+        ("inertias", _f, (JOINTS, 3, 3)),
+        ("momenta", _f, (JOINTS, 6)),
+        ("pulls", _f, (JOINTS, 6)),
+        ("mass", _f, (JOINTS, JOINTS)),
+        ("momentum", *_vector),
+        ("gradient", *_vector),
+        ("gravity", *_vector),
+        ("own", *_vector),
+        ("jacobian", _f, (6, JOINTS)),
+        ("tool", _f, (3,)),
+        ("tool_turn", _f, (4,)),
+        ("mobility", _f, (6, 6)),
+        # Room.
+        ("turns", _f, (JOINTS, 3, 3)),
+        ("spin", _f, (JOINTS, 3)),
+        ("forces", _f, (JOINTS, 3)),
+        ("moments", _f, (JOINTS, 3)),
+        ("needs", *_vector),
+        ("near", *_vector),
+        ("still", *_vector),
+        ("wanted", *_vector),
+        ("tool_speed", _f, (6,)),
+        ("error", _f, (6,)),
+        ("push", _f, (6,)),
+        ("lead", _f, (6,)),
+        ("columns", _f, (JOINTS, 6)),
+        ("root", _f, (6, 6)),
+        ("square", _f, (6, 6)),
+        ("modes", _f, (6, 6)),
+        ("damping", _f, (6, 6)),
+        ("side", _f, (6,)),
     ],
 )
 
@@ -373,6 +465,13 @@ def new_arms(n: int) -> NDArray[Any]:
     arms = np.zeros(n, ARM)
     arms["arrival"], arms["share"], arms["distances"], arms["is_fresh"] = NEVER, 1.0, -1.0, True
     return arms
+
+
+def new_springs(n: int) -> NDArray[Any]:
+    """Return the records of the impedances of n arms that have done nothing yet, shape (n,)."""
+    springs = np.zeros(n, SPRING)
+    springs["turn"][:, 0] = springs["is_braked"] = springs["is_still"] = springs["is_fresh"] = True
+    return springs
 
 
 def put(row: Any, field: str, values: Any) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.arm.equilibrium import is_spring_at_rest
+from bhd_lerobot.control.arm.spring import move_spring, tell_spring
 from bhd_lerobot.control.arm.step import Stage, has_to_be_told, is_arm_at_rest, move_arm
 from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
@@ -29,6 +31,7 @@ _NON_FINITE = int(Limit.NON_FINITE)
 _NONE, _BEGUN, _ENDED = int(Stage.NONE), int(Stage.BEGUN), int(Stage.ENDED)
 _NORMAL, _EMERGENCY_STOP = int(SafetyStatus.NORMAL), int(SafetyStatus.EMERGENCY_STOP)
 _LEAST, _MOST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+_SPRING_WORK = 100  # values that a record of an impedance counts for: in Python its tick takes as long
 _MOST_TAKEN = 3  # commands in one tick, while another process fills the queue
 
 Numbers = NDArray[np.float64]
@@ -43,6 +46,7 @@ def tick(  # noqa: PLR0917
     estop: Counts,
     monitor: Any,
     arm: Any,
+    spring: Any,
     limits: Any,
     arm_limits: Any,
     geometry: Any,
@@ -51,7 +55,7 @@ def tick(  # noqa: PLR0917
     sensors_ns: int,
     now_ns: int,
 ) -> bool:
-    """Run one tick of a robot whose controller is compiled, between reading its plant and writing to it.
+    """Run one tick of a robot, between reading its plant and writing to it.
 
     The reference advances by one period, also after ticks that were skipped: it is late then, and what is written to
     the plant does not jump to where it would be by now.
@@ -60,8 +64,9 @@ def tick(  # noqa: PLR0917
         state: the robot's record.
         queue: its commands.
         estop: the word of its emergency stop, see `EstopWord`.
-        monitor: the collision monitor of a base; one without beams if there is none.
-        arm: its arm; None of a base.
+        monitor: the collision monitor of a base; one without beams if there is none; None of an arm.
+        arm: its arm with position servos; None of other robots, as are the following.
+        spring: its impedance.
         limits: the numbers of its body.
         arm_limits: the numbers of its arm.
         geometry: what its arm is kept clear with.
@@ -93,6 +98,14 @@ def tick(  # noqa: PLR0917
             if state.entered != 0 or state.goes_back:
                 return False
         arm.stage = _NONE
+    if spring is not None:
+        if state.mode == _STOPPING:
+            state.is_at_rest = is_spring_at_rest(spring)
+        begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+        tell_spring(state, spring, arm_limits)
+        move_spring(state, spring, arm_limits)
+        end_tick(state, limits)
+        tell_spring(state, spring, arm_limits)
     return True
 
 
@@ -291,7 +304,7 @@ def tick_bases(  # noqa: PLR0917
     for sim in range(len(states)):
         state, queue, word, monitor = states[sim], queues[sim], estop[:, sim], monitors[sim % len(monitors)]
         seen, seen_ns, own = sensors[sim], sensors_ns[sim], limits[0]
-        tick(state, queue, word, monitor, None, own, None, None, None, seen, seen_ns, now_ns)
+        tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
 
 
 @kernel(
@@ -327,25 +340,29 @@ def tick_arms(  # noqa: PLR0917
         if not goes_on:
             arm.stage = _NONE
         geometry, own, its = geometries[arm.geometry % len(geometries)], limits[0], arm_limits[0]
-        if not tick(state, queue, word, None, arm, own, its, geometry, rows, None, sensors_ns[sim], now_ns):
+        if not tick(state, queue, word, None, arm, None, own, its, geometry, rows, None, sensors_ns[sim], now_ns):
             is_over = False
     return is_over
 
 
-@kernel("void(state[::1], queue[::1], i8[:,:], limits[::1], i8[:], i8)")
-def begin_all(  # noqa: PLR0917
-    states: Any, queues: Any, estop: Counts, limits: Any, sensors_ns: Counts, now_ns: int
+@kernel(
+    "void(state[::1], queue[::1], i8[:,:], spring[::1], limits[::1], arm_limits[::1], i8[:], i8)", work=_SPRING_WORK
+)
+def tick_springs(  # noqa: PLR0917
+    states: Any,
+    queues: Any,
+    estop: Counts,
+    springs: Any,
+    limits: Any,
+    arm_limits: Any,
+    sensors_ns: Counts,
+    now_ns: int,
 ) -> None:
-    """Do what comes before the controller of n robots."""
+    """Run one tick of n arms with torque motors."""
     for sim in range(len(states)):
-        begin_tick(states[sim], queues[sim], estop[:, sim], limits[0], sensors_ns[sim], now_ns)
-
-
-@kernel("void(state[::1], limits[::1])")
-def end_all(states: Any, limits: Any) -> None:
-    """Do what comes after the controller of n robots."""
-    for sim in range(len(states)):
-        end_tick(states[sim], limits[0])
+        state, queue, word, spring = states[sim], queues[sim], estop[:, sim], springs[sim]
+        own, its, seen_ns = limits[0], arm_limits[0], sensors_ns[sim]
+        tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
 
 
 @kernel("void(state[::1], limits[::1], b1[:])")

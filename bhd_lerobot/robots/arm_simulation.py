@@ -71,8 +71,7 @@ class ArmSimulation(ArmHost, Simulation):
         self._now = np.ones(n, np.int64)  # times the tick
         touches = np.zeros((3, n), np.bool_)
         self._arm_on_table, self._arm_on_object, self._self_contact = touches
-        if self.controller.is_compiled:
-            self._frames = Frames(world, self.cerebellum, touches, late=self.plant)
+        self._frames = Frames(world, self.cerebellum, touches, late=self.plant, brakes=self.plant.plant.brakes)
 
     @classmethod
     def start_scene(cls, config: "ArmConfig") -> TableScene:

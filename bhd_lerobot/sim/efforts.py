@@ -31,7 +31,6 @@ class MeanEfforts:
         self._reported = bind("qfrc_actuator")
         self.mean: Array = self._reported.copy()
         self._servos = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        self._actuators = int(model.nu)
         joints = model.actuator_trnid[self._servos, 0]
         self._dofs = model.jnt_dofadr[joints]
         self._gear = model.actuator_gear[self._servos, 0]
@@ -42,14 +41,9 @@ class MeanEfforts:
         counts = model.jnt_actfrclimited[joints] & (mujoco.mj_version() >= 4_000_000)
         self._most_torque = np.where(counts, model.jnt_actfrcrange[joints, 1], np.inf)
 
-    def are_all(self, servos: Sequence[int], actuators: Sequence[int]) -> bool:
-        """Return whether these servos of joints, by their numbers, are all of the model, and with others all actuators.
-
-        Args:
-            servos: the servos.
-            actuators: these, and what acts on something else.
-        """
-        return np.array_equal(self._servos, servos) and len(actuators) == self._actuators
+    def are_all(self, servos: Sequence[int]) -> bool:
+        """Return whether these servos of joints, by their numbers, are all that damp speeds."""
+        return set(self._servos[self._damping != 0.0].tolist()) <= set(servos) <= set(self._servos.tolist())
 
     def numbers(self, actuators: Sequence[int]) -> dict[str, Array]:
         """Return gear, damping, largest force and largest torque of some servos by their numbers in the model."""

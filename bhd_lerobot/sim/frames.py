@@ -22,12 +22,12 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.kernels import is_worth_compiling, kernel, record
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.record import JOINTS
-from bhd_lerobot.control.tick import tick
+from bhd_lerobot.control.tick import tick, tick_springs
 from bhd_lerobot.sim.engine import mujoco
+from bhd_lerobot.sim.plant import Brakes, run_brake, set_brake
 from bhd_lerobot.sim.world import World
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_TICK_VALUES = 8  # that a tick of one robot counts for, see `kernels`
 _LEFT_OUT = ("read", "write", "set_mode", "step", "tick")  # methods that frames in machine code do not call
 _NO_RING: NDArray[np.float64] = np.zeros((0, 1, 1))
 _OUTPUTS = 16  # fields that may be read after a frame
@@ -60,6 +60,9 @@ LAYOUT = record(
         ("damping", np.float64, (JOINTS,)),
         ("most_force", np.float64, (JOINTS,)),
         ("most_torque", np.float64, (JOINTS,)),
+        ("brake", np.int64),  # the first joint's, see `Brakes`
+        ("friction", np.float64, (JOINTS,)),
+        ("closing_ticks", np.int64),
         # What is copied out after a frame: from where, to where, and how many bytes of each simulation.
         ("outputs", np.int64),
         ("source", np.int64, (_OUTPUTS,)),
@@ -109,7 +112,7 @@ def _load() -> bool:
 
 
 @kernel()
-def run_frames(  # noqa: PLR0912, PLR0917
+def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
     ids: Counts,
     models: Counts,
     data: int,
@@ -139,6 +142,8 @@ def run_frames(  # noqa: PLR0912, PLR0917
     ticks: int,
     spec: int,
     arms: Any,
+    springs: Any,
+    brakes: Any,
     arm_limits: Any,
     geometries: Any,
     trajectories: Any,
@@ -163,7 +168,9 @@ def run_frames(  # noqa: PLR0912, PLR0917
         numbers: the tick that is next for each simulation, shape (n,).
         first_tick: number of the first tick.
         spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
-        arms: their records; None of bases, which have none of what follows.
+        arms: records of arms with position servos; None of bases, which have none of what follows.
+        springs: records of the impedances of arms with torque motors; None of others, as is the following.
+        brakes: for how many ticks the arms' brakes are closed, shape (n,).
         trajectories: what arms play.
         ring: the last commands, of servos that get them late, shape (ticks, n, actuators); empty if none is late.
         latency: by how many ticks they are late, shape (n,).
@@ -183,16 +190,27 @@ def run_frames(  # noqa: PLR0912, PLR0917
             if monitors is not None:
                 read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
                 monitor, seen = monitors[sim % len(monitors)], sensors[sim]
-                tick(state, queue, word, monitor, None, own, None, None, None, seen, seen_ns, now_ns)
+                tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
                 for k in range(joints):
                     ctrl[layout.ctrl[k]] = state.written[k]
             if arms is not None:
                 arm, its = arms[sim], arm_limits[0]
                 if arm.stage == 0:
                     read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-                geometry = geometries[arm.geometry % len(geometries)]
-                if not tick(state, queue, word, None, arm, own, its, geometry, trajectories, None, seen_ns, now_ns):
+                shapes, rows = geometries[arm.geometry % len(geometries)], trajectories
+                if not tick(state, queue, word, None, arm, None, own, its, shapes, rows, None, seen_ns, now_ns):
                     break
+            if springs is not None:
+                read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
+                spring, its = springs[sim], arm_limits[0]
+                tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
+                closing = ctrl[layout.brake : layout.brake + its.dof]
+                if state.mode_is_new:
+                    set_brake(brakes, closing, sim, state.mode)
+                    state.mode_is_new = False
+                speeds = qvel[layout.qvel[0] : layout.qvel[0] + its.dof]
+                run_brake(brakes, closing, speeds, sim, layout.friction, layout.closing_ticks)
+            if ring is not None:
                 passed = number - first_tick
                 slot = written + passed
                 behind = slot - min(latency[sim], waited[sim] + passed)
@@ -235,11 +253,19 @@ _WHERE = (
     "state[::1], queue[::1], i8[:,:]"
 )
 _WHAT = "limits[::1], f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], i8[:], i8, i8, i4"
-_ARMS = "arm[::1], arm_limits[::1], geometry[::1], f8[:,:,:], f8[:,:,:], i8[:], i8[:], i8"
+_LATE = "f8[:,:,:], i8[:], i8[:], i8"
 run_base_frames = run_frames.of(
-    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 7)}, i8)"
+    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 9)}, i8)"
 )
-run_arm_frames = run_frames.of("run_arm_frames", f"void({_WHERE}, none, {_WHAT}, {_ARMS})")
+run_arm_frames = run_frames.of(
+    "run_arm_frames",
+    f"void({_WHERE}, none, {_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], f8[:,:,:], {_LATE})",
+)
+run_spring_frames = run_frames.of(
+    "run_spring_frames",
+    f"void({_WHERE}, none, {_WHAT}, none, spring[::1], i8[:], arm_limits[::1], none, none, {_LATE})",
+    work=tick_springs.work,
+)
 
 
 @kernel()
@@ -295,6 +321,7 @@ class Frames:
         cerebellum: what controls them; its controller is a part of the compiled tick.
         touches: becomes True where the scene was touched, see `run_frames`, shape (kinds, n).
         late: what its plant passes commands on through; None if it passes them on at once.
+        brakes: those of arms with torque motors.
         gyro: name of the gyroscope; None if it is not read.
         beams: sensors of the cerebellum before the gyroscope's.
     """
@@ -306,6 +333,7 @@ class Frames:
         touches: NDArray[np.bool_],
         *,
         late: Late | None = None,
+        brakes: Brakes | None = None,
         gyro: str | None = None,
         beams: int = 0,
     ) -> None:
@@ -321,7 +349,7 @@ class Frames:
         row["is_exact"] = efforts.is_exact
         row["most_force"] = row["most_torque"] = np.inf
         # Others' efforts are averaged in Python.
-        self._is_possible = efforts.are_all(servos, row["ctrl"][: cerebellum.controller.joints])
+        self._is_possible = efforts.are_all(servos)
         if self._is_possible:
             for name, values in efforts.numbers(servos).items():
                 row[name][: len(servos)] = values
@@ -333,7 +361,15 @@ class Frames:
         self._addresses, self._numbers, self._zeros = np.zeros((3, world.n), np.int64)
         self._at_once = _NO_RING, self._zeros, self._zeros, 0
         self._checked, self._copies = -1, False
-        self._kernel = run_base_frames if cerebellum.controller.arms is None else run_arm_frames
+        controller, self._brakes = cerebellum.controller, brakes
+        self._kernel = run_base_frames
+        if controller.arms is not None:
+            self._kernel = run_arm_frames
+        elif controller.springs is not None:
+            self._kernel = run_spring_frames
+            if brakes is not None:
+                row["brake"], row["closing_ticks"] = brakes.first, brakes.closing_ticks
+                row["friction"][: len(brakes.friction)] = brakes.friction
 
     def _place_drive(self, row: Any) -> list[int]:
         """Write where the wheels and the touches are; return the servos."""
@@ -379,7 +415,7 @@ class Frames:
         if not self._is_possible or own.plant is not self._plant or not own.may_write or self._is_watched:
             return False
         ids = np.arange(self._world.n) if ids is None else ids
-        self._handled += len(ids) * _TICK_VALUES
+        self._handled += len(ids) * self._kernel.work
         if not is_worth_compiling(self._kernel, self._handled) or not _load():
             return False
         if not self._are_copied:
@@ -449,12 +485,15 @@ class Frames:
     def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """What all threads run with, before and after the layout."""
         own, late = self._cerebellum, self._late
-        controller, reading, is_base = own.controller, own.reading, own.controller.arms is None
+        controller, reading, is_base = own.controller, own.reading, own.controller.arm_limits is None
         records = own.states, own.fifo.queues, own.estop.words, controller.monitors if is_base else None
         sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
-        arms: tuple[Any, ...] = (*[None] * 7, 0)
+        arms: tuple[Any, ...] = (*[None] * 9, 0)
         if not is_base:
-            arms = controller.arms, controller.arm_limits, controller.geometries, controller.rows
+            if controller.arms is not None:
+                arms = controller.arms, None, None, controller.arm_limits, controller.geometries, controller.rows
+            elif self._brakes is not None:
+                arms = None, controller.springs, self._brakes.ticks, controller.arm_limits, None, None
             is_late = late is not None and late.is_late
             arms += (late.ring, late.latency, late.waited, late.written) if late and is_late else self._at_once
         return (self._world.warnings, *records, own.numbers, *sensors), arms

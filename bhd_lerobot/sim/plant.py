@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Drive
+from bhd_lerobot.control.kernels import kernel
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
 
@@ -19,7 +21,7 @@ class JointReading(Protocol):
     has_effort: bool
 
 
-MODES_WITH_MOTION = (2, 3, 4)  # `Mode.HOLD`, `TRACKING`, `STOPPING` of the cerebellum
+_HOLD, _STOPPING = int(Mode.HOLD), int(Mode.STOPPING)  # from the one to the other there is motion
 _MOST_VIEWS = 8  # readings that are remembered
 _CLOSING_S = 1.0  # [s] for which a brake only damps: what was pressed springs back
 _CREEP = 0.001  # [rad/s] a joint that slips slower than this feels less than the slip torque
@@ -30,9 +32,12 @@ _Views = tuple[_Array, _Array, _Array, list[tuple[_Array, _Array, _Array]]]
 class SimulatedPlant:
     """Reads the joints of all simulations and writes their servos' commands.
 
-    It has the calls of the cerebellum's plant and needs none of its code. A base's joints are its wheels, and their
-    servos take speeds [rad/s]. An arm's are those of its chain [rad], whose servos take angles [rad] or torques [N m],
-    and its gripper, whose position, speed and command are those of the opening, the sum of its two fingers [m].
+    It has the calls of the cerebellum's plant. A base's joints are its wheels, and their servos take speeds [rad/s].
+    An arm's are those of its chain [rad], whose servos take angles [rad] or torques [N m], and its gripper, whose
+    position, speed and command are those of the opening, the sum of its two fingers [m].
+
+    Attributes:
+        brakes: of arms with torque motors; None of others.
 
     Args:
         world: the simulations.
@@ -61,7 +66,7 @@ class SimulatedPlant:
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
-        self._brakes = _Brakes(world, arm) if arm is not None and arm.brake_damping else None
+        self.brakes = Brakes(world, arm) if arm is not None and arm.brake_damping else None
         # The views into the readings that are used, with the readings, which must live as long as their numbers count.
         self._views: dict[int, tuple[JointReading, _Views]] = {}
 
@@ -96,8 +101,8 @@ class SimulatedPlant:
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""
         self._ctrl[:] = ctrl
-        if self._brakes is not None:
-            self._brakes.run()
+        if self.brakes is not None:
+            self.brakes.run()
 
     def open(self) -> None:
         """Connect to nothing."""
@@ -107,8 +112,8 @@ class SimulatedPlant:
 
     def set_mode(self, mode: NDArray[np.int8]) -> None:
         """Take the robots' modes, shape (n,): brakes are open in those with motion."""
-        if self._brakes is not None:
-            self._brakes.close(~np.isin(mode, MODES_WITH_MOTION))
+        if self.brakes is not None:
+            self.brakes.set_mode(mode)
 
     def recover(self) -> bool:
         """Return that no robot has moved by itself."""
@@ -118,26 +123,56 @@ class SimulatedPlant:
         """Disconnect from nothing."""
 
 
-class _Brakes:
-    """The brakes of n arms: dampers that work without any sensor's help, and after a while also friction."""
+class Brakes:
+    """The brakes of n arms: dampers that work without any sensor's help, and after a while also friction.
+
+    Attributes:
+        ticks: for how many ticks each is closed, shape (n,); -1 if it is open.
+        friction: slip torque by damping [rad/s], shape (joints,).
+        closing_ticks: ticks for which a brake only damps: what was pressed springs back.
+    """
 
     def __init__(self, world: World, arm: Arm) -> None:
         brakes = [world.model.actuator(f"{joint}_brake").id for joint in arm.chain.joints]
+        self.first = brakes[0]
         self._ctrl = world.ctrl[:, brakes[0] : brakes[-1] + 1]
         self._velocity = world.qvel[:, world.joint_slice(arm.chain.joints)[1]]
-        self._friction = np.asarray(arm.brake_slip) / np.asarray(arm.brake_damping)  # [rad/s]
-        self._closed, self._ticks = np.zeros(world.n, np.bool_), np.zeros(world.n, np.int64)
-        self._closing_ticks = round(_CLOSING_S * world.body.control_hz)
+        self.friction = np.asarray(arm.brake_slip) / np.asarray(arm.brake_damping)
+        self.ticks: NDArray[np.int64] = np.full(world.n, -1, np.int64)
+        self.closing_ticks = round(_CLOSING_S * world.body.control_hz)
 
-    def close(self, mask: NDArray[np.bool_]) -> None:
-        """Close the brakes in `mask`, shape (n,), and open the others."""
-        self._ticks[~(mask & self._closed)] = 0
-        self._closed[:], self._ctrl[:] = mask, mask[:, None]
+    def set_mode(self, modes: NDArray[np.int8]) -> None:
+        """Close the brakes in modes without motion, and open the others; `modes` has shape (n,)."""
+        for sim, mode in enumerate(modes.tolist()):
+            set_brake(self.ticks, self._ctrl[sim], sim, mode)
 
     def run(self) -> None:
         """Advance by one tick."""
-        self._ticks += self._closed
-        held = self._ticks > self._closing_ticks
-        if held.any():
-            friction = self._friction / np.maximum(np.abs(self._velocity), _CREEP)
-            np.copyto(self._ctrl, 1.0 + friction, where=held[:, None])
+        for sim in np.flatnonzero(self.ticks >= 0).tolist():
+            run_brake(self.ticks, self._ctrl[sim], self._velocity[sim], sim, self.friction, self.closing_ticks)
+
+
+@kernel()
+def set_brake(ticks: NDArray[np.int64], ctrl: _Array, sim: int, mode: int) -> None:
+    """Close the brake of an arm in a mode without motion, and open it in others."""
+    if _HOLD <= mode <= _STOPPING:
+        ticks[sim] = -1
+    elif ticks[sim] < 0:
+        ticks[sim] = 0
+    else:
+        return
+    for k in range(len(ctrl)):
+        ctrl[k] = 0.0 if ticks[sim] < 0 else 1.0
+
+
+@kernel()
+def run_brake(  # noqa: PLR0917
+    ticks: NDArray[np.int64], ctrl: _Array, speed: _Array, sim: int, friction: _Array, closing_ticks: int
+) -> None:
+    """Advance the brake of an arm by one tick."""
+    if ticks[sim] < 0:
+        return
+    ticks[sim] += 1
+    if ticks[sim] > closing_ticks:
+        for k in range(len(ctrl)):
+            ctrl[k] = 1.0 + friction[k] / max(abs(speed[k]), _CREEP)

@@ -61,7 +61,7 @@ class Rig:
         self.world.step(1)
         self.log["force"].append(self._force[0].copy())
         self.log["tool"].append(self._tool[0].copy())
-        self.log["estimate"].append(self.controller.contact.wrench[0].copy())
+        self.log["estimate"].append(self.controller.contact_wrench[0].copy())
         self.log["torque"].append(self.controller.actuators[0, :6].copy())
         self.log["command"].append(self.controller.command[0].copy())
 
@@ -94,7 +94,7 @@ class Rig:
 
     def approach(self, speed: float, threshold: float = 2.0) -> None:
         """Move along x until something is felt, and make the place of the contact the target."""
-        while abs(self.controller.contact.wrench[0, 0]) < threshold:
+        while abs(self.controller.contact_wrench[0, 0]) < threshold:
             self.target[:, 0] += speed / 25
             assert self.target[0, 0] < 0.7
             self.keep(0.04)

@@ -5,10 +5,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 
 from bhd_lerobot.control.arm.compliance import Compliance
-from bhd_lerobot.control.arm.rotations import rotation_vectors
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from tests.robots.impedance_rig import ARM, START, Rig
 
@@ -156,14 +157,15 @@ def test_a_free_response_loses_energy_in_every_tick(damping: tuple[float, ...] |
     rig = Rig(compliance=Compliance(damping=damping))
     rig.world.qpos[:, :6] += (0.05, -0.04, 0.05, 0.1, -0.1, 0.2)
     rig.cerebellum.readings.forget(np.arange(1))  # it was put there: no joint turns so fast
-    controller, equilibrium = rig.controller, rig.controller.equilibrium
+    equilibrium, dynamics = rig.controller.springs[0], ArmDynamics(ARM)
     stiffness = np.diag(np.asarray(Compliance().stiffness).diagonal())
     energies = []
     for _ in range(750):
         q, v = rig.world.qpos[:, :6], rig.world.qvel[:, :6]
-        terms = controller.dynamics.terms(q, v)
-        turn = rotation_vectors(equilibrium.rotation @ terms.tool[:, :3, :3].swapaxes(1, 2))
-        error = np.concatenate([equilibrium.position - terms.tool[:, :3, 3], turn], axis=1)[0]
+        terms = dynamics.terms(q, v)
+        there = pinocchio.Quaternion(*equilibrium["turn"].tolist()).matrix()
+        turn = pinocchio.log3(there @ terms.tool[0, :3, :3].T)
+        error = np.concatenate([equilibrium["place"] - terms.tool[0, :3, 3], turn])
         energies.append(0.5 * error @ stiffness @ error + 0.5 * v[0] @ terms.mass[0] @ v[0])
         rig.bridge.advance_ticks(1)
     assert energies[0] > 1.0

@@ -1,10 +1,14 @@
 """How a tool gives way to forces: stiffness and damping, checked, and the damping that lets nothing ring."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bhd_lerobot.control.geometry.chain import decompose
+from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -18,6 +22,7 @@ MAX_FORCE = 120.0  # [N] below what ISO/TS 15066 permits on a hand that is clamp
 MAX_MOMENT = 20.0  # [N m] below what the wrists have
 # [rad/s] Where there is no spring there is no natural frequency to damp: damping is that of a spring of this one.
 _LEAST_FREQUENCY = 2.0
+_SWEEPS, _PRECISE = 12, 1e-24  # of Jacobi's rotations; share of the squares off the diagonal that remains
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,23 +62,84 @@ class Compliance:
             object.__setattr__(self, "damping", _matrix("damping", self.damping))
 
 
-def critical_damping(mobility: Array, stiffness: Array, ratio: Array) -> Array:
-    """Return damping matrices with which every mode of mass and spring has the same damping ratio.
+@kernel()
+def find_damping(spring: Any) -> None:
+    """Write to a spring's `damping` the matrix with which every mode of mass and spring has its damping ratio.
 
     Mass and stiffness are brought to diagonal form together; with 1 = Q^T mass Q and w^2 = Q^T stiffness Q the damping
-    is that of 2 ratio w. It is symmetric and positive definite.
-
-    Args:
-        mobility: inverse of the mass matrix, positive definite, shape (n, 6, 6).
-        stiffness: shape (n, 6, 6).
-        ratio: shape (n,).
+    is that of 2 ratio w. It is symmetric and positive definite. The inverse of the mass matrix, `mobility`, is positive
+    definite; `root`, `square` and `modes` are lost.
     """
-    root = np.linalg.cholesky(mobility)
-    square, modes = np.linalg.eigh(np.swapaxes(root, 1, 2) @ stiffness @ root)
-    frequency = np.sqrt(np.maximum(square, _LEAST_FREQUENCY**2))
-    # What takes modes to forces: root^-T modes.
-    forces = np.linalg.solve(np.swapaxes(root, 1, 2), modes)
-    return np.asarray((forces * (2.0 * ratio[:, None] * frequency)[:, None, :]) @ np.swapaxes(forces, 1, 2))
+    root, square, modes = spring.root, spring.square, spring.modes
+    for i in range(6):
+        for j in range(6):
+            root[i, j] = spring.mobility[i, j]
+    decompose(root, 6)
+    for i in range(6):
+        for j in range(6):
+            modes[i, j] = 0.0
+            for k in range(j, 6):
+                modes[i, j] += spring.stiffness[i, k] * root[k, j]
+    for i in range(6):
+        for j in range(6):
+            square[i, j] = 0.0
+            for k in range(i, 6):
+                square[i, j] += root[k, i] * modes[k, j]
+    find_modes(square, modes)
+    for mode in range(6):  # what takes modes to forces: root^-T modes
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                modes[i, mode] -= root[k, i] * modes[k, mode]
+            modes[i, mode] /= root[i, i]
+    for i in range(6):
+        for j in range(6):
+            spring.damping[i, j] = 0.0
+    for mode in range(6):
+        share = 2.0 * spring.ratio * math.sqrt(max(square[mode, mode], _LEAST_FREQUENCY * _LEAST_FREQUENCY))
+        for i in range(6):
+            for j in range(6):
+                spring.damping[i, j] += share * modes[i, mode] * modes[j, mode]
+
+
+@kernel()
+def find_modes(square: Array, modes: Array) -> None:
+    """Bring a symmetric matrix of shape (6, 6) to diagonal form in place, and write its eigenvectors as columns.
+
+    By Jacobi's rotations, each of which brings one element to zero.
+    """
+    for i in range(6):
+        for j in range(6):
+            modes[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_SWEEPS):
+        off = whole = 0.0
+        for i in range(6):
+            whole += square[i, i] * square[i, i]
+            for j in range(i):
+                off += square[i, j] * square[i, j]
+        if not off > _PRECISE * whole:
+            return
+        for p in range(5):
+            for q in range(p + 1, 6):
+                if square[p, q] != 0.0:
+                    rotate(square, modes, p, q)
+
+
+@kernel()
+def rotate(square: Array, modes: Array, p: int, q: int) -> None:
+    """Bring an element of a symmetric matrix to zero by a rotation of two axes."""
+    ratio = (square[q, q] - square[p, p]) / (2.0 * square[p, q])
+    tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
+    c = 1.0 / math.sqrt(tangent * tangent + 1.0)
+    s = tangent * c
+    for k in range(6):
+        one, other = square[k, p], square[k, q]
+        square[k, p], square[k, q] = c * one - s * other, s * one + c * other
+    for k in range(6):
+        one, other = square[p, k], square[q, k]
+        square[p, k], square[q, k] = c * one - s * other, s * one + c * other
+        one, other = modes[k, p], modes[k, q]
+        modes[k, p], modes[k, q] = c * one - s * other, s * one + c * other
+    square[p, q] = square[q, p] = 0.0
 
 
 def _matrix(name: str, values: ArrayLike) -> Array:

@@ -69,8 +69,6 @@ class ArmController(Controller):
         wrench: estimate what the surroundings put on the tools; with `max_force`.
     """
 
-    is_compiled = True
-
     def __init__(
         self,
         body: Body,

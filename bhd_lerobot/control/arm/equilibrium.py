@@ -1,9 +1,18 @@
-"""Where an impedance's spring is at rest: a tool pose and an opening that move within limits."""
+"""Where an impedance's spring is at rest: a tool pose and an opening that move within limits.
+
+They follow setpoints that come once a frame, along straight lines, however far a setpoint is. Over the frame that
+follows a setpoint the target moves evenly from where the last setpoint put it to the new one. The equilibrium follows
+the target with the target's own speed added, never faster than the limits. Without a setpoint it brakes to rest.
+"""
+
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm.rotations import rotation_vectors, turned
+from bhd_lerobot.control.geometry.rotations import find_way, normalise, turn_by
+from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.messages import Limit
 
 Array = NDArray[np.float64]
@@ -14,145 +23,190 @@ TURN_SPEED, TURN_ACCELERATION = 1.0, 4.0  # [rad/s, rad/s^2]
 _GAIN = 50.0  # [1/s] how eagerly a remaining error is closed
 _APPROACH = 0.7  # share of the acceleration that approaching a target may count on: room for discrete time
 _REST = 1e-6  # [m/s, rad/s] slower than this is at rest
+_LEAST_NORM, _MOST_NORM = 0.5, 2.0  # a quaternion with a norm beyond these is no orientation with a rounding error
+_TINY = 1e-12
+_NON_FINITE, _POSITION = int(Limit.NON_FINITE), int(Limit.POSITION)
+_VELOCITY, _ACCELERATION = int(Limit.VELOCITY), int(Limit.ACCELERATION)
 
 
-class Equilibrium:
-    """Follows setpoints that come once a frame, for n arms; along straight lines, however far a setpoint is.
+@kernel()
+def head_for_setpoint(state: Any, spring: Any, limits: Any) -> bool:
+    """Head for what was requested; return False if that is no pose: another process writes the queue."""
+    square = 0.0
+    for k in range(8):
+        value = state.requested[k]
+        if not math.isfinite(value) or (3 <= k < 7 and abs(value) > _MOST_NORM):
+            state.limits |= _NON_FINITE
+            return False
+        if 3 <= k < 7:
+            square += value * value
+    if not _LEAST_NORM < math.sqrt(square) < _MOST_NORM:
+        state.limits |= _NON_FINITE
+        return False
+    if not spring.is_active:
+        spring.target_opening = spring.opening
+        for k in range(3):
+            spring.target[k] = spring.place[k]
+        for k in range(4):
+            spring.target_turn[k] = spring.turn[k]
+    rate = limits.hz / limits.frame_ticks
+    for k in range(4):
+        spring.goal_turn[k] = state.requested[3 + k]
+    normalise(spring.goal_turn)
+    find_way(spring.feed[3:], spring.goal_turn, spring.target_turn)
+    is_beyond = False
+    for k in range(3):
+        spring.goal[k] = clamp(state.requested[k], -limits.most_reach, limits.most_reach)
+        is_beyond = is_beyond or spring.goal[k] != state.requested[k]
+        spring.feed[k] = (spring.goal[k] - spring.target[k]) * rate
+        spring.feed[k + 3] *= rate
+    spring.goal_opening = clamp(state.requested[7], limits.lower[limits.dof], limits.upper[limits.dof])
+    if is_beyond or spring.goal_opening != state.requested[7]:
+        state.limits |= _POSITION
+    spring.opening_feed = (spring.goal_opening - spring.target_opening) * rate
+    spring.left, spring.is_active = limits.frame_ticks, True
+    return True
 
-    Over the frame that follows a setpoint the target moves evenly from where the last setpoint put it to the new one.
-    The equilibrium follows the target with the target's own speed added, never faster than the limits. Without a
-    setpoint it brakes to rest.
 
-    Attributes:
-        position: of the tool in the base frame [m], shape (n, 3).
-        rotation: of the tool in the base frame, shape (n, 3, 3).
-        opening: of the gripper [m], shape (n, 1).
-        speed: velocity of the tool, linear [m/s] then angular [rad/s], in the base frame, shape (n, 6).
-        active: whether a setpoint is followed, shape (n,).
-        limits: the `Limit` flags raised since they were last cleared, shape (n,).
+@kernel()
+def put_at_tool(spring: Any) -> None:
+    """Put the tool's equilibrium where the tool is, at rest, and follow no setpoint."""
+    for k in range(3):
+        spring.place[k] = spring.tool[k]
+    for k in range(4):
+        spring.turn[k] = spring.tool_turn[k]
+    for k in range(6):
+        spring.speed[k] = 0.0
+    spring.is_active = False
+
+
+@kernel()
+def keep_near(spring: Any, part: int, share: float) -> None:
+    """Bring the equilibrium nearer to the tool, and stop it there: what is in the tool's way stops both.
 
     Args:
-        control_hz: ticks a second [Hz].
-        frame_ticks: ticks in a frame, over which a setpoint is approached.
-        opening_limits: largest speed [m/s] and acceleration [m/s^2] of the opening.
+        part: 0 for the position, 1 for the orientation.
+        share: of the way between them that remains.
     """
-
-    def __init__(self, n: int, control_hz: int, frame_ticks: int, opening_limits: tuple[float, float]) -> None:
-        self.position, self.opening = np.zeros((n, 3)), np.zeros((n, 1))
-        self.rotation = np.tile(np.eye(3), (n, 1, 1))
-        self.speed = np.zeros((n, 6))
-        self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
-        self._opening_speed = np.zeros((n, 1))
-        self._hz, self._frame_ticks, self._left = control_hz, frame_ticks, np.zeros(n, np.int64)
-        self._limits = (SPEED, ACCELERATION), (TURN_SPEED, TURN_ACCELERATION), opening_limits
-        # Target, where it is at the end of the frame, and its speed: of position, rotation and opening.
-        self._target, self._goal = self.position.copy(), self.position.copy()
-        self._target_rotation, self._goal_rotation = self.rotation.copy(), self.rotation.copy()
-        self._target_opening, self._goal_opening = self.opening.copy(), self.opening.copy()
-        self._feed, self._feed_opening = np.zeros((n, 6)), np.zeros((n, 1))
-
-    def set_setpoint(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
-        """Head for new setpoints.
-
-        Args:
-            position: in the base frame [m], shape (n, 3).
-            rotation: in the base frame, shape (n, 3, 3).
-            opening: [m], shape (n, 1).
-            mask: the arms that they are for, shape (n,).
-        """
-        new = mask & ~self.active
-        self._target[new], self._target_opening[new] = self.position[new], self.opening[new]
-        self._target_rotation[new] = self.rotation[new]
-        self._goal[mask], self._goal_rotation[mask], self._goal_opening[mask] = (
-            position[mask],
-            rotation[mask],
-            opening[mask],
-        )
-        rate = self._hz / self._frame_ticks
-        turn = rotation_vectors(rotation[mask] @ np.swapaxes(self._target_rotation[mask], 1, 2))
-        self._feed[mask, :3], self._feed[mask, 3:] = (position - self._target)[mask] * rate, turn * rate
-        self._feed_opening[mask] = (opening - self._target_opening)[mask] * rate
-        self._left[mask] = self._frame_ticks
-        self.active |= mask
-
-    def drop(self, mask: NDArray[np.bool_]) -> None:
-        """Follow no setpoint any more: brake to rest."""
-        self.active &= ~mask
-
-    def place(self, ids: NDArray[np.intp], pose: Array) -> None:
-        """Put the tool's equilibrium somewhere, at rest, and follow no setpoint; `pose` has shape (len(ids), 4, 4)."""
-        self.position[ids], self.rotation[ids] = pose[:, :3, 3], pose[:, :3, :3]
-        self.speed[ids] = 0.0
-        self.active[ids] = False
-
-    def keep_near(self, tool: Array, share: Array) -> None:
-        """Bring the equilibrium nearer to the tool, and stop it there: what is in the tool's way stops both.
-
-        Args:
-            tool: the tool's pose in the base frame, shape (n, 4, 4).
-            share: of the way between them that remains, of the position and of the turn, shape (n, 2).
-        """
-        far, twisted = share[:, 0] < 1.0, share[:, 1] < 1.0
-        if far.any():
-            place = tool[far, :3, 3]
-            self.position[far] = place + (self.position[far] - place) * share[far, :1]
-            self.speed[far, :3] = 0.0
-        if twisted.any():
-            turn = rotation_vectors(self.rotation[twisted] @ np.swapaxes(tool[twisted, :3, :3], 1, 2))
-            self.rotation[twisted] = turned(tool[twisted, :3, :3], turn * share[twisted, 1:])
-            self.speed[twisted, 3:] = 0.0
-
-    def place_opening(self, ids: NDArray[np.intp], opening: Array) -> None:
-        """Put the opening's equilibrium somewhere [m], at rest; `opening` has shape (len(ids),)."""
-        self.opening[ids, 0], self._opening_speed[ids] = opening, 0.0
-
-    def run(self) -> None:
-        """Advance by one tick."""
-        if not (self.active.any() or self.speed.any() or self._opening_speed.any()):
-            return
-        self._move_targets()
-        active, moving = self.active[:, None], (self._left > 0)[:, None] & self.active[:, None]
-        self._left -= self._left > 0
-        turn = rotation_vectors(self._target_rotation @ np.swapaxes(self.rotation, 1, 2))
-        speeds = (self.speed[:, :3], self.speed[:, 3:], self._opening_speed)
-        errors = (self._target - self.position, turn, self._target_opening - self.opening)
-        feeds = (self._feed[:, :3], self._feed[:, 3:], self._feed_opening)
-        for speed, error, feed, limits in zip(speeds, errors, feeds, self._limits, strict=True):
-            self._approach(speed, np.where(active, error, 0.0), np.where(moving, feed, 0.0), limits)
-        self.position += self.speed[:, :3] / self._hz
-        self.opening += self._opening_speed / self._hz
-        turning = self.speed[:, 3:].any(axis=1)
-        self.rotation[turning] = turned(self.rotation[turning], self.speed[turning, 3:] / self._hz)
-
-    def at_rest(self) -> NDArray[np.bool_]:
-        """Return whether nothing moves, shape (n,)."""
-        return np.asarray((np.abs(self.speed) < _REST).all(axis=1) & (np.abs(self._opening_speed) < _REST)[:, 0])
-
-    def _move_targets(self) -> None:
-        """Move the targets of the arms that are within the frame after a setpoint."""
-        last = self.active & (self._left == 1)
-        going = self.active & (self._left > 1)
-        self._target[going] += self._feed[going, :3] / self._hz
-        self._target_opening[going] += self._feed_opening[going] / self._hz
-        self._target_rotation[going] = turned(self._target_rotation[going], self._feed[going, 3:] / self._hz)
-        if last.any():  # sums of steps miss it by their rounding
-            self._target[last], self._target_opening[last] = self._goal[last], self._goal_opening[last]
-            self._target_rotation[last] = self._goal_rotation[last]
-
-    def _approach(self, speed: Array, error: Array, feed: Array, limits: tuple[float, float]) -> None:
-        """Change a velocity of shape (n, k), in place, towards the one that leads to the target."""
-        fastest, hardest = limits
-        size = np.linalg.norm(error, axis=1, keepdims=True)
-        # Faster than this it could not slow down in time to stop at the target.
-        closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * hardest * size))
-        wanted = feed + error * (closing / np.maximum(size, 1e-12))
-        change = _clip(wanted, fastest) - speed
-        self.limits[np.linalg.norm(wanted, axis=1) > fastest] |= int(Limit.VELOCITY)
-        hard = np.linalg.norm(change, axis=1) * self._hz > hardest
-        self.limits[self.active & hard] |= int(Limit.ACCELERATION)
-        speed += _clip(change, hardest / self._hz)
+    if share >= 1.0:
+        return
+    if part == 0:
+        for k in range(3):
+            spring.place[k] = spring.tool[k] + (spring.place[k] - spring.tool[k]) * share
+    else:
+        find_way(spring.side, spring.turn, spring.tool_turn)
+        for k in range(4):
+            spring.turn[k] = spring.tool_turn[k]
+        turn_by(spring.turn, spring.side, share)
+    for k in range(3):
+        spring.speed[3 * part + k] = 0.0
 
 
-def _clip(vectors: Array, longest: float) -> Array:
-    return vectors * (longest / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest))
+@kernel()
+def move_equilibrium(state: Any, spring: Any, limits: Any) -> None:
+    """Advance the equilibrium by one tick."""
+    if not spring.is_active and is_equilibrium_still(spring, 0.0):
+        return
+    hz, is_moving = limits.hz, spring.is_active and spring.left > 0
+    if is_moving:
+        move_target(spring, hz)
+        spring.left -= 1
+    error = spring.error
+    find_way(error[3:], spring.target_turn, spring.turn)
+    for k in range(3):
+        error[k] = spring.target[k] - spring.place[k]
+    feed = 1.0 if is_moving else 0.0
+    gap = spring.target_opening - spring.opening
+    if not spring.is_active:
+        gap = 0.0
+        for k in range(6):
+            error[k] = 0.0
+    approach(state, spring, hz, 0, feed, SPEED, ACCELERATION)
+    approach(state, spring, hz, 3, feed, TURN_SPEED, TURN_ACCELERATION)
+    fastest, hardest = limits.fastest[limits.dof], limits.hardest[limits.dof]
+    wanted = feed * spring.opening_feed + math.copysign(closing_speed(abs(gap), hardest), gap)
+    change = clamp(wanted, -fastest, fastest) - spring.opening_speed
+    flag_limits(state, spring, abs(wanted) > fastest, abs(change) * hz > hardest)
+    spring.opening_speed += clamp(change, -hardest / hz, hardest / hz)
+    for k in range(3):
+        spring.place[k] += spring.speed[k] / hz
+    spring.opening += spring.opening_speed / hz
+    turn_by(spring.turn, spring.speed[3:], 1.0 / hz)
+
+
+@kernel()
+def move_target(spring: Any, hz: float) -> None:
+    """Move the target within the frame after a setpoint; sums of steps miss its end by their rounding."""
+    if spring.left > 1:
+        spring.target_opening += spring.opening_feed / hz
+        for k in range(3):
+            spring.target[k] += spring.feed[k] / hz
+        turn_by(spring.target_turn, spring.feed[3:], 1.0 / hz)
+        return
+    spring.target_opening = spring.goal_opening
+    for k in range(3):
+        spring.target[k] = spring.goal[k]
+    for k in range(4):
+        spring.target_turn[k] = spring.goal_turn[k]
+
+
+@kernel()
+def approach(  # noqa: PLR0917
+    state: Any, spring: Any, hz: float, first: int, feed: float, fastest: float, hardest: float
+) -> None:
+    """Change three components of the speed, from the first on, towards those that lead to the target."""
+    size = length(spring.error, first)
+    share = closing_speed(size, hardest) / max(size, _TINY)
+    wanted = spring.side
+    for k in range(first, first + 3):
+        wanted[k] = feed * spring.feed[k] + spring.error[k] * share
+    size = length(wanted, first)
+    is_fast, share = size > fastest, fastest / max(size, fastest)
+    for k in range(first, first + 3):
+        wanted[k] = wanted[k] * share - spring.speed[k]
+    size = length(wanted, first)
+    flag_limits(state, spring, is_fast, size * hz > hardest)
+    share = hardest / hz / max(size, hardest / hz)
+    for k in range(first, first + 3):
+        spring.speed[k] += wanted[k] * share
+
+
+@kernel()
+def closing_speed(size: float, hardest: float) -> float:
+    """Return how fast a gap is closed: faster than this it could not slow down in time to stop at the target."""
+    return min(_GAIN * size, math.sqrt(2 * _APPROACH * hardest * size))
+
+
+@kernel()
+def flag_limits(state: Any, spring: Any, is_fast: bool, is_hard: bool) -> None:
+    """Note which limits were met."""
+    if is_fast:
+        state.limits |= _VELOCITY
+    if is_hard and spring.is_active:
+        state.limits |= _ACCELERATION
+
+
+@kernel()
+def is_equilibrium_still(spring: Any, least: float) -> bool:
+    """Return whether nothing moves faster than the least [m/s, rad/s]."""
+    is_still = abs(spring.opening_speed) <= least
+    for k in range(6):
+        is_still = is_still and abs(spring.speed[k]) <= least
+    return is_still
+
+
+@kernel()
+def is_spring_at_rest(spring: Any) -> bool:
+    """Return whether equilibrium and feed-forward are at rest, and with closed brakes whether the arm is."""
+    is_free = is_equilibrium_still(spring, _REST)
+    for k in range(6):
+        is_free = is_free and spring.wrench[k] == 0.0
+    return is_free and (spring.is_still or not spring.is_braked)
+
+
+@kernel()
+def length(vector: Array, first: int) -> float:
+    """Return the length of three components of a vector, from the first on."""
+    return math.sqrt(
+        vector[first] * vector[first] + vector[first + 1] * vector[first + 1] + vector[first + 2] * vector[first + 2]
+    )

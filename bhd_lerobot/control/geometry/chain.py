@@ -205,13 +205,8 @@ def along(turn: Array, row: int, vector: Array) -> float:
 
 @kernel()
 def solve(square: Array, side: Array, size: int) -> None:
-    """Solve square x = side in place, for a symmetric positive definite matrix: by Cholesky's decomposition."""
-    for i in range(size):
-        for j in range(i + 1):
-            total = square[i, j]
-            for k in range(j):
-                total -= square[i, k] * square[j, k]
-            square[i, j] = math.sqrt(max(total, _TINY)) if i == j else total / square[j, j]
+    """Solve square x = side in place, for a symmetric positive definite matrix."""
+    decompose(square, size)
     for i in range(size):
         for k in range(i):
             side[i] -= square[i, k] * side[k]
@@ -220,3 +215,14 @@ def solve(square: Array, side: Array, size: int) -> None:
         for k in range(i + 1, size):
             side[i] -= square[k, i] * side[k]
         side[i] /= square[i, i]
+
+
+@kernel()
+def decompose(square: Array, size: int) -> None:
+    """Write Cholesky's root of a symmetric positive definite matrix to its lower triangle."""
+    for i in range(size):
+        for j in range(i + 1):
+            total = square[i, j]
+            for k in range(j):
+                total -= square[i, k] * square[j, k]
+            square[i, j] = math.sqrt(max(total, _TINY)) if i == j else total / square[j, j]

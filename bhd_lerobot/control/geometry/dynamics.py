@@ -111,6 +111,8 @@ class ArmDynamics:
             row["turn"][k], row["offset"][k] = placed.rotation, placed.translation
             row["mass"][k], row["centre"][k], row["inertia"][k] = inertia.mass, inertia.lever, inertia.inertia
         row["rotor"][: self.dof] = model.armature
+        tool = model.frames[self._tool].placement
+        row["tool_turn"], row["tool_offset"] = tool.rotation, tool.translation
 
     def terms(self, position: Array, velocity: Array) -> DynamicsTerms:
         """Return the dynamics in a state of n arms.

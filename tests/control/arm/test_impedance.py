@@ -10,6 +10,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
@@ -19,7 +20,7 @@ ARM = ur5(actuation="torque")
 HZ = 500
 EFFORT = np.array(ARM.limits.effort[:6])
 HOME = np.array(ARM.arm.home)
-ALL = np.ones(1, np.bool_)
+DYNAMICS = ArmDynamics(ARM)
 
 
 class StuckPlant(Plant):
@@ -82,7 +83,7 @@ def test_the_command_is_the_pose_and_the_opening() -> None:
     np.testing.assert_allclose(state.measured, state.command, atol=1e-11)
     np.testing.assert_allclose(np.linalg.norm(state.command[:, 3:7]), 1.0)
     assert state.command[0, 7] == MAX_OPENING
-    weight = rig.controller.dynamics.terms(HOME[None, :6], np.zeros((1, 6))).gravity
+    weight = DYNAMICS.terms(HOME[None, :6], np.zeros((1, 6))).gravity
     np.testing.assert_allclose(state.joint_efforts[:, :6], weight, atol=1e-9)
 
 
@@ -118,7 +119,7 @@ def test_without_spring_and_damper_the_motors_carry_the_arms_own_dynamics() -> N
         rig.plant.velocity[:6] = share * np.array((0.5, -1.0, 1.5, 1.0, -1.0, 2.0))
         rig.tick()
     speeds = rig.plant.velocity[None, :6]
-    terms = rig.controller.dynamics.terms(rig.plant.position[None, :6], speeds)
+    terms = DYNAMICS.terms(rig.plant.position[None, :6], speeds)
     own = terms.coriolis[0] @ speeds[0] + terms.gravity[0]
     assert np.abs(terms.coriolis[0] @ speeds[0]).max() > 0.01
     np.testing.assert_allclose(rig.plant.written[-1][:6], own - 0.01 * EFFORT * speeds[0], atol=1e-9)
@@ -159,6 +160,7 @@ def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
     rig = StuckRig()
     rig.target[0, 3:7] = (value, 0, 0, 0)
     rig.send()
+    assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written).all()
     np.testing.assert_allclose(rig.controller.command[0, :3], rig.controller.measured(rig.cerebellum.reading)[0, :3])
@@ -175,8 +177,11 @@ def test_places_beyond_any_reach_are_clipped() -> None:
 
 def test_values_that_are_no_numbers_stop_the_arm() -> None:
     rig = StuckRig()
-    rig.controller.set_setpoint(np.full((1, 8), np.nan), ALL)
+    rig.send()
+    rig.cerebellum.offer(Setpoint(rig.sequence + 1, rig.now, rig.target))
+    rig.cerebellum.fifo.queues["values"][:] = np.nan  # another process may write to it
     rig.tick()
+    assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written[-1]).all()
 
@@ -210,7 +215,7 @@ def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(ca
     np.testing.assert_allclose(rig.controller.command, measured, atol=1e-9)
     # Pressed again and again it stays the same stop, even if the arm is pushed away.
     rig.plant.position[0] += 0.1
-    rig.controller.stop(ALL, cause)
+    rig.cerebellum.estop.press()
     rig.tick()
     np.testing.assert_allclose(rig.controller.command, measured, atol=1e-9)
 
@@ -242,7 +247,7 @@ def test_a_restart_forgets_the_episode_before() -> None:
     rig.target[0, 2] += 0.1
     rig.send(10)
     rig.cerebellum.restart(np.array([0]))
-    assert rig.controller.contact.wrench.tolist() == [[0] * 6]
+    assert rig.controller.contact_wrench.tolist() == [[0] * 6]
     rig.tick(50)  # not configured: it stays where it is
     np.testing.assert_allclose(rig.controller.command, rig.controller.measured(rig.cerebellum.reading), atol=1e-9)
     assert not rig.controller.wrench.any()
@@ -264,3 +269,8 @@ def test_a_position_servo_is_refused() -> None:
         ImpedanceController(ur5(), 1, HZ, 20)
     with pytest.raises(ConfigError, match="actuation"):
         ImpedanceController(replace(ARM, arm=replace(ARM.arm, actuation="position")), 1, HZ, 20)
+
+
+def test_too_few_ticks_for_the_estimate_of_contacts_are_refused() -> None:
+    with pytest.raises(ConfigError, match="control_hz is 49"):
+        ImpedanceController(ARM, 1, 49, 1)

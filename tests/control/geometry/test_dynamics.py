@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.geometry.rigid_bodies import find_dynamics, find_mobility
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
 
@@ -55,6 +59,28 @@ def test_it_agrees_with_the_engine(opening: float) -> None:
     kinematics = ArmKinematics(ARM.arm.chain, ARM.limits)
     np.testing.assert_allclose(terms.tool, kinematics.tool(POSTURES), atol=1e-12)
     np.testing.assert_allclose(terms.jacobian, kinematics.jacobian(POSTURES), atol=1e-12)
+
+
+@pytest.mark.law
+def test_what_a_tick_computes_is_what_pinocchio_does() -> None:
+    controller = ImpedanceController(ARM, 1, 500, 20)
+    [spring], [limits] = as_objects(controller.springs), as_objects(controller.arm_limits)
+    for k, (q, v) in enumerate(zip(POSTURES, SPEEDS, strict=True)):
+        find_dynamics(spring, limits, np.pad(q, (0, 2)), np.pad(v, (0, 2)))
+        mass, coriolis, gravity = TERMS.mass[k], TERMS.coriolis[k], TERMS.gravity[k]
+        for mine, expected in (
+            (np.triu(spring.mass[:6, :6]), np.triu(mass)),
+            (spring.momentum[:6], mass @ v),
+            (spring.own[:6], coriolis @ v + gravity),
+            (spring.gradient[:6], coriolis.T @ v),
+            (spring.gravity[:6], gravity),
+            (spring.jacobian[:, :6], TERMS.jacobian[k]),
+            (spring.tool, TERMS.tool[k, :3, 3]),
+            (np.abs(spring.tool_turn @ pose_vectors(TERMS.tool[k])[3:]), 1.0),
+        ):
+            np.testing.assert_allclose(mine, expected, atol=1e-11)
+        find_mobility(spring, limits, 1e-3)
+        np.testing.assert_allclose(spring.mobility, TERMS.mobility(1e-3)[k], atol=1e-11)
 
 
 def test_the_coriolis_matrix_is_half_of_how_the_mass_matrix_changes() -> None:
