@@ -417,6 +417,7 @@ SPRING = record(
         ("error", _f, (6,)),
         ("push", _f, (6,)),
         ("lead", _f, (6,)),
+        ("tethers", _f, (2,)),
         ("columns", _f, (JOINTS, 6)),
         ("root", _f, (6, 6)),
         ("square", _f, (6, 6)),

@@ -197,8 +197,8 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
                 arm, its = arms[sim], arm_limits[0]
                 if arm.stage == 0:
                     read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-                shapes, rows = geometries[arm.geometry % len(geometries)], trajectories
-                if not tick(state, queue, word, None, arm, None, own, its, shapes, rows, None, seen_ns, now_ns):
+                shapes = geometries[arm.geometry % len(geometries)]
+                if not tick(state, queue, word, None, arm, None, own, its, shapes, trajectories, None, seen_ns, now_ns):
                     break
             if springs is not None:
                 read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)

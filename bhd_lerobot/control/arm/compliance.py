@@ -73,32 +73,32 @@ def find_damping(spring: Any) -> None:
     root, square, modes = spring.root, spring.square, spring.modes
     for i in range(6):
         for j in range(6):
-            root[i, j] = spring.mobility[i, j]
+            root[i, j] = spring.mobility[i, j] if j <= i else 0.0
     decompose(root, 6)
-    for i in range(6):
-        for j in range(6):
-            modes[i, j] = 0.0
-            for k in range(j, 6):
-                modes[i, j] += spring.stiffness[i, k] * root[k, j]
-    for i in range(6):
-        for j in range(6):
-            square[i, j] = 0.0
-            for k in range(i, 6):
-                square[i, j] += root[k, i] * modes[k, j]
+    multiply(modes, spring.stiffness, root, False)
+    multiply(square, root, modes, True)
     find_modes(square, modes)
     for mode in range(6):  # what takes modes to forces: root^-T modes
         for i in range(5, -1, -1):
             for k in range(i + 1, 6):
                 modes[i, mode] -= root[k, i] * modes[k, mode]
             modes[i, mode] /= root[i, i]
+        square[mode, 0] = 2.0 * spring.ratio * math.sqrt(max(square[mode, mode], _LEAST_FREQUENCY * _LEAST_FREQUENCY))
     for i in range(6):
         for j in range(6):
             spring.damping[i, j] = 0.0
-    for mode in range(6):
-        share = 2.0 * spring.ratio * math.sqrt(max(square[mode, mode], _LEAST_FREQUENCY * _LEAST_FREQUENCY))
-        for i in range(6):
-            for j in range(6):
-                spring.damping[i, j] += share * modes[i, mode] * modes[j, mode]
+            for mode in range(6):
+                spring.damping[i, j] += square[mode, 0] * modes[i, mode] * modes[j, mode]
+
+
+@kernel()
+def multiply(product: Array, one: Array, other: Array, is_transposed: bool) -> None:
+    """Write the product of two matrices of shape (6, 6), of the first one transposed if that is wanted."""
+    for i in range(6):
+        for j in range(6):
+            product[i, j] = 0.0
+            for k in range(6):
+                product[i, j] += (one[k, i] if is_transposed else one[i, k]) * other[k, j]
 
 
 @kernel()

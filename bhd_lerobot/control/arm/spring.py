@@ -16,10 +16,10 @@ from bhd_lerobot.control.arm.equilibrium import (
     move_equilibrium,
     put_at_tool,
 )
-from bhd_lerobot.control.geometry.rotations import find_way
 from bhd_lerobot.control.arm.wrench import observe_contact
 from bhd_lerobot.control.geometry.chain import find_torques
 from bhd_lerobot.control.geometry.rigid_bodies import find_dynamics, find_mobility
+from bhd_lerobot.control.geometry.rotations import find_way
 from bhd_lerobot.control.guard import FULL_TORQUE_S
 from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
@@ -207,49 +207,19 @@ def move_wrench(spring: Any, limits: Any) -> None:
 @kernel()
 def find_wanted_torques(state: Any, spring: Any, limits: Any, speed: Array) -> None:
     """Write the torques of spring, damper and feed-forward, and of the arm's own dynamics, to the spring's `wanted`."""
-    dof, push, lead = limits.dof, spring.push, spring.lead
+    dof, push = limits.dof, spring.push
     find_mobility(spring, limits, _MOBILITY_DAMPING)
     find_push(spring)
-    # What is pressed may give way at once, and the motors' torques need their time to fall.
-    fall_s = 0.0
-    for k in range(dof):
-        fall_s = max(fall_s, abs(pull_of(spring, push, k)) * (FULL_TORQUE_S / limits.effort[k]))
-    for i in range(6):
-        spring.side[i] = 0.0
-        for j in range(6):
-            spring.side[i] += spring.mobility[i, j] * push[j] * (0.5 * fall_s)
-    gained = max(length(spring.side, 0) / (_GAINED * SPEED), length(spring.side, 3) / (_GAINED * TURN_SPEED))
-    share = 1.0 / math.sqrt(max(gained, 1.0))
-    tethers = spring.error  # the first two, see `find_push`
-    for part in range(2):
-        remains = tethers[part] * share
-        keep_near(spring, part, remains)
-        size, largest = length(push, 3 * part), spring.largest[part]
-        if remains < 1.0 or size > largest:
-            state.limits |= _EFFORT
-        # The faster the tool moves where it is pushed to, the less it is pushed.
-        most = TURN_SPEED if part else SPEED
-        ahead = 0.0
-        for k in range(3 * part, 3 * part + 3):
-            ahead += push[k] * spring.tool_speed[k]
-        ahead /= max(size, _TINY)
-        least = min(_FREE_TURN if part else _FREE_PUSH, largest)
-        least *= clamp((_ENDS * most - ahead) / ((_ENDS - _EASES) * most), 0.0, 1.0)
-        allowed = min(clamp(largest * (1.0 - ahead / (_EASES * most)), least, largest), size * share)
-        for k in range(3 * part, 3 * part + 3):
-            push[k] *= allowed / max(size, _TINY)
-    if spring.is_fixed:
-        for i in range(6):
-            for j in range(6):
-                spring.damping[i, j] = spring.fixed_damping[i, j]
-    else:
+    limit_push(state, spring, share_to_stop(spring, limits))
+    if not spring.is_fixed:
         find_damping(spring)
+    damping = spring.fixed_damping if spring.is_fixed else spring.damping
     for i in range(6):
         for j in range(6):
-            push[i] += spring.damping[i, j] * (lead[j] - spring.tool_speed[j])
+            push[i] += damping[i, j] * (spring.lead[j] - spring.tool_speed[j])
     share = 1.0
     for k in range(dof):
-        torque = spring.wanted[k] = pull_of(spring, push, k)
+        torque = spring.wanted[k] = pull_of(spring, k)
         along = speed[k] if torque > 0.0 else -speed[k] if torque < 0.0 else 0.0
         most = limits.fastest[k]
         share = min(share, clamp((_JOINT_ENDS * most - along) / ((_JOINT_ENDS - _JOINT_EASES) * most), 0.0, 1.0))
@@ -259,11 +229,49 @@ def find_wanted_torques(state: Any, spring: Any, limits: Any, speed: Array) -> N
 
 
 @kernel()
-def find_push(spring: Any) -> None:
-    """Write what spring and feed-forward push with, the equilibrium's speed as far as the damper counts it, and tethers.
+def share_to_stop(spring: Any, limits: Any) -> float:
+    """Return the share of the push with which the tool gains no more than its speed while the torques fall.
 
-    The damper's pull by the equilibrium's speed ends where the spring's is the largest. The tethers, to the first two
-    places of `error`, are the shares of the way to the equilibrium at which the spring pushes its most.
+    What is pressed may give way at once, and the motors' torques need their time to fall.
+    """
+    fall_s = 0.0
+    for k in range(limits.dof):
+        fall_s = max(fall_s, abs(pull_of(spring, k)) * (FULL_TORQUE_S / limits.effort[k]))
+    for i in range(6):
+        spring.side[i] = 0.0
+        for j in range(6):
+            spring.side[i] += spring.mobility[i, j] * spring.push[j] * (0.5 * fall_s)
+    gained = max(length(spring.side, 0) / (_GAINED * SPEED), length(spring.side, 3) / (_GAINED * TURN_SPEED))
+    return 1.0 / math.sqrt(max(gained, 1.0))
+
+
+@kernel()
+def limit_push(state: Any, spring: Any, share: float) -> None:
+    """Push no more than a share, than the largest force and moment, and than the tool's speed permits."""
+    for part in range(2):
+        remains = spring.tethers[part] * share
+        keep_near(spring, part, remains)
+        size, largest = length(spring.push, 3 * part), spring.largest[part]
+        if remains < 1.0 or size > largest:
+            state.limits |= _EFFORT
+        # The faster the tool moves where it is pushed to, the less it is pushed.
+        most, ahead = TURN_SPEED if part else SPEED, 0.0
+        for k in range(3 * part, 3 * part + 3):
+            ahead += spring.push[k] * spring.tool_speed[k]
+        ahead /= max(size, _TINY)
+        least = min(_FREE_TURN if part else _FREE_PUSH, largest)
+        least *= clamp((_ENDS * most - ahead) / ((_ENDS - _EASES) * most), 0.0, 1.0)
+        allowed = min(clamp(largest * (1.0 - ahead / (_EASES * most)), least, largest), size * share)
+        for k in range(3 * part, 3 * part + 3):
+            spring.push[k] *= allowed / max(size, _TINY)
+
+
+@kernel()
+def find_push(spring: Any) -> None:
+    """Write what spring and feed-forward push with, and the equilibrium's speed as far as the damper counts it.
+
+    The damper's pull by the equilibrium's speed ends where the spring's is the largest. The `tethers` are the shares of
+    the way to the equilibrium at which the spring pushes its most.
     """
     push, lead, error = spring.push, spring.lead, spring.error
     find_way(error[3:], spring.turn, spring.tool_turn)
@@ -275,16 +283,16 @@ def find_push(spring: Any) -> None:
             push[i] += spring.stiffness[i, j] * error[j]
     for part in range(2):
         size, largest = length(push, 3 * part), spring.largest[part]
-        tether = error[part] = largest / max(size, largest)
+        tether = spring.tethers[part] = largest / max(size, largest)
         for k in range(3 * part, 3 * part + 3):
             lead[k] *= clamp(2.0 * (1.0 - size / largest), 0.0, 1.0)
             push[k] = push[k] * tether + spring.wrench[k]
 
 
 @kernel()
-def pull_of(spring: Any, push: Array, k: int) -> float:
-    """Return the torque of a joint that a wrench on the tool amounts to [N m]."""
+def pull_of(spring: Any, k: int) -> float:
+    """Return the torque of a joint that the push on the tool amounts to [N m]."""
     total = 0.0
     for i in range(6):
-        total += spring.jacobian[i, k] * push[i]
+        total += spring.jacobian[i, k] * spring.push[i]
     return total

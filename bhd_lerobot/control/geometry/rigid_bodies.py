@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.geometry.rotations import put_quaternion
 from bhd_lerobot.control.geometry.chain import decompose, put_turn
+from bhd_lerobot.control.geometry.rotations import put_quaternion
 from bhd_lerobot.control.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -22,10 +22,10 @@ _GRAVITY = 9.81  # [m/s^2]
 def find_dynamics(arm: Any, limits: Any, q: Array, speed: Array) -> None:
     """Write the dynamics of a state of an arm: mass @ change + own = torque.
 
-    To its `mass` [kg m^2], with the rotors' inertia, upper triangle; `own`, what speeds and weight need [N m]; `gravity`,
-    the weight alone [N m]; `momentum`, mass @ speed; `gradient`, that of the kinetic energy by the positions [N m],
-    which is the transpose of the Coriolis matrix times the speed; `jacobian`, at the tool centre point, linear velocity
-    first; `tool` [m] and `tool_turn`, where that is.
+    To its `mass` [kg m^2], with the rotors' inertia, upper triangle; `own`, what speeds and weight need [N m];
+    `gravity`, the weight alone [N m]; `momentum`, mass @ speed; `gradient`, that of the kinetic energy by the positions
+    [N m], which is the transpose of the Coriolis matrix times the speed; `jacobian`, at the tool centre point, linear
+    velocity first; `tool` [m] and `tool_turn`, where that is.
 
     Args:
         q: positions [rad].
@@ -34,35 +34,45 @@ def find_dynamics(arm: Any, limits: Any, q: Array, speed: Array) -> None:
     for k in range(limits.dof):
         place_link(arm, limits, q, k)
     find_motions(arm, limits, speed)
-    for k in range(limits.dof - 2, -1, -1):  # each joint carries all links behind it
-        arm.masses[k] += arm.masses[k + 1]
-        for i in range(3):
-            arm.firsts[k, i] += arm.firsts[k + 1, i]
-            for j in range(3):
-                arm.inertias[k, i, j] += arm.inertias[k + 1, i, j]
-        for i in range(6):
-            arm.momenta[k, i] += arm.momenta[k + 1, i]
-            arm.pulls[k, i] += arm.pulls[k + 1, i]
+    for k in range(limits.dof - 2, -1, -1):
+        add_link(arm, k)
     for k in range(limits.dof):
         find_terms(arm, limits, speed, k)
-    last, rotation = limits.dof - 1, arm.rotations[limits.dof - 1]
+    find_tool(arm, limits)
+
+
+@kernel()
+def add_link(arm: Any, k: int) -> None:
+    """Add to a link what is behind its end: its joint carries all that."""
+    arm.masses[k] += arm.masses[k + 1]
+    for i in range(3):
+        arm.firsts[k, i] += arm.firsts[k + 1, i]
+        for j in range(3):
+            arm.inertias[k, i, j] += arm.inertias[k + 1, i, j]
+    for i in range(6):
+        arm.momenta[k, i] += arm.momenta[k + 1, i]
+        arm.pulls[k, i] += arm.pulls[k + 1, i]
+
+
+@kernel()
+def find_tool(arm: Any, limits: Any) -> None:
+    """Write where the tool is, and how it moves with the joints."""
+    last = limits.dof - 1
+    rotation, turn = arm.rotations[last], arm.turns[last]
     for i in range(3):
         arm.tool[i] = arm.origins[last, i]
         for j in range(3):
             arm.tool[i] += rotation[i, j] * limits.tool_offset[j]
-    for k in range(limits.dof):
-        axis, origin = arm.axes[k], arm.origins[k]
-        x, y, z = (arm.tool[0] - origin[0], arm.tool[1] - origin[1], arm.tool[2] - origin[2])
-        column = cross(axis[0], axis[1], axis[2], x, y, z)
-        for i in range(3):
-            arm.jacobian[i, k], arm.jacobian[i + 3, k] = column[i], axis[i]
-    turn = arm.turns[last]
-    for i in range(3):
-        for j in range(3):
             turn[i, j] = 0.0
             for m in range(3):
                 turn[i, j] += rotation[i, m] * limits.tool_turn[m, j]
     put_quaternion(arm.tool_turn, turn)
+    for k in range(limits.dof):
+        axis, origin = arm.axes[k], arm.origins[k]
+        x, y, z = arm.tool[0] - origin[0], arm.tool[1] - origin[1], arm.tool[2] - origin[2]
+        column = cross(axis[0], axis[1], axis[2], x, y, z)
+        for i in range(3):
+            arm.jacobian[i, k], arm.jacobian[i + 3, k] = column[i], axis[i]
 
 
 @kernel()
