@@ -9,8 +9,8 @@ __all__ = [
     "held",
     "impedance",
     "relief",
-    "rotations",
     "setpoints",
+    "spring",
     "step",
     "wrench",
 ]

@@ -10,4 +10,6 @@ __all__ = [
     "kinematics",
     "numeric_inverse",
     "poses",
+    "rigid_bodies",
+    "rotations",
 ]
