@@ -34,13 +34,15 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 1e-300)
 
 # What comes from outside of the core, or from a controller that is broken: any number may be in it.
 OUTSIDE = {"position", "velocity", "effort", "actuators", "requested", "target", "values", "near"}
-POSITIVE = {"deceleration", "reach", "range_min", "range_max"}
+POSITIVE = {"deceleration", "reach", "range_min", "range_max", "largest"}
 TIMES = (0, 1, 10**6, 10**9, -(10**9), 2**62, -(2**62), 2**63 - 1, -(2**63))
 FIXED = {"limits", "arm_limits", "geometry"}  # numbers of a body
 WHOLE = {  # the smallest and the largest; others are from 0 to 3
     "mode": (0, 8),
     "joints": (2, 8),
     "width": (2, 8),
+    "dof": (1, 8),
+    "frame_ticks": (1, 4),
     "late": (1, 5),
     "gyro": (-1, 6),
     "beams": (0, 7),
