@@ -44,8 +44,8 @@ def enclosing(shape: Balls) -> tuple[Array, Array, float]:
     if len(centres) <= 2 and np.ptp(radii) == 0.0:  # a ball or a capsule
         return centres[0], centres[-1], float(radii[0])
     middle = centres.mean(axis=0)
-    _, _, axes = np.linalg.svd(centres - middle, full_matrices=True)
-    found = [_along(axis, middle, centres, radii) for axis in axes]
+    _, axes = np.linalg.eigh((centres - middle).T @ (centres - middle))
+    found = [_along(axis, middle, centres, radii) for axis in axes.T]
     return min(found, key=lambda capsule: _volume(*capsule))
 
 

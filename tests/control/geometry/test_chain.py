@@ -1,15 +1,23 @@
 """What a tick computes of an arm: the same as the kinematics of plans, Pinocchio and numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import HELD, Capsule, Placement
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.arm.clearance import fill_geometry
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.chain import find_distances, find_frames, find_jacobian, find_torques, solve
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.kernels import as_objects
+from bhd_lerobot.control.record import GEOMETRY as GEOMETRY_RECORD
+from bhd_lerobot.control.record import new_arms
+from bhd_lerobot.sim.chain import chain_from_mjcf
+from tests.control.geometry.arm_models import serial
 
 RNG = np.random.default_rng(0)
 BODY = ur5(load=2.0)
@@ -34,6 +42,39 @@ def test_distances_are_those_that_plans_are_checked_with() -> None:
     for k, q in enumerate(POSTURES):
         np.testing.assert_allclose(find_distances(ARM, GEOMETRY, q, True), least[:, k], atol=1e-12)
         np.testing.assert_allclose(ARM.distances[: len(every)], every[:, k], atol=1e-12)
+
+
+@pytest.mark.parametrize("joints", [4, 5, 6, 7])
+def test_of_any_chain_they_are_the_same(joints: int) -> None:
+    """With a base and a tool that are turned, and what the gripper holds."""
+    chain = chain_from_mjcf(serial(joints, joints, ref=True), "tool")
+    turned = Placement((0.1, -0.2, 0.3), Placement.of(ForwardKinematics(CHAIN).tool(POSTURES[0])).rotation)
+    held = Capsule(HELD, joints, chain.tool.position, (0.01, 0.02, 0.3), 0.01)
+    chain = replace(chain, base=turned).holding(held)
+    record = np.zeros(1, GEOMETRY_RECORD)
+    fill_geometry(record[0], chain)
+    [arm], [geometry] = as_objects(new_arms(1)), as_objects(record)
+    forward, model = ForwardKinematics(chain), CollisionModel(chain)
+    postures = POSTURES[:30, :1] + RNG.uniform(-2, 2, (30, joints))
+    every = model.each(postures)
+    for k, q in enumerate(postures):
+        find_jacobian(arm, geometry, q)
+        np.testing.assert_allclose(arm.frames[: joints + 1], forward.frames(q)[:, :3], atol=1e-12)
+        np.testing.assert_allclose(arm.jacobian[:, :joints], forward.jacobian(q), atol=1e-12)
+        find_distances(arm, geometry, q, True)
+        np.testing.assert_allclose(arm.distances[: len(every)], every[:, k], atol=1e-12)
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("joints", [4, 7])
+def test_no_distance_changes_faster_than_its_slope(joints: int) -> None:
+    model = CollisionModel(chain_from_mjcf(serial(joints, joints), "tool"))
+    slopes = np.concatenate(model.slopes())
+    for q in RNG.uniform(-2, 2, (50, joints)):
+        for joint in range(joints):
+            step = np.eye(joints)[joint] * 1e-3
+            change = np.abs(np.diff(model.each(np.stack([q, q + step])), axis=1))[:, 0]
+            assert (change <= slopes[:, joint] * 1e-3 + 1e-9).all()
 
 
 def test_torques_are_those_of_pinocchio() -> None:
