@@ -286,10 +286,8 @@ class DatasetRecorder:
             consequence = "All saved episodes are intact and load; run `bhd-data repair` when the cause is removed."
             with write_errors("compact the dataset", self.root, consequence):
                 self._settle_if_is_uncertain()
-                self._is_uncertain = True
                 compact(self._state, self._schema, self._disk, self._lock, self._stats)
                 self._disk.remove_tree(self.root / layout.STAGING)
-                self._is_uncertain = False
             self._finalized = True
         finally:
             self._lock.release()

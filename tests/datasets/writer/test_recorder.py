@@ -201,6 +201,8 @@ def test_episodes_may_be_open_side_by_side(tmp_path: Path) -> None:
             )
         left_open = recorder.begin_episode()
         left_open.add_image(CAMERA, np.zeros((32, 48, 3), np.uint8))
+    with pytest.raises(FrameError, match="saved or discarded"):
+        left_open.add_image(CAMERA, np.zeros((32, 48, 3), np.uint8))
     assert support.verify(root, 3, video=True, stats=True) == 3
     assert not (root / ".bhd").exists()
 

@@ -94,6 +94,9 @@ def test_at_the_goal_it_turns_to_its_heading_and_rests(side: int) -> None:
     assert see(brain, goal_at(0.03, 0.0, side * 0.02))[0].tolist() == [0.0, 0.0]
     assert see(brain, goal_at(0.07, 0.0, 0.0))[0].tolist() == [0.0, 0.0]  # a little off, it stays
     assert see(brain, goal_at(0.09, 0.0, 0.0))[0, 0] > 0
+    assert see(brain, goal_at(0.03, 0.0, 0.0))[0].tolist() == [0.0, 0.0]
+    brain.reset(np.arange(1), [0], 1)
+    assert see(brain, goal_at(0.07, 0.0, 0.0))[0, 0] > 0  # in another episode it has not been there
 
 
 def test_it_never_asks_for_more_than_the_robot_can() -> None:
