@@ -45,8 +45,8 @@ class TimedTopics(BaseTopics):
         """Look for ticks that took a setpoint."""
         wall = time.time_ns() - time.monotonic_ns()
         while (state := self._ring.read()) is not None:
-            if state["setpoints"] != self._setpoints:
-                self._setpoints = int(state["setpoints"])
+            if state["state"]["setpoints_taken"] != self._setpoints:
+                self._setpoints = int(state["state"]["setpoints_taken"])
                 self.used.append(int(state["start_ns"]) + wall)
         return super().poll(now_ns)
 

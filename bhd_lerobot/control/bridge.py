@@ -1,4 +1,4 @@
-"""The bridge between brain and cerebellum, in lockstep with a simulated clock."""
+"""The bridge between brain and cerebellum, and that of a simulated clock."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -14,14 +14,21 @@ from bhd_lerobot.errors import ConfigError
 
 
 class Bridge(ABC):
-    """Sends commands to a cerebellum, and reads its state: in lockstep, or across processes on the wall clock."""
+    """Sends commands to a cerebellum, and reads its state: in lockstep, or across processes on the wall clock.
+
+    Args:
+        cerebellum: the controller, or on the wall clock one that holds the record of the controller.
+        rates: the rates.
+    """
+
+    def __init__(self, cerebellum: Cerebellum, rates: Rates) -> None:
+        self.cerebellum, self.rates = cerebellum, rates
 
     @property
     @abstractmethod
     def now_ns(self) -> int:
         """Time of the cerebellum [ns]."""
 
-    @abstractmethod
     def send(
         self,
         values: NDArray[np.float64],
@@ -38,8 +45,13 @@ class Bridge(ABC):
             due_ns: when it takes effect [ns]; at the next tick if None.
             replaces: whether it takes the place of what was sent before and is not due yet.
         """
+        cerebellum, now = self.cerebellum, self.now_ns
+        due = now if due_ns is None else due_ns
+        if abs(due - now) > HORIZON_NS:
+            return cerebellum.refuse(Reason.BEYOND_HORIZON if due > now else Reason.STALE, mask)
+        sequence = int(cerebellum.fifo.sent_sequence.max()) + 1
+        return cerebellum.offer(Setpoint(sequence, due, values, replaces), mask)
 
-    @abstractmethod
     def send_chunk(
         self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None
     ) -> list[SendResult]:
@@ -51,6 +63,14 @@ class Bridge(ABC):
             start_ns: when the first takes effect [ns]; at the next tick if None. Those whose frame has gone by already
                 are left out: a brain that took its time does not make the robot hurry.
         """
+        now = self.now_ns
+        start = now if start_ns is None else start_ns
+        dues = [start + k * NANOSECONDS // self.rates.fps for k in range(len(values) + 1)]
+        results: list[SendResult] = []
+        for row, due, end in zip(values, dues, dues[1:], strict=False):
+            if end > now:
+                results.append(self.send(row, mask, max(now, due), replaces=not results))
+        return results
 
     @abstractmethod
     def submit(self, command: BrainCommand, sim: int = 0) -> CommandResult | None:
@@ -77,18 +97,22 @@ class Bridge(ABC):
     def state(self) -> CerebellumState:
         """Return a copy of the newest state."""
 
-    @abstractmethod
     def estop(self, ids: NDArray[np.intp] | None = None) -> None:
         """Press the emergency stop; the next tick latches it."""
+        self.cerebellum.estop.press(ids)
 
     @property
-    @abstractmethod
     def estop_pressed(self) -> bool:
         """Whether the emergency stop of any simulation is pressed, be it latched already or not."""
+        return bool(np.any(self.cerebellum.estop.pressed))
 
     @abstractmethod
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Request a change of mode of some simulations, of all if None; return the outcome of it."""
+
+    @abstractmethod
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Start new episodes of robots that were put somewhere else."""
 
     def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Leave UNCONFIGURED: odometry starts here."""
@@ -141,41 +165,14 @@ class LockstepBridge(Bridge):
             raise ConfigError(
                 f"control_hz is {rates.control_hz}, but the cerebellum was made for {cerebellum.control_hz} Hz."
             )
-        self.cerebellum = cerebellum
-        self.rates = rates
+        super().__init__(cerebellum, rates)
         self._advance, self._run = advance, run
-        self._sequence = 0
         self._tick = 0
 
     @property
     def now_ns(self) -> int:
         """Simulated time since the bridge was made [ns]."""
         return self._tick * NANOSECONDS // self.rates.control_hz
-
-    def send(
-        self,
-        values: NDArray[np.float64],
-        mask: NDArray[np.bool_] | None = None,
-        due_ns: int | None = None,
-        *,
-        replaces: bool = False,
-    ) -> SendResult:
-        """Send one setpoint, see `Bridge.send`."""
-        due = self.now_ns if due_ns is None else due_ns
-        if abs(due - self.now_ns) > HORIZON_NS:
-            return self.cerebellum.refuse(Reason.BEYOND_HORIZON if due > self.now_ns else Reason.STALE, mask)
-        self._sequence += 1
-        return self.cerebellum.offer(Setpoint(self._sequence, due, values, replaces), mask)
-
-    def send_chunk(
-        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None
-    ) -> list[SendResult]:
-        """Send an action chunk, see `Bridge.send_chunk`; it always begins now: nothing is late."""
-        frame = self.rates.ticks_per_frame
-        return [
-            self.send(row, mask, (self._tick + k * frame) * NANOSECONDS // self.rates.control_hz, replaces=k == 0)
-            for k, row in enumerate(values)
-        ]
 
     # --- goals -------------------------------------------------------------------------------------------------------
 
@@ -217,15 +214,6 @@ class LockstepBridge(Bridge):
     def state(self) -> CerebellumState:
         """Return a copy of the present state."""
         return self.cerebellum.state(self.now_ns)
-
-    def estop(self, ids: NDArray[np.intp] | None = None) -> None:
-        """Press the emergency stop; the next tick latches it."""
-        self.cerebellum.estop.press(ids)
-
-    @property
-    def estop_pressed(self) -> bool:
-        """Whether the emergency stop of any simulation is pressed, be it latched already or not."""
-        return bool(np.any(self.cerebellum.estop.pressed))
 
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Request a change of mode; it happens before the next tick or is refused with a reason."""

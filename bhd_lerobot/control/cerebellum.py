@@ -96,6 +96,9 @@ class Cerebellum:
             states["stamp_ns"],
             numbers["has_stamps"],
         )
+        self._measured, self._pressed = states["measured"][:, :width], states["pressed"]
+        self._torque = states["torque"][:, : controller.joints]
+        self._wrench = states["wrench"][:, : controller.contact_wrench.shape[1]]
         self._has_effort = None if controller.arm_limits is None else controller.arm_limits["has_effort"]
         if controller.arm_limits is None:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
@@ -278,11 +281,10 @@ class Cerebellum:
             self._count_refusals(reasons)
             return SendResult(reasons)
         reasons = self._mode_reasons()
-        states = self.states
-        last = states["sent_sequence"]
+        last, last_due_ns = self.fifo.sent_sequence, self.fifo.sent_due_ns
         late = (setpoint.sequence <= last) | (setpoint.sequence > last + SEQUENCE_STEP)
         if not setpoint.replaces:
-            late |= setpoint.due_ns < states["sent_due_ns"]
+            late |= setpoint.due_ns < last_due_ns
         reasons[(reasons == Reason.ACCEPTED) & late] = Reason.OUT_OF_ORDER
         if not np.isfinite(values).all():
             reasons[~np.isfinite(values).all(axis=1)] = Reason.NON_FINITE
@@ -290,7 +292,7 @@ class Cerebellum:
         accepted = wanted & (reasons == Reason.ACCEPTED)
         if accepted.any():
             pushed = self.fifo.push(setpoint.sequence, setpoint.due_ns, values, accepted)
-            last[pushed], states["sent_due_ns"][pushed] = setpoint.sequence, setpoint.due_ns
+            last[pushed], last_due_ns[pushed] = setpoint.sequence, setpoint.due_ns
             reasons[accepted & ~pushed] = Reason.FIFO_FULL
         self._count_refusals(reasons)
         return SendResult(reasons)
@@ -335,7 +337,7 @@ class Cerebellum:
             self._configure(allowed)
         if request == Request.ACTIVATE:
             self.refusals[Reason.NOT_ACTIVE] += self._drop(allowed)
-            self.states["sent_due_ns"][allowed] = np.iinfo(np.int64).min
+            self.fifo.sent_due_ns[allowed] = np.iinfo(np.int64).min
         if request == Request.RESET:
             # A press after another latch has not been seen yet: the next tick will.
             latched = self.mode == Mode.ESTOP
@@ -389,6 +391,7 @@ class Cerebellum:
         kept = ("setpoints_taken", "command", "actuators") if self.body.arm is not None else ("setpoints_taken",)
         values = [self.states[name][ids] for name in kept]  # servos that take positions stay where they are
         self.states[ids] = new_states(1)
+        self.fifo.forget(ids)
         for name, value in zip(kept, values, strict=True):
             self.states[name][ids] = value
         self.controller.restart(ids)
@@ -415,26 +418,31 @@ class Cerebellum:
         by_setpoint = (self.mode == Mode.TRACKING) & ~self.states["by_goal"]
         return np.where(by_setpoint, now_ns - self.states["due_ns"], 0)
 
-    def command_age_of(self, sim: int, now_ns: int) -> int:
-        """Return `command_age_ns` of one simulation [ns]."""
-        states = self.states
-        if self.mode[sim] != _TRACKING or states["by_goal"][sim]:
-            return 0
-        return now_ns - int(states["due_ns"][sim])
+    def report(self) -> None:
+        """Complete the records with what only their readers need."""
+        controller, reading = self.controller, self.reading
+        self._measured[:] = controller.measured(reading)
+        self._torque[:] = reading.effort if reading.has_effort else controller.efforts(reading)
+        self._wrench[:], self._pressed[:] = controller.contact_wrench, controller.pressed()
 
     def state(self, now_ns: int) -> CerebellumState:
         """Return a copy of the present state."""
-        velocity = self.reading.velocity.copy()
+        self.report()
+        return self.reported(now_ns)
+
+    def reported(self, now_ns: int) -> CerebellumState:
+        """Return a copy of what the records report, whether they are this cerebellum's own or another's."""
+        velocity, odometry = self.reading.velocity.copy(), 0 if self.body.drive is None else 3
         return CerebellumState(
             stamp_ns=now_ns,
             joint_positions=self.reading.position.copy(),
             joint_velocities=velocity,
-            joint_efforts=self.efforts(),
-            contact_wrench=self.controller.contact_wrench.copy(),
-            pressed=self.controller.pressed(),
+            joint_efforts=self._torque.copy(),
+            contact_wrench=self._wrench.copy(),
+            pressed=self._pressed.copy(),
             command=self.command.copy(),
-            odometry=self.controller.odometry(),
-            measured=self.controller.measured(self.reading),
+            odometry=self.states["odometry"][:, :odometry].copy(),
+            measured=self._measured.copy(),
             mode=self.mode.copy(),
             is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
             emergency_stop=self.mode == Mode.ESTOP,

@@ -14,6 +14,7 @@ from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.record import NEVER, QUEUE, WAITING
 from bhd_lerobot.errors import ConfigError
 
+_NEVER_DUE = np.iinfo(np.int64).min
 _MOST_READS = 100  # a writer overwrites what is being read once in a great while, and never so many times in a row
 
 
@@ -30,6 +31,8 @@ class CommandFifo:
 
     Attributes:
         queues: the queues as the tick reads them, shape (n,).
+        sent_sequence: sequence number of the last command that this end has sent, shape (n,).
+        sent_due_ns: when it is due, shape (n,).
     """
 
     def __init__(self, n: int, width: int, capacity: int = QUEUE, buffer: Any = None) -> None:
@@ -41,6 +44,11 @@ class CommandFifo:
         self._sequence, self._due = self.queues["sequence"], self.queues["due_ns"]
         self._waits, self._values = self.queues["waits"], self.queues["values"][:, :, :width]
         self._all = np.arange(n)
+        self.sent_sequence, self.sent_due_ns = self._head - 1, np.full(n, _NEVER_DUE)
+
+    def forget(self, ids: NDArray[np.intp]) -> None:
+        """Take commands of any due time and sequence number next: robots have been put somewhere else."""
+        self.sent_sequence[ids], self.sent_due_ns[ids] = -1, _NEVER_DUE
 
     @classmethod
     def nbytes(cls, n: int) -> int:
@@ -51,11 +59,6 @@ class CommandFifo:
         """Return the number of entries in use of the fullest queue: those that wait, and those between them."""
         most = max(head - tail for head, tail in zip(self._head.tolist(), self._tail.tolist(), strict=True))
         return min(max(most, 0), self.capacity)
-
-    @property
-    def pushed(self) -> int:
-        """Number of commands that were ever appended."""
-        return int(self._head.sum())
 
     def push(
         self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]
@@ -152,12 +155,16 @@ class StateRing:
     def __init__(self, dtype: np.dtype, capacity: int = 16, buffer: Any = None) -> None:
         if capacity < 2:
             raise ConfigError(f"The state ring's capacity is {capacity}; it must be at least 2.")
-        self.capacity = capacity
+        self.dtype, self.capacity = dtype, capacity
         if buffer is None:
             buffer = bytearray(self.nbytes(dtype, capacity))
         self._count = np.frombuffer(buffer, np.int64, 1)
-        slots = np.frombuffer(buffer, self._slot(dtype), capacity, offset=8)
-        self._guard, self._state = slots["guard"], slots["state"]
+        slot = self._slot(dtype)
+        self._guard = np.frombuffer(buffer, slot, capacity, offset=8)["guard"]
+        # As bytes: numpy copies a structure field by field, and a record has a hundred of them.
+        rows = np.frombuffer(buffer, np.uint8, capacity * slot.itemsize, offset=8).reshape(capacity, slot.itemsize)
+        start = slot.fields["state"][1]  # type: ignore[index]
+        self._rows = rows[:, start : start + dtype.itemsize]
 
     @staticmethod
     def _slot(dtype: np.dtype) -> np.dtype:
@@ -177,7 +184,7 @@ class StateRing:
         count = int(self._count[0])
         slot = count % self.capacity
         self._guard[slot] += 1
-        self._state[slot] = state
+        self._rows[slot] = np.frombuffer(state, np.uint8)
         self._guard[slot] += 1
         self._count[0] = count + 1
 
@@ -206,8 +213,8 @@ class StateRing:
         complete = 2 * (number // self.capacity + 1)
         if int(self._guard[slot]) != complete:
             return None
-        state = self._state[slot].copy()
-        return state if int(self._guard[slot]) == complete else None
+        state = self._rows[slot].copy()
+        return state.view(self.dtype)[0] if int(self._guard[slot]) == complete else None
 
 
 class RingReader:

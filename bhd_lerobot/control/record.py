@@ -70,9 +70,7 @@ STATE = record(
         ("requested", *_vector),  # the setpoint that was taken last, before all limits
         ("setpoints_taken", _i),
         ("due_ns", _i),  # when it was due
-        ("sent_sequence", _i),
         ("taken_sequence", _i),
-        ("sent_due_ns", _i),
         ("next_due_ns", _i),  # when the next in the queue is due; `NEVER` if none waits
         ("next_entry", _i),
         ("seen_head", _i),
@@ -108,6 +106,11 @@ STATE = record(
         ("stood", _b),  # the wheels had not turned at all then
         ("stopped_at", _f, (4,)),  # [rad/s] of the wheels then, commanded and read
         ("late", _f, (2, LOOKS)),  # [rad/s] commanded between looks, the newest first
+        # Reports, see `Cerebellum.report`: written when somebody reads the record, not in the tick.
+        ("measured", *_vector),  # where it is in the space of the commands
+        ("torque", *_vector),  # [N m] of the joints, a gripper's force [N]
+        ("wrench", _f, (6,)),  # [N, N m] that the surroundings put on the tool
+        ("pressed", _f),  # [N] that forbids to activate it
     ],
 )
 
@@ -455,8 +458,7 @@ def new_states(n: int) -> NDArray:
     """Return the records of n robots that are not configured, shape (n,)."""
     states = np.zeros(n, STATE)
     states["near"] = states["seen_position"] = np.nan
-    states["sent_sequence"] = states["taken_sequence"] = states["seen_head"] = -1
-    states["sent_due_ns"] = np.iinfo(np.int64).min
+    states["taken_sequence"] = states["seen_head"] = -1
     states["next_due_ns"], states["mode_is_new"] = NEVER, True
     return states
 

@@ -12,7 +12,6 @@ __all__ = [
     "planning_link",
     "privileges",
     "requests",
-    "sections",
     "shared_memory",
     "timing",
 ]

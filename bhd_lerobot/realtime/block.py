@@ -12,11 +12,18 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from bhd_lerobot import __version__
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.record import STATE
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, request_dtype
 from bhd_lerobot.realtime.shared_memory import SharedBlock
+from bhd_lerobot.realtime.timing import TimingStatistics
 
 WORDS = 64
+_REQUESTS, _EVENTS = 16, 64
 _SCENE = np.dtype([("text", "S32768")])
 
 
@@ -77,18 +84,20 @@ class LiveLayout:
     """Sizes of everything in a block.
 
     Attributes:
-        width: values in a command.
         state: dtype of the states.
-        fifo_capacity: commands that may wait.
         ring_capacity: states that a reader may lag behind.
-        extra: further sections, sizes in bytes by name.
+        width: values in a command.
+        fifo_capacity: commands that may wait.
+        dof: joints of the arm; 0 if there is none.
+        plans: bytes for what is planned in the brain's process.
     """
 
-    width: int
     state: np.dtype
-    fifo_capacity: int
     ring_capacity: int
-    extra: dict[str, int]
+    width: int = 1
+    fifo_capacity: int = 1
+    dof: int = 0
+    plans: int = 0
 
     def create(self, name: str, about: dict[str, Any]) -> "LiveBlock":
         """Make the block.
@@ -101,15 +110,19 @@ class LiveLayout:
             "fifo": CommandFifo.nbytes(1),
             "ring": StateRing.nbytes(self.state, self.ring_capacity),
             "scenes": StateRing.nbytes(_SCENE, 2),
-            **self.extra,
+            "requests": Mailbox.nbytes(request_dtype(self.dof), _REQUESTS),
+            "events": Mailbox.nbytes(EVENT_DTYPE, _EVENTS),
+            "statistics": TimingStatistics.nbytes,
+            "plan": self.plans,
         }
         described = {
             "width": self.width,
             "fifo_capacity": self.fifo_capacity,
+            "dof": self.dof,
             "ring_capacity": self.ring_capacity,
             "state": npy.dtype_to_descr(self.state),
         }
-        about = {**about, "made_ns": time.monotonic_ns(), "layout": described}
+        about = {**about, "version": __version__, "made_ns": time.monotonic_ns(), "layout": described}
         return LiveBlock(SharedBlock.create(name, sections, about))
 
 
@@ -121,9 +134,14 @@ class LiveBlock:
         estop: the word of the emergency stop.
         fifo: the commands.
         ring: the states.
+        requests: requests for modes and goals.
+        events: replies to them, and results of goals.
 
     Args:
         block: the memory.
+
+    Raises:
+        RealtimeError: its records are those of another version.
     """
 
     def __init__(self, block: SharedBlock) -> None:
@@ -132,10 +150,18 @@ class LiveBlock:
         self.name, self.about = block.name, block.about
         self.words: NDArray[np.int64] = np.frombuffer(block.section("words"), np.int64)
         self.state_dtype = npy.descr_to_dtype(_tuples(layout["state"]))
+        fields = self.state_dtype.fields or {}
+        if "state" in fields and fields["state"][0] != STATE:
+            raise RealtimeError(
+                f"The robot {self.name!r} runs version {self.about.get('version')} of bhd_lerobot and this is version "
+                f"{__version__}, whose record is another. Run the same version on both sides."
+            )
         self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_LATCHED + 1])
         self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))
         self.ring = StateRing(self.state_dtype, layout["ring_capacity"], block.section("ring"))
         self._scenes = StateRing(_SCENE, 2, block.section("scenes"))
+        self.requests = Mailbox(request_dtype(layout["dof"]), _REQUESTS, block.section("requests"))
+        self.events = Mailbox(EVENT_DTYPE, _EVENTS, block.section("events"))
 
     @classmethod
     def attach(cls, name: str) -> Self:
@@ -178,10 +204,6 @@ class LiveBlock:
     def section(self, name: str) -> memoryview:
         """Return the memory of a further section."""
         return self._block.section(name)
-
-    def has(self, name: str) -> bool:
-        """Return whether there is a section of this name."""
-        return self._block.has(name)
 
     def show_life(self, word: Word) -> None:
         """Note that this process lives."""

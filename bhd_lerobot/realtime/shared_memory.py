@@ -198,10 +198,6 @@ class SharedBlock:
         self._views.append(view)
         return view
 
-    def has(self, name: str) -> bool:
-        """Return whether there is a section of this name."""
-        return name in self._sections
-
     def close(self) -> None:
         """Leave the block; the last process that does so removes it. May be called twice."""
         if self._descriptor < 0:

@@ -16,6 +16,7 @@ from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport
+from bhd_lerobot.robots.host.state import command_age_ns
 from bhd_lerobot.tasks.task import Event
 
 _SILENCE_S = 2.0  # so long without a frame the loop is stopped, or has ended
@@ -101,10 +102,11 @@ class Onlooker:
 
     def _is_followed(self, state: Any) -> bool:
         """Return whether a command is followed; zero speed is none for a base that nobody drives."""
-        if state["mode"][0] != Mode.TRACKING:
+        record = state["state"]
+        if record["mode"] != Mode.TRACKING:
             return False
-        stands = self.body.drive is not None and not state["requested"].any()
-        return not (stands and state["command_age_ns"])
+        stands = self.body.drive is not None and not record["requested"].any()
+        return not (stands and command_age_ns(state))
 
     # --- an episode, see `Robots` ------------------------------------------------------------------------------------
 
@@ -137,7 +139,7 @@ class Onlooker:
             before,
             after,
             # What was requested before a goal, or before the robot stopped by itself, is not what it follows.
-            requested=state["requested"] if state["command_age_ns"] else state["command"],
+            requested="requested" if command_age_ns(state) else "command",
             truth=lambda: event,
             origin_ns=self._origin_ns,
         )
@@ -151,7 +153,7 @@ class Onlooker:
     def _judge(self, state: Any) -> Event:
         """Return how the episode ends with a frame, by the state at its end."""
         now = int(state["sensed_ns"])
-        if state["mode"][0] == Mode.TRACKING:
+        if state["state"]["mode"] == Mode.TRACKING:
             self._followed_ns = now
         if results := self._take_results(now):
             self.ended_by = results[0]

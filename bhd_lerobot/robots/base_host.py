@@ -89,11 +89,6 @@ class BaseHost(Host):
         pose[:, 1] = self._start[:, 1] + np.sin(turn) * odometry[:, 0] + np.cos(turn) * odometry[:, 1]
         return BaseTruth(pose, np.zeros(self.n, np.bool_))
 
-    def show(self, state: Any) -> None:
-        """Take over what the process of a robot on the wall clock published, a record of `state_dtype`."""
-        super().show(state)
-        self.cerebellum.states["odometry"] = state["odometry"]
-
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Take over where in their arenas the bases start: a person has put them there."""
         self._start[ids] = [(0.0, 0.0, 0.0) if arena is None else arena.start for arena in scenes]

@@ -11,11 +11,11 @@ from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Mode, Reason, Request
+from bhd_lerobot.control.record import STATE
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Word
 from bhd_lerobot.realtime.bridge import LiveBridge
-from bhd_lerobot.realtime.mailbox import Mailbox
-from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
+from bhd_lerobot.realtime.requests import RequestServer
 from tests.control.support import BODY, PerfectPlant
 
 HZ, FPS = 200, 10
@@ -28,29 +28,20 @@ class Rig:
 
     def __init__(self) -> None:
         self.now = 5 * 10**12
-        sizes = {"requests": Mailbox.nbytes(request_dtype(0)), "events": Mailbox.nbytes(EVENT_DTYPE)}
-        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY.drive, 1, HZ))
-        own = {name: np.asarray(value) for name, value in vars(self.cerebellum.state(0)).items()}
-        numbers = [("tick", np.int64), ("due_ns", np.int64)]
-        extended = np.dtype([*((name, value.dtype, value.shape) for name, value in own.items()), *numbers])
-        layout = LiveLayout(2, extended, 16, 64, sizes)
+        self.cerebellum, mirror = (
+            Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY.drive, 1, HZ)) for _ in range(2)
+        )
+        row = np.dtype([("state", STATE), ("tick", np.int64), ("now_ns", np.int64)])
+        layout = LiveLayout(row, 64, 2, 16)
         self.block = layout.create(f"test-bridge-{os.getpid()}", {})
         other = LiveBlock.attach(self.block.name)
         self.other = other
         self.cerebellum.fifo, self.cerebellum.estop = other.fifo, other.estop
-        requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
-                            Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
-        self.server = RequestServer(self.cerebellum, requests, events)
-        self.record = np.zeros((), extended)
+        self.server = RequestServer(self.cerebellum, other.requests, other.events)
+        self.row = np.zeros(1, row)
         self.start, self.ticks = self.now, 0
         other.words[Word.START] = self.start
-        client = RequestClient(
-            Mailbox(request_dtype(0), buffer=self.block.section("requests")),
-            Mailbox(EVENT_DTYPE, buffer=self.block.section("events")),
-            self.tick,
-            clock_ns=self.clock,
-        )
-        self.bridge = LiveBridge(self.block, Rates(HZ, HZ, FPS), client, self.tick, self.clock)
+        self.bridge = LiveBridge(self.block, mirror, Rates(HZ, HZ, FPS), self.tick, self.clock)
 
     def clock(self) -> int:
         return self.now
@@ -62,11 +53,10 @@ class Rig:
             elapsed = self.ticks * TICK
             self.server.serve(self.now)
             self.cerebellum.tick(elapsed)
-            state = self.cerebellum.state(elapsed)
-            for name, value in vars(state).items():
-                self.record[name] = value
-            self.record["tick"], self.record["due_ns"] = self.ticks, self.start + elapsed
-            self.other.ring.publish(self.record)
+            self.cerebellum.report()
+            self.row["state"] = self.cerebellum.states
+            self.row["tick"], self.row["now_ns"] = self.ticks, elapsed
+            self.other.ring.publish(self.row)
             self.ticks += 1
 
     def close(self) -> None:
@@ -134,7 +124,8 @@ def test_a_second_bridge_moves_the_robot_and_what_the_first_sends_then_is_droppe
         assert bridge.send(drive(0.1)).accepted.all()
         rig.tick()
     with closing(LiveBlock.attach(rig.block.name)) as block:
-        second = LiveBridge(block, bridge.rates, bridge._client, rig.tick, rig.clock)
+        mirror = Cerebellum(BODY, PerfectPlant(1), HZ, BaseController(BODY.drive, 1, HZ))
+        second = LiveBridge(block, mirror, bridge.rates, rig.tick, rig.clock)
         for _ in range(5):
             assert second.send(drive(0.05)).accepted.all()
             rig.tick(10)

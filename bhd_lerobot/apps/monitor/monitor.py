@@ -30,13 +30,15 @@ _SNAPSHOT_S = 0.5  # that a single snapshot measures rates over
 _LINE_S = 1.0  # between two lines where there is no terminal
 
 
-def running() -> list[LiveBlock]:
-    """Return the robots that run, to be closed by the caller."""
+def running(wanted: str | None = None) -> list[LiveBlock]:
+    """Return the robots that run, to be closed by the caller; raise if the one that is wanted cannot be read."""
     found = []
     for name in names():
         try:
             block = LiveBlock.watch(name)
         except (RealtimeError, KeyError, TypeError, ValueError):  # gone in the meantime, or the block of something else
+            if name == wanted:
+                raise
             continue
         if "made_ns" in block.about and "commands" in block.about:
             found.append(block)
@@ -47,7 +49,7 @@ def running() -> list[LiveBlock]:
 
 def find(name: str | None) -> LiveBlock:
     """Return the block of the robot with this id, or of the only one that runs if None; or raise a `RealtimeError`."""
-    blocks = running()
+    blocks = running(name)
     chosen = [block for block in blocks if name in (None, block.name)]
     for block in blocks:
         if len(chosen) != 1 or block is not chosen[0]:

@@ -46,7 +46,7 @@ class LivePage:
         }
         if state is None:
             return -1, told
-        told["mode"] = Mode(int(state["mode"][0])).name.lower().replace("_", " ")
+        told["mode"] = Mode(int(state["state"]["mode"])).name.lower().replace("_", " ")
         told["age"] = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
         views, arrays = self._drawn(state)
         told["arrays"] = {
@@ -62,8 +62,9 @@ class LivePage:
 
     def _drawn(self, state: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         names, observed, physics = self._names, state["observation"], state["physics"]
-        if not physics.shape[1] and state["odometry"].shape[1] == len(_ODOMETRY) and not set(_ODOMETRY) <= set(names):
-            names, observed = [*names, *_ODOMETRY], np.concatenate([observed, state["odometry"]], axis=1)
+        if not physics.shape[1] and self._block.about.get("drives") and not set(_ODOMETRY) <= set(names):
+            odometry = state["state"]["odometry"][None]
+            names, observed = [*names, *_ODOMETRY], np.concatenate([observed, odometry], axis=1)
         columns = {keys.OBSERVATION_STATE: observed, **({keys.PHYSICS_STATE: physics} if physics.shape[1] else {})}
         views, places = views_of(self._robot, {keys.OBSERVATION_STATE: {"names": names}}, columns)
         return views, {keys.OBSERVATION_STATE: observed, **{f"view.{name}": values for name, values in places.items()}}

@@ -12,6 +12,7 @@ from bhd_lerobot.control.motion.goal_codec import decode_feedback
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.timing import TimingStatistics
+from bhd_lerobot.robots.host.state import command_age_ns
 
 LIMITS = tuple(limit.name or "" for limit in Limit if limit)
 WATCHDOGS = tuple(watchdog.name or "" for watchdog in Watchdog if watchdog)
@@ -111,7 +112,7 @@ class Sampler:
     def __init__(self, block: LiveBlock, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._block, self._clock = block, clock
         self._started = int(block.about["made_ns"])
-        self._statistics = block.section("statistics") if block.has("statistics") else None
+        self._statistics = block.section("statistics")
         self._past: deque[_Counts] = deque()
         self._spreads: tuple[Spread | None, Spread | None] = (None, None)
 
@@ -167,31 +168,35 @@ class Sampler:
 
     def _of_state(self, state: Any, now: int, running: bool, rates: dict[str, float]) -> dict[str, Any]:
         """Return what a published state says."""
-        mode = Mode(int(state["mode"][0]))
-        goal = decode_feedback(state["feedback"]) if "feedback" in state.dtype.names else None
+        record, goal = state["state"], decode_feedback(state["feedback"])
+        mode = Mode(int(record["mode"]))
         by_setpoint = mode == Mode.TRACKING and goal is None
-        requested = state["requested"][0].tolist() if int(state["setpoints"]) and goal is None else None
-        age = (int(state["command_age_ns"]) + now - int(state["due_ns"])) / NANOSECONDS
+        requested = record["requested"].tolist() if int(record["setpoints_taken"]) and goal is None else None
+        age = (command_age_ns(state) + now - int(state["due_ns"])) / NANOSECONDS
         seen = (int(state["oldest_ns"]) + now - int(state["sensed_ns"])) / NANOSECONDS
-        values = zip(self._block.about["commands"], state["command"][0].tolist(), state["measured"][0], strict=True)
-        refusals = dict(zip(REASONS, state["refusals"].tolist(), strict=True))
+        values = zip(
+            self._block.about["commands"], record["command"].tolist(), record["measured"].tolist(), strict=False
+        )
+        refusals = dict(zip(REASONS, record["refusals"].tolist(), strict=True))
         counts = {
             key: {name: Count(int(n), rates.get(f"{key}.{name}")) for name, n in zip(names, state[key], strict=True)}
             for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS))
         }
         return {
             "mode": mode.name,
-            "estop_latched": bool(state["emergency_stop"][0]),
+            "estop_latched": mode == Mode.ESTOP,
             "command_age": max(0.0, age) if by_setpoint and running else None,
             "observation_age": max(0.0, seen) if running else None,
             "dimensions": tuple(
-                Dimension(name, None if requested is None else requested[i], applied, float(measured))
+                Dimension(name, None if requested is None else requested[i], applied, measured)
                 for i, (name, applied, measured) in enumerate(values)
             ),
             **counts,
             "refusals": {name: n for name, n in refusals.items() if n and name != Reason.ACCEPTED.name},
             "goal": goal and {**asdict(goal), "phase": goal.phase.name},
-            "pose": dict(zip(POSE, state["odometry"][0].tolist(), strict=False)),
+            "pose": dict(zip(POSE, record["odometry"].tolist(), strict=True))
+            if self._block.about.get("drives")
+            else {},
         }
 
     def _rates(self, now: int, words: Any, state: Any) -> dict[str, float]:
@@ -202,7 +207,7 @@ class Sampler:
             return {}
         counts = {
             "executed": int(state["executed"]),
-            "setpoints": int(state["setpoints"]),
+            "setpoints": int(state["state"]["setpoints_taken"]),
             "frames": int(words[Word.RECORDER_FRAMES]),
         }
         for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS)):
@@ -223,8 +228,6 @@ class Sampler:
         return rates
 
     def _read_spreads(self) -> tuple[Spread | None, Spread | None]:
-        if self._statistics is None:
-            return None, None
         try:
             view = TimingStatistics.view(self._statistics)
         except ConfigError:  # the process has not begun to count, or begins anew at this very moment

@@ -4,14 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.realtime.frame_reader import Boundary
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport
-from bhd_lerobot.robots.host.state import raised
+from bhd_lerobot.robots.host.state import command_age_ns, raised
 
 
 def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
@@ -19,7 +18,7 @@ def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
 
     Args:
         mirror: a host like the one that published it.
-        state: a record of `state_dtype`.
+        state: a record of `published_dtype`.
         seen_ns: when it is observed, monotonic [ns].
         origin_ns: when the episode began, monotonic [ns].
     """
@@ -34,7 +33,7 @@ def report_of(
     before: Boundary,
     after: Boundary,
     *,
-    requested: NDArray[np.float64],
+    requested: str,
     truth: Callable[[], Any],
     origin_ns: int,
 ) -> FrameReport:
@@ -44,28 +43,30 @@ def report_of(
         mirror: a host like the one that published them.
         before: the boundary that it begins with.
         after: the boundary that it ends with.
-        requested: what was requested by its end, as a command of the cerebellum, shape (1, width).
+        requested: the field of the record that says what was requested by its end.
         truth: returns what a task judges by at its end.
         origin_ns: when the episode began, monotonic [ns].
     """
     begun, end = before.state, after.state
     limits, watchdog = raised(begun, end)
+    state, cerebellum = end["state"], mirror.cerebellum
+    command, asked = (state[name][None, : cerebellum.width] for name in ("command", requested))
     columns = {
-        keys.COMMAND_AGE: np.array([int(end["command_age_ns"])]) / NANOSECONDS,
-        keys.EFFORT: end["joint_efforts"].copy(),
+        keys.COMMAND_AGE: np.array([command_age_ns(end)]) / NANOSECONDS,
+        keys.EFFORT: state["torque"][None, : cerebellum.controller.joints].copy(),
         keys.LATENESS: np.array([after.lateness_ns / NANOSECONDS]),
         keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),
         keys.SKIPPED: np.array([int(end["skipped"] - begun["skipped"])]),
     }
     if keys.WRENCH in mirror.columns:
-        columns[keys.WRENCH] = end["contact_wrench"].copy()
+        columns[keys.WRENCH] = state["wrench"][None].copy()
     return FrameReport(
-        applied=mirror.to_action(end["command"]),
-        requested=mirror.to_action(requested),
+        applied=mirror.to_action(command),
+        requested=mirror.to_action(asked),
         sent=SendResult(np.zeros(1, np.int8)),
         limits=np.array([limits]),
         watchdog=np.array([watchdog]),
-        mode=end["mode"].copy(),
+        mode=np.array([state["mode"]]),
         truth=truth,
         columns=columns,
         number=before.frame,

@@ -109,12 +109,9 @@ class Host(ABC):
         """Return the goal that brings a robot without a world to the start of a scene; None if a person does that."""
         return None
 
-    def show(self, state: Any) -> None:
-        """Take over what the process of a robot on the wall clock published, a record of `state_dtype`."""
-        self.cerebellum.reading.position[:] = state["joint_positions"]
-        self.cerebellum.reading.velocity[:] = state["joint_velocities"]
-        self.cerebellum.command[:] = state["command"]
-        self.cerebellum.mode[:] = state["mode"]
+    def show(self, row: Any) -> None:
+        """Take over what the process of a robot on the wall clock published beside its record."""
+        return
 
     def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return commands of the cerebellum, shape (n, width), in the space of the actions, shape (n, actions)."""

@@ -10,19 +10,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import LiveLayout, Word
-from bhd_lerobot.realtime.sections import BrainSide, section_sizes
-from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec
-from bhd_lerobot.robots.host.state import state_dtype
+from bhd_lerobot.robots.host.state import published_dtype
+
+if TYPE_CHECKING:  # planning takes 100 MB, and a base plans nothing
+    pass
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
@@ -30,6 +32,7 @@ _ANSWER_S = 30.0  # that it may take to place a scene
 _HEAD_START_S = 0.02  # from the order to run to the first tick
 _END_S = 5.0  # that a process has to end in order before it is killed
 _FIFO = 256
+_REST_S = 0.002  # between two checks of the planner for a request
 
 
 class LiveLink:
@@ -37,7 +40,7 @@ class LiveLink:
 
     Attributes:
         block: what both processes share.
-        bridge_side: this process's ends of the queues for requests and goals.
+        planner: plans goals, on a thread; None for a robot that takes none.
         grants: what the real-time process was granted or refused, as plain values.
 
     Args:
@@ -47,12 +50,19 @@ class LiveLink:
     def __init__(self, mirror: Host, config: Any, name: str) -> None:
         realtime: RealtimeConfig = config.realtime
         rates = mirror.rates
+        goals = getattr(mirror.cerebellum.controller, "goals", None)
+        dof, plans = 0 if mirror.body.arm is None else len(mirror.body.arm.chain.joints), 0
+        if goals is not None:
+            from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
+
+            plans = PlanningLink.nbytes(dof, rates.control_hz)
         layout = LiveLayout(
-            mirror.cerebellum.width,
-            state_dtype(mirror),
-            _FIFO,
+            published_dtype(mirror),
             max(64, math.ceil(realtime.buffer_s * rates.control_hz) + 2),
-            {**section_sizes(mirror.cerebellum), "statistics": TimingStatistics.nbytes},
+            mirror.cerebellum.width,
+            _FIFO,
+            dof,
+            plans,
         )
         about = {
             "robot": config.type,
@@ -61,6 +71,7 @@ class LiveLink:
             "actions": list(mirror.action_names),
             "commands": list(mirror.body.limits.names),
             "observations": list(mirror.observation_names),
+            "drives": mirror.body.drive is not None,
             "brain_pid": os.getpid(),
         }
         self.grants: list[dict[str, Any]] = []
@@ -69,7 +80,12 @@ class LiveLink:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
-        self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
+        self.planner: PlanServer | None = None
+        if goals is not None:
+            self.planner = PlanServer(self.block.section("plan"), goals.planner)
+            pause = partial(time.sleep, _REST_S)
+            plan = threading.Thread(target=self.planner.serve, args=(self._stop.is_set, pause), daemon=True)
+            self._threads.append(plan)
         ours, theirs = socket.socketpair()
         self._pipe = Connection(ours.detach())
         try:
@@ -92,9 +108,6 @@ class LiveLink:
         self._pipe.send(spec)
         self.block.show_life(Word.BRAIN_ALIVE)
         self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
-        serve = self.bridge_side.serve
-        if serve is not None:
-            self._threads.append(threading.Thread(target=serve, args=(self._stop.is_set,), daemon=True))
         for thread in self._threads:
             thread.start()
         self.about = self._answer("ready", _START_S)

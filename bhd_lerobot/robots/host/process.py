@@ -32,7 +32,7 @@ from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
-from bhd_lerobot.realtime.sections import cerebellum_side, planning_link
+from bhd_lerobot.realtime.requests import RequestServer
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant
 from bhd_lerobot.robots.host.host import Host
@@ -109,15 +109,18 @@ class LiveProcess:
         self._connection = connection
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
-        dof = len(spec.body.arm.chain.joints) if spec.body.arm else 0
-        planning = planning_link(self._block, dof, spec.rates.control_hz)
+        planning: Planning | None = None
+        if len(plans := self._block.section("plan")) and spec.body.arm is not None:
+            from bhd_lerobot.realtime.planning_link import PlanningLink
+
+            planning = PlanningLink(plans, len(spec.body.arm.chain.joints), spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
         if self._plant is not None:
             self._plant.open()
         self._host: Host = spec.make_host(self._plant, planning=planning)
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
-        self._serve_bridge = cerebellum_side(self._block, cerebellum)
+        self._requests = RequestServer(cerebellum, self._block.requests, self._block.events)
         self._publisher = StatePublisher(
             self._host, self._block.ring, age_ns=self._age_ns if self._plant else None, problem=self._problem
         )
@@ -183,7 +186,7 @@ class LiveProcess:
         for tick in range(self._warm_up_ticks):
             self._host.cerebellum.stamp_origin_ns = time.monotonic_ns() - tick * self._loop.period_ns
             self._host.cerebellum.tick(tick * self._loop.period_ns)
-            self._serve_bridge(0)
+            self._requests.serve(0)
             self._advance(1)
             self._publisher.publish(Slot(tick, 0, 0, 0), 0, 0, grid)
             self._statistics.add(0, 0, 0, 0)
@@ -211,7 +214,7 @@ class LiveProcess:
         return named or cerebellum.readings.silence or f"{cause} {plant.hint if cause and plant else ''}".rstrip(" .")
 
     def _serve(self, now_ns: int) -> None:
-        self._serve_bridge(now_ns)
+        self._requests.serve(time.monotonic_ns())  # they expire on the clock that both processes share
         if os.getppid() == self._parent:
             return
         # The brain's process has ended: come to rest (its watchdog sees to that, a real robot stops at once), then end.

@@ -76,7 +76,7 @@ class LiveHost:
         self.running = np.ones(1, np.bool_)
         self.link = LiveLink(mirror, mirror.config, name)
         self.clock = LiveClock(self.link, mirror.sensor_period_s)
-        self.bridge = LiveBridge(self.link.block, mirror.rates, self.link.bridge_side.client, self.link.wait)
+        self.bridge = mirror.bridge = LiveBridge(self.link.block, mirror.cerebellum, mirror.rates, self.link.wait)
         self._sender = CommandSender(self.bridge, mirror.to_setpoints)
         self._frame_ns = NANOSECONDS // self.rates.fps
         self._reader: FrameReader | None = None
@@ -88,6 +88,7 @@ class LiveHost:
     # --- the mirror --------------------------------------------------------------------------------------------------
 
     def _show(self, state: Any) -> None:
+        self.bridge.show(state)
         if self._shown is not state:
             self._shown = state
             self.mirror.show(state)
@@ -147,14 +148,13 @@ class LiveHost:
             self._go_to_start(goal)
             link.place(scenes[0], int(seeds[0]))
         initial = self.mirror.reset(ids, scenes, seeds)
-        self.bridge.begin()
         self._reader = None
         self._boundary, self._shown = None, None
         self.running[:] = True
         return initial
 
     def _go_to_start(self, goal: BrainCommand) -> None:
-        self.bridge.begin()
+        self.bridge.restart(np.zeros(1, np.intp))
         self.link.run()
         refusal = self.bridge.submit(goal)
         results = [] if refusal is None else [refusal]
@@ -240,7 +240,7 @@ class LiveHost:
             RealtimeError: a process has ended, or is stopped.
         """
         receipt = self.send(command)
-        applied = self.to_action(self.bridge.latest["command"])
+        applied = self.to_action(self.bridge.state().command)
         return ActionReport(sent=receipt.sent, refusals=receipt.refusals, mode=self.modes, applied=applied)
 
     def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
@@ -268,7 +268,7 @@ class LiveHost:
             self.mirror,
             before,
             after,
-            requested=end["command"] if isinstance(command, Goals) else end["requested"],
+            requested="command" if isinstance(command, Goals) else "requested",
             truth=partial(self._truth_at, end, end["touches"] > before.state["touches"]),
             origin_ns=self._origin,
         )
@@ -314,8 +314,7 @@ class LiveHost:
     @property
     def modes(self) -> NDArray[np.int8]:
         """The newest `Mode`, shape (1,)."""
-        mode: NDArray[np.int8] = self.bridge.latest["mode"].copy()
-        return mode
+        return self.bridge.state().mode
 
     # --- images ------------------------------------------------------------------------------------------------------
 

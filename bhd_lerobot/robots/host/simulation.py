@@ -147,10 +147,9 @@ class Simulation(Host):
         """Generalised positions, shape (n, nq), and velocities, shape (n, nv), live."""
         return self.world.qpos, self.world.qvel
 
-    def show(self, state: Any) -> None:
-        """Take over what the process of a robot on the wall clock published, a record of `state_dtype`."""
-        super().show(state)
-        self.restore_physics(0, state["physics"][0])
+    def show(self, row: Any) -> None:
+        """Take over what the process of a robot on the wall clock published beside its record."""
+        self.restore_physics(0, row["physics"][0])
 
     def restore_physics(self, sim: int, state: NDArray[np.float64]) -> None:
         """Put one robot into a recorded `physics_state`; sensors follow, the cerebellum is left alone."""

@@ -1,4 +1,4 @@
-"""What the real-time process publishes at every tick."""
+"""What the real-time process publishes at every tick: the record of the robot, and what else its readers need."""
 
 import time
 from collections.abc import Callable
@@ -7,72 +7,72 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.cerebellum import MOVING
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, write_feedback
+from bhd_lerobot.control.record import STATE
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.robots.host.host import Host
 
 LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
 
 _PROBLEM_BYTES = 400
-# The numbers that a state begins with, in the order in which they are written.
-_NUMBERS = (
-    *("tick", "segment", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
-    *("setpoints", "waiting", "command_age_ns", "sensed_ns", "oldest_ns"),
-)
+_NUMBERS = {
+    "tick": "number on the grid of its segment",
+    "segment": "number of the segment",
+    "now_ns": "the cerebellum's time of the tick [ns]",
+    "due_ns": "when the tick was due, monotonic [ns]",
+    "start_ns": "when it started, monotonic [ns]",
+    "ended_ns": "when the tick before it ended, monotonic [ns]",
+    "executed": "ticks executed so far in the segment",
+    "skipped": "ticks skipped so far",
+    "overruns": "ticks so far that ended after their successor was due",
+    "sensed_ns": "when the observation was read, monotonic [ns]",
+    "oldest_ns": "how much older the oldest reading in it was [ns]",
+}
 
 
-def state_dtype(host: Host) -> np.dtype:
-    """Return the dtype of the published states of one robot.
+def published(host: Host) -> dict[str, tuple[Any, tuple[int, ...], str]]:
+    """Return the table of what one robot publishes: type, shape and meaning by name.
 
-    Beside the fields of `CerebellumState`:
-
-    - ``tick``: number on the grid of its segment; ``segment``: number of the segment.
-    - ``due_ns``, ``start_ns``: when the tick was due and when it started, monotonic; ``ended_ns``: when the tick before
-      it ended.
-    - ``executed``, ``skipped``, ``overruns``: ticks so far in the segment.
-    - ``requested``, ``setpoints``: the setpoint taken last, and how many were taken; ``command_age_ns``: its age if it
-      is followed; ``waiting``: entries in the queue.
-    - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
-      `Reason`, and of the kinds of touches of the simulation. Limits are counted once a frame.
-    - ``feedback``: how far the goal is that is followed, once a frame.
-    - ``problem``: what is wrong in FAULT, in UTF-8, see `problem_of`.
-    - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
-      older the oldest reading in them was.
-    - ``physics``: the simulator's generalised positions and velocities; of no width without one.
+    What is counted is counted since the start of the segment; limits and watchdogs once a frame.
     """
-    cerebellum = host.cerebellum
-    own = vars(cerebellum.state(0))
     physics = sum(part.shape[1] for part in host.physics)
-    return np.dtype(
-        [
-            *((name, np.int64) for name in _NUMBERS),
-            *((name, value.dtype, value.shape) for name, value in own.items() if name != "stamp_ns"),
-            ("requested", np.float64, (1, cerebellum.width)),
-            ("limits", np.int64, (len(LIMITS),)),
-            ("watchdogs", np.int64, (len(WATCHDOGS),)),
-            ("refusals", np.int64, (len(Reason),)),
-            ("touches", np.int64, (len(host.touches),)),
-            ("observation", np.float64, (1, len(host.observation_names))),
-            ("physics", np.float64, (1, physics)),
-            ("feedback", FEEDBACK_DTYPE),
-            ("problem", f"S{_PROBLEM_BYTES}"),
-        ]
-    )
+    return {
+        "state": (STATE, (), "the record of the tick, see `bhd_lerobot.control.record`"),
+        **{name: (np.int64, (), meaning) for name, meaning in _NUMBERS.items()},
+        "limits": (np.int64, (len(LIMITS),), "how often each of `LIMITS` changed a command"),
+        "watchdogs": (np.int64, (len(WATCHDOGS),), "how often each of `WATCHDOGS` noticed something"),
+        "touches": (np.int64, (len(host.touches),), "ticks with a touch, by kind"),
+        "observation": (np.float64, (1, len(host.observation_names)), "the observation's floats"),
+        "physics": (np.float64, (1, physics), "the simulator's generalised positions and velocities"),
+        "feedback": (FEEDBACK_DTYPE, (), "how far the goal is that is followed, once a frame"),
+        "problem": (f"S{_PROBLEM_BYTES}", (), "what is wrong in FAULT, in UTF-8"),
+    }
 
 
-def problem_of(state: Any) -> str:
-    """Return what is wrong with a robot by its state, as text; empty if nothing is."""
-    return bytes(state["problem"]).decode(errors="ignore")
+def published_dtype(host: Host) -> np.dtype:
+    """Return the dtype of what one robot publishes."""
+    return np.dtype([(name, kind, shape) for name, (kind, shape, _) in published(host).items()], align=True)
+
+
+def command_age_ns(row: Any) -> int:
+    """Return how long before the tick the command in force was due [ns]; 0 for a robot that follows none."""
+    state = row["state"]
+    by_setpoint = state["mode"] == Mode.TRACKING and not state["by_goal"]
+    return int(row["now_ns"]) - int(state["due_ns"]) if by_setpoint else 0
+
+
+def problem_of(row: Any) -> str:
+    """Return what is wrong with a robot by what it published, as text; empty if nothing is."""
+    return bytes(row["problem"]).decode(errors="ignore")
 
 
 class StatePublisher:
     """Publishes the states of one robot, into a ring.
 
     Args:
-        ring: where they go, of dtype `state_dtype(host)`.
+        ring: where they go, of dtype `published_dtype(host)`.
         clock: monotonic time [ns].
         age_ns: how much older than the tick its newest reading is [ns]; not older if None.
         problem: what is wrong with the robot now, as text; called in FAULT.
@@ -88,17 +88,15 @@ class StatePublisher:
     ) -> None:
         self._clock, self._age_ns, self._problem = clock, age_ns, problem
         self._host, self._cerebellum, self._ring = host, host.cerebellum, ring
-        self._record = np.zeros(1, state_dtype(host))
-        # The one robot's values, as views: an index costs as much as a write.
-        self._field = {name: self._record[name][0] for name in self._record.dtype.names or ()}
-        self._state = self._record[0]
-        self._speed = np.zeros_like(host.cerebellum.reading.velocity)
-        self._numbers = np.frombuffer(self._record.data, np.int64, len(_NUMBERS))  # one write instead of thirteen
-        self._feedback = self._state["feedback"]
-        self._touches = np.zeros(len(host.touches), np.int64)
-        self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
+        self._record = record = np.zeros(1, published_dtype(host))
+        # Views, because an index costs as much as a write, and bytes, because numpy copies structures field by field.
+        self._row = record[0]
+        self._state, self._source = record.view(np.uint8)[: STATE.itemsize], self._cerebellum.states.view(np.uint8)
+        self._numbers = np.frombuffer(record.data, np.int64, len(_NUMBERS), record.dtype.fields["tick"][1])
+        self._observation, self._feedback = record["observation"][0], self._row["feedback"]
+        self._counted = {name: record[name][0] for name in ("limits", "watchdogs", "touches")}
         nq = host.physics[0].shape[1]
-        self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
+        self._physics = record["physics"][0, :, :nq], record["physics"][0, :, nq:]
         self._frame = host.rates.ticks_per_frame
         self._next_frame = 0
         self._was_faulty = False
@@ -108,7 +106,8 @@ class StatePublisher:
         """Begin a new segment."""
         self.segment = segment
         self._next_frame = 0
-        self._limits[:] = self._watchdogs[:] = self._touches[:] = 0
+        for counts in self._counted.values():
+            counts[:] = 0
 
     def publish(self, slot: Slot, start_ns: int, ended_ns: int, grid: TickGrid) -> None:
         """Publish the state at the end of a tick.
@@ -117,48 +116,37 @@ class StatePublisher:
             start_ns: when it started [ns].
             ended_ns: when its predecessor ended [ns].
         """
-        host, cerebellum, field = self._host, self._cerebellum, self._field
+        host, cerebellum = self._host, self._cerebellum
         is_new = self._count(slot)
         is_faulty = cerebellum.mode[0] == Mode.FAULT
         if is_faulty != self._was_faulty or (is_faulty and is_new):
             self._was_faulty = is_faulty
             self._record["problem"] = self._problem().encode()[:_PROBLEM_BYTES] if is_faulty else b""
-        controller, reading = cerebellum.controller, cerebellum.reading
-        field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
-        field["joint_efforts"][:] = cerebellum.efforts()
-        field["contact_wrench"][:], field["pressed"][:] = controller.contact_wrench, controller.pressed()
-        field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
-        field["odometry"][:] = controller.odometry()
-        field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
-        np.abs(reading.velocity, out=self._speed)
-        field["is_moving"][:] = np.count_nonzero(self._speed > MOVING) > 0
-        field["emergency_stop"][:] = cerebellum.mode == Mode.ESTOP
-        field["refusals"][:] = cerebellum.refusals[:, 0]
-        field["observation"][:], oldest = host.sense()
+        cerebellum.report()
+        self._state[:] = self._source
+        self._observation[:], oldest = host.sense()
         self._numbers[:] = (
             slot.index,
             self.segment,
+            slot.due_ns - grid.start_ns,
             slot.due_ns,
             start_ns,
             ended_ns,
             grid.executed,
             grid.skipped,
             grid.overruns,
-            cerebellum.setpoints_taken,
-            len(cerebellum.fifo),
-            cerebellum.command_age_of(0, slot.due_ns - grid.start_ns),
             # Before the first tick everything stands still: what is read then is so until that tick.
             self._clock() if slot.index >= 0 else slot.due_ns,
             (host.tick - int(oldest[0])) * grid.period_ns + (self._age_ns() if self._age_ns else 0),
         )
         self._physics[0][:], self._physics[1][:] = host.physics
-        self._ring.publish(self._state)
+        self._ring.publish(self._record)
 
     def restate(self) -> None:
         """Publish the last state once more, with what is known by now to be wrong."""
         if self._was_faulty:
             self._record["problem"] = self._problem().encode()[:_PROBLEM_BYTES]
-            self._ring.publish(self._state)
+            self._ring.publish(self._record)
 
     def _count(self, slot: Slot) -> bool:
         """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame.
@@ -166,12 +154,9 @@ class StatePublisher:
         Returns:
             Whether it was the last tick of a frame.
         """
-        field = self._field
-        flags = [flag[0] for flag in self._host.touches]
-        if any(flags):
-            self._touches += flags
-            field["touches"][:] = self._touches
-            for flag in self._host.touches:
+        for kind, flag in enumerate(self._host.touches):
+            if flag[0]:
+                self._counted["touches"][kind] += 1
                 flag[0] = False
         # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
         frame = (slot.index + 1) // self._frame
@@ -180,14 +165,9 @@ class StatePublisher:
         self._next_frame = frame + 1
         write_feedback(self._feedback, self._cerebellum.controller.feedback(0))
         limits, watchdog = self._cerebellum.take_flags()
-        raised = int(limits[0])
-        if raised:
-            self._limits += [bool(raised & limit) for limit in LIMITS]
-            field["limits"][:] = self._limits
-        raised = int(watchdog[0])
-        if raised:
-            self._watchdogs += [bool(raised & watchdog) for watchdog in WATCHDOGS]
-            field["watchdogs"][:] = self._watchdogs
+        for name, raised, kinds in (("limits", limits, LIMITS), ("watchdogs", watchdog, WATCHDOGS)):
+            if flags := int(raised[0]):
+                self._counted[name] += [bool(flags & kind) for kind in kinds]
         return True
 
 

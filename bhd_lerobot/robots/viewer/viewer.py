@@ -126,7 +126,7 @@ def _publish(simulation: Simulation) -> LiveBlock:
     physics = sum(part.shape[1] for part in simulation.physics)
     dtype = np.dtype([("physics", np.float64, (1, physics))])
     name = f"{simulation.config.type}-view-{os.getpid()}-{next(_numbers)}"
-    block = LiveLayout(1, dtype, 1, _STATES, {}).create(name, {})
+    block = LiveLayout(dtype, _STATES).create(name, {})
     record = np.zeros((), dtype)
 
     def publish(ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:

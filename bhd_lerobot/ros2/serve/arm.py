@@ -39,7 +39,7 @@ class ArmTopics(Topics):
         self._host, self._counts, self._view, self._rate_hz = host, counts, view, joint_states_hz
         self._names = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._count = len(self._names)
-        self._command: NDArray[np.float64] = host.bridge.latest["command"].copy()  # joints, then the gripper
+        self._command: NDArray[np.float64] = host.bridge.state().command  # joints, then the gripper
         self._motion: _Motion | None = None  # what is followed
         self._next: tuple[Any, int] | None = None  # the trajectory that takes its place, and when [ns]
         self._period_ns = NANOSECONDS // host.rates.fps
@@ -78,18 +78,18 @@ class ArmTopics(Topics):
         self._motion = self._next = None
 
     def _publish(self, state: State) -> None:
-        record, count = state.record, self._count
+        robot, count = state.robot, self._count
         fields = {
             "header": header(state.stamps, "base_link"),
             "name": self._names,
-            "position": record["joint_positions"][:, :count],
-            "velocity": record["joint_velocities"][:, :count],
-            "effort": record["joint_efforts"][:, :count],
+            "position": robot.joint_positions[:, :count],
+            "velocity": robot.joint_velocities[:, :count],
+            "effort": robot.joint_efforts[:, :count],
         }
         self._joint_states.send(encode(JOINTS, fields, 1)[0])
 
     def _publish_transforms(self, state: State) -> None:
-        angles = state.record["joint_positions"][0]
+        angles = state.robot.joint_positions[0]
         motion = views.Motion({name: angles[k : k + 1] for k, name in enumerate(self._names)})
         frames = Frames(0, np.zeros(1, np.int64), state.stamps)
         for message in views.moving_transforms(self._view, frames, motion):
@@ -121,7 +121,7 @@ class ArmTopics(Topics):
         return False
 
     def _trajectory(self, message: Any, passed_ns: int) -> JointTrajectory:
-        start = self._host.bridge.latest["command"][0, : self._count]
+        start = self._host.bridge.state().command[0, : self._count]
         return JointTrajectory(message, self._names, start, max(0, passed_ns) / NANOSECONDS)
 
     def _move(self, message: Any) -> bool:
@@ -135,7 +135,7 @@ class ArmTopics(Topics):
     def _grip(self, message: Any) -> bool:
         if len(message.data) != 1:
             return self._refuse(ur.GRIPPER_TOPIC, f"{len(message.data)} values; it takes the opening [m] alone")
-        command = self._command if self._motion else self._host.bridge.latest["command"]
+        command = self._command if self._motion else self._host.bridge.state().command
         if is_taken := self._send(ur.GRIPPER_TOPIC, command[0, : self._count], message.data[0]):
             self._motion = self._motion or _Motion(ur.GRIPPER_TOPIC)
         return is_taken
@@ -153,10 +153,10 @@ class ArmTopics(Topics):
 
     def poll(self, now_ns: int) -> int:
         """Send the present setpoint of what is followed; return when the next one is due [ns]."""
-        record = self._host.bridge.latest
+        robot = self._host.bridge.state()
         if self._next is not None:
             message, start_ns = self._next
-            if mode_reason(Mode(int(record["mode"][0]))) != Reason.ACCEPTED:
+            if mode_reason(Mode(int(robot.mode[0]))) != Reason.ACCEPTED:
                 self._next = None
                 self._counts.add(f"{ur.TRAJECTORY_TOPIC}: the arm was stopped before the trajectory's start")
             elif now_ns >= start_ns:
@@ -173,7 +173,7 @@ class ArmTopics(Topics):
             if not self._send(motion.topic, joints):
                 self._motion = None
                 return following_ns
-            off = np.abs(record["command"] - self._command)[0]
+            off = np.abs(robot.command - self._command)[0]
             if motion.is_over(now_ns, off):
                 self._motion = None
                 if off[: self._count].max() > _REACHED:

@@ -108,9 +108,9 @@ class TrajectoryController(Topics):
         return self._inputs
 
     def _publish(self, state: State) -> None:
-        count, record = len(self._joints), state.record
-        wanted, measured = record["command"][:, :count], record["joint_positions"][:, :count]
-        speeds = record["joint_velocities"][:, :count]
+        count, robot = len(self._joints), state.robot
+        wanted, measured = robot.command[:, :count], robot.joint_positions[:, :count]
+        speeds = robot.joint_velocities[:, :count]
         points = {
             "reference": {"positions": wanted},
             "feedback": {"positions": measured, "velocities": speeds},

@@ -66,13 +66,12 @@ class BaseTopics(Topics):
         return [Output(NODE_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
-        record, stamps = state.record, state.stamps
+        robot, observation, stamps = state.robot, state.row["observation"], state.stamps
         frames = Frames(0, np.zeros(1, np.int64), stamps)
-        twist = record["observation"][:, :2]
-        moved = np.concatenate([twist, record["odometry"]], axis=1)
-        angles, speeds = record["joint_positions"], record["joint_velocities"] * self._drive.wheel_radius
+        moved = np.concatenate([observation[:, :2], robot.odometry], axis=1)
+        angles, speeds = robot.joint_positions, robot.joint_velocities * self._drive.wheel_radius
         self._odometry.send(self._odometry_part.encode(frames, moved)[0])
-        self._imu.send(self._gyro_part.encode(frames, record["observation"][:, self._gyro])[0])
+        self._imu.send(self._gyro_part.encode(frames, observation[:, self._gyro])[0])
         self._joints.send(self._wheel_part.encode(frames, np.concatenate([angles, speeds], axis=1))[0])
         battery = {
             "header": header(stamps),
@@ -91,11 +90,11 @@ class BaseTopics(Topics):
         if now_ns < self._scan_due_ns:
             return self._scan_due_ns
         state = State.of(self._host)
-        taken = int(state.record["sensed_ns"] - state.record["oldest_ns"])
+        taken = int(state.row["sensed_ns"] - state.row["oldest_ns"])
         if taken - self._scanned_ns > self._scan_period_ns // 2:
             self._scanned_ns = taken
-            stamps = state.stamps - int(state.record["oldest_ns"])
-            ranges = state.record["observation"][:, self._ranges]
+            stamps = state.stamps - int(state.row["oldest_ns"])
+            ranges = state.row["observation"][:, self._ranges]
             self._scan.send(self._scan_part.encode(Frames(0, np.zeros(1, np.int64), stamps), ranges)[0])
         self._scan_due_ns = max(now_ns + _POLL_NS, self._scanned_ns + self._scan_period_ns)
         return self._scan_due_ns

@@ -73,19 +73,19 @@ class Faults(Topics):
         return [Output(10.0, self._look)]
 
     def _look(self, state: State) -> None:
-        before, mode = self._before, Mode(int(state.record["mode"][0]))
-        is_new = mode in (Mode.FAULT, Mode.ESTOP) and mode != before["mode"][0]
+        before, mode = self._before, Mode(int(state.robot.mode[0]))
+        is_new = mode in (Mode.FAULT, Mode.ESTOP) and mode != before["state"]["mode"]
         self._looks = (self._looks + 1) * is_new
         if self._looks == 1:
             return  # a moment later the cause is known better: which topic is silent, which process has ended
-        self._before, self._looks = state.record.copy(), 0
+        self._before, self._looks = state.row.copy(), 0
         if not is_new:
             return
         if mode == Mode.FAULT and self._host.is_lost:
-            raise RealtimeError(f"{problem_of(state.record).removesuffix('.')}. The robot is stopped; start again.")
-        _, flags = raised(before, state.record)
+            raise RealtimeError(f"{problem_of(state.row).removesuffix('.')}. The robot is stopped; start again.")
+        _, flags = raised(before, state.row)
         noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in Watchdog(flags))
-        why = "the emergency stop was pressed" if mode == Mode.ESTOP else problem_of(state.record) or noticed
+        why = "the emergency stop was pressed" if mode == Mode.ESTOP else problem_of(state.row) or noticed
         self._report(f"{mode.name}: {why.removesuffix('.')}. A message on {RESET_TOPIC} lets the robot go on.")
 
 

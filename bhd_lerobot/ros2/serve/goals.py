@@ -153,7 +153,7 @@ class BaseGoals:
         return None if why is None else CommandResult(command.task_id, False, *why)
 
     def _odometry(self) -> NDArray[np.float64]:
-        pose: NDArray[np.float64] = self._host.bridge.latest["odometry"][0]
+        pose: NDArray[np.float64] = self._host.bridge.latest["state"]["odometry"]
         return pose
 
     def take_results(self) -> list[CommandResult]:
@@ -178,18 +178,18 @@ class BaseGoals:
         if now_ns < self._due_ns:
             return self._due_ns
         self._end_ns = self._end_ns or now_ns + round(self._command.timeout_s * NANOSECONDS)
-        record = self._host.bridge.latest
-        x, y, yaw = record["odometry"][0]
+        row = self._host.bridge.latest
+        observed, (x, y, yaw) = row["observation"], row["state"]["odometry"].tolist()
         way, turn = self._goal[:2] - (x, y), self._goal[2] - yaw
         cos, sin = math.cos(yaw), math.sin(yaw)
         ahead, left = cos * way[0] + sin * way[1], -sin * way[0] + cos * way[1]
-        speed, rate = record["observation"][0, :2]
+        speed, rate = observed[0, :2]
         off = abs(math.remainder(turn, math.tau))
         is_there = math.hypot(ahead, left) <= _TOLERANCE_M and off <= _TOLERANCE_RAD
         action = self._brain.act(
             Observation(
                 self._features.observation_names,  # type: ignore[arg-type]
-                record["observation"],
+                observed,
                 environment_state=np.array([[ahead, left, math.cos(turn), math.sin(turn)]]),
             )
         )

@@ -152,7 +152,7 @@ class InterfaceTopics(Topics):
 
     def _publish_diagnostics(self, state: State) -> None:
         """Publish what was refused and what the robot's limits have changed; a warning where it happened just now."""
-        more, self._limits = state.record["limits"] - self._limits, state.record["limits"].copy()
+        more, self._limits = state.row["limits"] - self._limits, state.row["limits"].copy()
         for limit, count in zip(LIMITS, more.tolist(), strict=True):
             if count > 0 and limit in _CUTS:
                 self._counts.note("cut", f"by the robot's limit of {str(limit.name).lower()}", count)
@@ -198,15 +198,15 @@ class InterfaceTopics(Topics):
             publisher.send(encode_known(msgtype, fields))
 
     def _publish(self, state: State) -> None:
-        record = state.record
+        robot = state.robot
         fields = {
             "header": header(state.stamps, self._frame),
             "stamp": stamp_tree(state.stamps),
-            "joint_positions": record["joint_positions"],
-            "joint_velocities": record["joint_velocities"],
-            "joint_efforts": record["joint_efforts"],
-            "is_moving": bool(record["is_moving"][0]),
-            "emergency_stop": bool(record["emergency_stop"][0]),
+            "joint_positions": robot.joint_positions,
+            "joint_velocities": robot.joint_velocities,
+            "joint_efforts": robot.joint_efforts,
+            "is_moving": bool(robot.is_moving[0]),
+            "emergency_stop": bool(robot.emergency_stop[0]),
         }
         for publisher, msgtype in self._states_out:
             publisher.send(encode_known(msgtype, fields))

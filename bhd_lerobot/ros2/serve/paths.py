@@ -35,7 +35,7 @@ class PlannedPath(Topics):
     """
 
     def __init__(self, host: LiveHost, node: Node, trajectory: Callable[[], JointTrajectory | None]) -> None:
-        planner, chain = host.link.bridge_side.planner, host.body.need(Arm).chain
+        planner, chain = host.link.planner, host.body.need(Arm).chain
         if planner is None:
             raise AssertionError(f"{host.config.type} is no arm.")
         self._host, self._planner, self._trajectory = host, planner, trajectory
@@ -84,7 +84,7 @@ class DrivenPath(Topics):
         return [Output(_DRIVEN_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
-        x, y, yaw = state.record["odometry"][0]
+        x, y, yaw = state.robot.odometry[0]
         [pose] = _poses(state.stamps, ODOM_FRAME, np.array([[x, y, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]]))
         self._poses.append(decode(POSE, pose))
         if self._path.receivers:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, CerebellumState, Reason, SendResult
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.graph import UNNAMED
@@ -23,18 +23,20 @@ class State:
     """What the cerebellum published last.
 
     Attributes:
-        record: it; see `bhd_lerobot.robots.host.state.state_dtype`.
+        row: it; see `bhd_lerobot.robots.host.state.published`.
         stamp_ns: when it was measured, on the wall clock [ns].
+        robot: what the robot's record reports.
     """
 
-    record: Any
+    row: Any
     stamp_ns: int
+    robot: CerebellumState
 
     @classmethod
     def of(cls, host: LiveHost) -> "State":
         """Return the newest state of a robot."""
-        record = host.bridge.latest
-        return cls(record, int(record["sensed_ns"]) + time.time_ns() - time.monotonic_ns())
+        row = host.bridge.latest
+        return cls(row, int(row["sensed_ns"]) + time.time_ns() - time.monotonic_ns(), host.bridge.reported(row))
 
     @property
     def stamps(self) -> NDArray[np.int64]:

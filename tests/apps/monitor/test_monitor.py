@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import os
 import pty
 import select
@@ -26,6 +27,7 @@ from bhd_lerobot.cli.monitor import main
 from bhd_lerobot.control.commands import Feedback, GoalPhase
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import write_feedback
+from bhd_lerobot.control.record import STATE
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime import shared_memory
@@ -35,7 +37,7 @@ from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
-from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, published_dtype
 from tests.realtime.test_shared_memory import files
 from tests.recording.support import options
 from tests.waiting import until
@@ -44,10 +46,15 @@ S = 1_000_000_000
 NAME = f"test-monitor-{os.getpid()}"
 
 
+def room(name: str) -> int:
+    """Return how many values a field of the record holds."""
+    return math.prod(STATE[name].shape)
+
+
 @functools.cache
 def published() -> np.dtype:
     config: Any = parse(RecordConfig, options(Path("unused"), robot__beams=4))
-    return state_dtype(make_simulation(config.robot))
+    return published_dtype(make_simulation(config.robot))
 
 
 class Robot:
@@ -55,8 +62,9 @@ class Robot:
 
     def __init__(self, name: str = NAME) -> None:
         dtype = published()
-        layout = LiveLayout(2, dtype, 16, 64, {"statistics": TimingStatistics.nbytes})
-        about = {"robot": "turtlebot3", "fps": 10, "control_hz": 200, "commands": ["x.vel", "theta.vel"]}
+        layout = LiveLayout(dtype, 64, 2, 16)
+        names = ["x.vel", "theta.vel"]
+        about = {"robot": "turtlebot3", "fps": 10, "control_hz": 200, "commands": names, "drives": True}
         self.block = layout.create(name, about)
         self.made = int(self.block.about["made_ns"])
         self.now = self.made + 100 * S
@@ -67,7 +75,7 @@ class Robot:
     def start(self, segment: int = 1) -> None:
         words = self.block.words
         words[Word.START], words[Word.SEGMENT], words[Word.PHASE] = self.now, segment, Phase.RUNNING
-        self.state["segment"], self.state["executed"], self.state["mode"] = segment, 0, Mode.HOLD
+        self.state["segment"], self.state["executed"], self.state["state"]["mode"] = segment, 0, Mode.HOLD
         self.statistics.reset()
         self.tick(0)
 
@@ -78,7 +86,11 @@ class Robot:
         state["executed"] += ticks
         state["due_ns"], state["start_ns"], state["sensed_ns"] = self.now, self.now, self.now
         for name, value in fields.items():
-            state[name] = value
+            if name in STATE.names and name != "limits":
+                values = np.ravel(value)
+                state["state"][name] = values[0] if values.size == 1 else np.pad(values, (0, room(name) - values.size))
+            else:
+                state[name] = value
         words[Word.EXECUTED] = state["executed"]
         self.block.ring.publish(state)
         for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE):
@@ -168,7 +180,7 @@ def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
     first = sampler.sample()
     assert (first.control_rate, first.frame_rate, first.command_rate) == (None, None, None)
     for _ in range(40):
-        robot.tick(25, setpoints=robot.state["setpoints"] + 1)
+        robot.tick(25, setpoints_taken=robot.state["state"]["setpoints_taken"] + 1)
         robot.block.words[Word.RECORDER_FRAMES] += 1
         shown = sampler.sample()
     assert shown.control_rate == pytest.approx(200)
@@ -211,8 +223,8 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     robot.tick(
         400,
         mode=Mode.TRACKING,
-        setpoints=7,
-        command_age_ns=30_000_000,
+        setpoints_taken=7,
+        now_ns=30_000_000,
         oldest_ns=150_000_000,
         requested=[[0.2, 1.0]],
         command=[[0.1, 0.5]],
@@ -249,7 +261,7 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
 
 def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot) -> None:
     write_feedback(robot.state["feedback"], Feedback("2-down", GoalPhase.EXECUTING, 0.25, 1.5, 0.01))
-    robot.tick(1, mode=Mode.TRACKING, setpoints=7)
+    robot.tick(1, mode=Mode.TRACKING, setpoints_taken=7)
     sampler, block = robot.sampler()
     shown = sampler.sample()
     assert shown.goal is not None
@@ -278,7 +290,7 @@ def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
 
 
 def test_before_anything_is_published_there_is_something_to_show() -> None:
-    layout = LiveLayout(2, np.dtype([("x", np.float64)]), 4, 4, {})
+    layout = LiveLayout(np.dtype([("x", np.float64)]), 4)
     made = layout.create(f"{NAME}-bare", {"robot": "ur5", "fps": 25, "control_hz": 500, "commands": []})
     block = LiveBlock.watch(made.name)
     shown = Sampler(block).sample()

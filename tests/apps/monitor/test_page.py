@@ -22,7 +22,7 @@ from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_simulation
-from bhd_lerobot.robots.host.state import state_dtype
+from bhd_lerobot.robots.host.state import published_dtype
 from tests.apps.browser import opened, wait_until
 from tests.recording.support import options
 
@@ -40,13 +40,14 @@ class Robot:
         config: Any = parse(RecordConfig, options(Path("unused"), **overrides)).robot
         self.simulation = make_simulation(config)
         self.has_world = has_world
-        dtype = state_dtype(self.simulation)
+        dtype = published_dtype(self.simulation)
         if not has_world:
             width = {"physics": (np.float64, (1, 0))}
             dtype = np.dtype([(name, *width.get(name, (dtype[name],))) for name in dtype.names or ()])
-        about = {"robot": config.type, "observations": list(self.simulation.observation_names)}
+        body, names = self.simulation.body, list(self.simulation.observation_names)
+        about = {"robot": config.type, "observations": names, "drives": body.drive is not None}
         name = f"test-page-{os.getpid()}-{next(NUMBERS)}"
-        self.block = LiveLayout(2, dtype, 4, 8, {}).create(name, about)
+        self.block = LiveLayout(dtype, 8).create(name, about)
         self.block.words[Word.PHASE] = Phase.RUNNING
         self.state = np.zeros((), dtype)
         self.scene: Any = type(self.simulation).start_scene(config)
@@ -56,18 +57,18 @@ class Robot:
         self.block.publish_scene(scene_to_json(self.scene if self.has_world else None))
 
     def publish(self, **fields: Any) -> None:
-        self.state["mode"], self.state["sensed_ns"] = Mode.TRACKING, time.monotonic_ns()
+        self.state["state"]["mode"], self.state["sensed_ns"] = Mode.TRACKING, time.monotonic_ns()
         self.state["observation"] = self.simulation.sense()[0]
         if self.has_world:
             self.state["physics"] = np.concatenate(self.simulation.physics, axis=1)
         for name, value in fields.items():
-            self.state[name] = value
+            (self.state["state"] if name == "odometry" else self.state)[name] = value
         self.block.ring.publish(self.state)
 
     def move(self) -> None:
         """Be elsewhere: an arm by a joint, a base by some metres."""
         self.simulation.world.qpos[0, 0] += 0.4
-        self.publish(**({} if self.has_world else {"odometry": self.state["odometry"] + [[3.0, 0.0, 0.0]]}))
+        self.publish(**({} if self.has_world else {"odometry": self.state["state"]["odometry"] + [3.0, 0.0, 0.0]}))
 
     def close(self) -> None:
         self.block.close()
@@ -154,7 +155,7 @@ def test_the_page_is_sent_where_the_robot_is_and_what_is_around_it(robot: Robot,
 def test_a_real_base_is_drawn_where_its_wheels_say(watched: Any) -> None:
     with closing(Robot(BASE, has_world=False)) as robot:
         robot.place()
-        robot.publish(odometry=[[1.0, 2.0, 0.5]])
+        robot.publish(odometry=[1.0, 2.0, 0.5])
         with served(watched(robot), 0) as address, closing(Stream(address)) as stream:
             first = stream.next()
             assert first["about"]["views"]["base"]["from"] == "odometry"

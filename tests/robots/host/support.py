@@ -92,10 +92,10 @@ class States:
         return self
 
     def first(self, wanted: Mode) -> int:
-        return next(k for k, state in enumerate(self.all) if state["mode"][0] == wanted)
+        return next(k for k, state in enumerate(self.all) if state["state"]["mode"] == wanted)
 
     def has(self, wanted: Mode) -> bool:
-        return any(state["mode"][0] == wanted for state in self.read().all)
+        return any(state["state"]["mode"] == wanted for state in self.read().all)
 
 
 def drive_on(name: str, options: dict[str, Any]) -> None:

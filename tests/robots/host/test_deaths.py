@@ -61,15 +61,15 @@ def test_a_brain_that_is_stopped_at_any_moment_leaves_nothing_half_sent(tmp_path
     with driving_child(name, tmp_path / "log", brain_timeout_s=0.1) as (brain, _):
         states = States(name)
         for _ in range(12):
-            until(lambda: states.read().all and states.all[-1]["mode"][0] == Mode.TRACKING, "the base drives")
+            until(lambda: states.read().all and states.all[-1]["state"]["mode"] == Mode.TRACKING, "the base drives")
             time.sleep(rng.uniform(0.0, 0.06))
             brain.send_signal(signal.SIGSTOP)
-            until(lambda: states.read().all[-1]["mode"][0] == Mode.HOLD, "the base holds")
+            until(lambda: states.read().all[-1]["state"]["mode"] == Mode.HOLD, "the base holds")
             brain.send_signal(signal.SIGCONT)
         last = states.read().all[-1]
         assert not any(watchdog_count(last, one) for one in (Watchdog.GUARD, Watchdog.PLANT, Watchdog.BLOCKED))
-        assert not any(state["mode"][0] in (Mode.FAULT, Mode.ESTOP) for state in states.all)
-        assert all(abs(state["command"][0, 0]) <= 0.2 + 1e-9 for state in states.all)
+        assert not any(state["state"]["mode"] in (Mode.FAULT, Mode.ESTOP) for state in states.all)
+        assert all(abs(state["state"]["command"][0]) <= 0.2 + 1e-9 for state in states.all)
         states.block.close()
 
 
@@ -90,13 +90,13 @@ def expect_exact_timeout(states: States, word: Word) -> None:
     assert int(stopped["executed"]) == int(before["executed"]) + 1  # no state between them was lost
     assert int(stopped["start_ns"]) - alive > TIMEOUT_S * 1e9
     assert int(before["start_ns"]) - alive <= TIMEOUT_S * 1e9
-    assert before["mode"][0] == Mode.TRACKING
+    assert before["state"]["mode"] == Mode.TRACKING
     # From there on it only slows down, and then holds.
     rest = states.all[first:]
-    speeds = [float(state["command"][0, 0]) for state in rest if state["mode"][0] == Mode.STOPPING]
+    speeds = [float(state["state"]["command"][0]) for state in rest if state["state"]["mode"] == Mode.STOPPING]
     assert speeds == sorted(speeds, reverse=True)
     hold = states.first(Mode.HOLD)
-    assert states.all[hold]["command"].tolist() == [[0.0, 0.0]]
+    assert states.all[hold]["state"]["command"][:2].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("buffer_s", [0.3, 10.0])

@@ -164,7 +164,7 @@ def turn(robot: UR5, name: str, by: float) -> None:
 def expect_no_jump(states: States, robot: UR5) -> None:
     """The joints moved no further than their limits allow, with a tenth for the servos' overshoot."""
     ticks = np.diff([int(state["tick"]) for state in states.read().all])
-    positions = np.array([state["joint_positions"][0] for state in states.all])
+    positions = np.array([state["state"]["position"][:7] for state in states.all])
     assert np.isfinite(positions).all()
     limits = robot.host.body.limits  # type: ignore[union-attr]
     most = 1.1 * np.array(limits.velocity[:6]) / HZ * ticks[:, None]
@@ -193,7 +193,7 @@ def test_a_cerebellum_that_was_away_does_not_catch_up_at_the_wire(arm: tuple[UR5
     time.sleep(AWAY_S)
     os.kill(pid, signal.SIGCONT)
     until(robot.host.bridge.take_results, "the goal ends")
-    commands = np.array([state["command"][0] for state in states.read().all])
+    commands = np.array([state["state"]["command"][:7] for state in states.read().all])
     skipped = np.diff([int(state["skipped"]) for state in states.all])
     assert skipped.max() > AWAY_S * HZ / 2  # it was away
     limits = robot.host.body.limits  # type: ignore[union-attr]
@@ -223,7 +223,7 @@ def test_no_press_around_a_reset_is_lost(arm: tuple[UR5, States], tmp_path: Path
     presses = json.loads((tmp_path / "presses").read_text())
     until(lambda: states.read().all[-1]["start_ns"] > presses[-1][1], "a tick after the last press")
     starts = np.array([int(state["start_ns"]) for state in states.all])
-    stopped = [bool(state["emergency_stop"][0]) for state in states.all]
+    stopped = [state["state"]["mode"] == Mode.ESTOP for state in states.all]
     for _, pressed_ns in presses:
         # The first tick that began after it found it: it is stopped at the end of that tick, or was before it, and has
         # been reset meanwhile.

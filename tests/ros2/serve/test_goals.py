@@ -32,8 +32,7 @@ class Base:
 
     @property
     def latest(self) -> dict[str, Any]:
-        odometry = self.simulation.cerebellum.controller.odometry()
-        return {"odometry": odometry, "observation": self.simulation.observe().state}
+        return {"state": self.simulation.cerebellum.states[0], "observation": self.simulation.observe().state}
 
     @property
     def estop_pressed(self) -> bool:
@@ -71,11 +70,11 @@ def test_goals_are_reached_within_the_tolerances(frame: str) -> None:
     assert goals.submit(goal("a", 1.0, 0.0, 1.0), frame) is None
     first = run(base, goals, 300)
     assert [(one.task_id, one.success) for one in first] == [("a", True)]
-    np.testing.assert_allclose(base.latest["odometry"][0], [1.0, 0.0, 1.0], atol=0.12)
+    np.testing.assert_allclose(base.latest["state"]["odometry"], [1.0, 0.0, 1.0], atol=0.12)
     assert goals.submit(goal("b", 0.3, 0.0, 0.5), frame) is None
     assert [(one.task_id, one.success) for one in run(base, goals, 300)] == [("b", True)]
     expected = [0.3, 0.0, 0.5] if frame == "odom" else [1 + 0.3 * math.cos(1), 0.3 * math.sin(1), 1.5]
-    np.testing.assert_allclose(base.latest["odometry"][0], expected, atol=0.25)
+    np.testing.assert_allclose(base.latest["state"]["odometry"], expected, atol=0.25)
 
 
 def test_speed_is_limited() -> None:

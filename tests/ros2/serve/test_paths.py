@@ -49,7 +49,7 @@ class Robot:
     def __init__(self) -> None:
         self.planner = SimpleNamespace(newest=None)
         self.phase: GoalPhase | None = None
-        self.link = SimpleNamespace(bridge_side=SimpleNamespace(planner=self.planner))
+        self.link = SimpleNamespace(planner=self.planner)
         self.bridge = self
 
     def feedback(self) -> Feedback | None:
@@ -75,7 +75,7 @@ def plan(command: BrainCommand) -> Trajectory:
     return made.trajectory
 
 
-STATE = State(None, 1_500_000_000)
+STATE = State(None, 1_500_000_000, None)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,8 @@ def test_the_path_of_a_base_is_that_of_the_last_minute_and_is_made_where_somebod
     for k in range(400):
         if k == 399:
             node.receivers = 1
-        output.publish(State({"odometry": np.array([[0.1 * k, -0.2 * k, 0.01 * k]])}, k * 200_000_000))
+        base: Any = SimpleNamespace(odometry=np.array([[0.1 * k, -0.2 * k, 0.01 * k]]))
+        output.publish(State(None, k * 200_000_000, base))
     [path] = node.sent[DRIVEN_TOPIC]
     assert path.header.frame_id == "odom"
     assert len(path.poses) == 300  # 60 s at 5 Hz
