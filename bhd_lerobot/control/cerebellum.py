@@ -23,7 +23,7 @@ from bhd_lerobot.control.messages import (
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
-from bhd_lerobot.control.record import JOINTS, new_states, put
+from bhd_lerobot.control.record import JOINTS, command_age_ns, new_states, put
 from bhd_lerobot.control.tick import drop_all, judge_all, tick_arms, tick_bases, tick_springs
 from bhd_lerobot.errors import ConfigError
 
@@ -415,8 +415,8 @@ class Cerebellum:
 
     def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
         """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
-        by_setpoint = (self.mode == Mode.TRACKING) & ~self.states["by_goal"]
-        return np.where(by_setpoint, now_ns - self.states["due_ns"], 0)
+        ages: NDArray[np.int64] = command_age_ns(self.states, now_ns)
+        return ages
 
     def report(self) -> None:
         """Complete the records with what only their readers need."""

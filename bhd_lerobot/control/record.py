@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.kernels import record
-from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ConfigError
 
 JOINTS = 8
@@ -475,6 +475,12 @@ def new_springs(n: int) -> NDArray[Any]:
     springs = np.zeros(n, SPRING)
     springs["turn"][:, 0] = springs["is_braked"] = springs["is_still"] = springs["is_fresh"] = True
     return springs
+
+
+def command_age_ns(states: Any, now_ns: Any) -> Any:
+    """Return how long ago the commands in force were due [ns]; 0 for a robot that follows none."""
+    by_setpoint = (states["mode"] == Mode.TRACKING) & ~states["by_goal"]
+    return np.where(by_setpoint, now_ns - states["due_ns"], 0)
 
 
 def put(row: Any, field: str, values: Any) -> None:

@@ -6,13 +6,13 @@ The words are 64-bit integers, each written by one process (those that any may w
 import time
 from dataclasses import dataclass
 from enum import IntEnum
+from importlib.metadata import version
 from typing import Any, Self
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from bhd_lerobot import __version__
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.record import STATE
@@ -24,6 +24,7 @@ from bhd_lerobot.realtime.timing import TimingStatistics
 
 WORDS = 64
 _REQUESTS, _EVENTS = 16, 64
+_VERSION = version("lerobot_robot_bhd")
 _SCENE = np.dtype([("text", "S32768")])
 
 
@@ -122,7 +123,7 @@ class LiveLayout:
             "ring_capacity": self.ring_capacity,
             "state": npy.dtype_to_descr(self.state),
         }
-        about = {**about, "version": __version__, "made_ns": time.monotonic_ns(), "layout": described}
+        about = {**about, "version": _VERSION, "made_ns": time.monotonic_ns(), "layout": described}
         return LiveBlock(SharedBlock.create(name, sections, about))
 
 
@@ -154,7 +155,7 @@ class LiveBlock:
         if "state" in fields and fields["state"][0] != STATE:
             raise RealtimeError(
                 f"The robot {self.name!r} runs version {self.about.get('version')} of bhd_lerobot and this is version "
-                f"{__version__}, whose record is another. Run the same version on both sides."
+                f"{_VERSION}, whose record is another. Run the same version on both sides."
             )
         self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_LATCHED + 1])
         self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))

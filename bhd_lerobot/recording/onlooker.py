@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.control.record import command_age_ns
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.frame_reader import FrameReader
 from bhd_lerobot.realtime.timing import TimingStatistics
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport
-from bhd_lerobot.robots.host.state import command_age_ns
 from bhd_lerobot.tasks.task import Event
 
 _SILENCE_S = 2.0  # so long without a frame the loop is stopped, or has ended
@@ -106,7 +106,7 @@ class Onlooker:
         if record["mode"] != Mode.TRACKING:
             return False
         stands = self.body.drive is not None and not record["requested"].any()
-        return not (stands and command_age_ns(state))
+        return not (stands and command_age_ns(record, state["now_ns"]))
 
     # --- an episode, see `Robots` ------------------------------------------------------------------------------------
 
@@ -139,7 +139,7 @@ class Onlooker:
             before,
             after,
             # What was requested before a goal, or before the robot stopped by itself, is not what it follows.
-            requested="requested" if command_age_ns(state) else "command",
+            requested="requested" if command_age_ns(state["state"], state["now_ns"]) else "command",
             truth=lambda: event,
             origin_ns=self._origin_ns,
         )

@@ -9,10 +9,10 @@ from typing import Any
 
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import decode_feedback
+from bhd_lerobot.control.record import command_age_ns
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.timing import TimingStatistics
-from bhd_lerobot.robots.host.state import command_age_ns
 
 LIMITS = tuple(limit.name or "" for limit in Limit if limit)
 WATCHDOGS = tuple(watchdog.name or "" for watchdog in Watchdog if watchdog)
@@ -172,7 +172,7 @@ class Sampler:
         mode = Mode(int(record["mode"]))
         by_setpoint = mode == Mode.TRACKING and goal is None
         requested = record["requested"].tolist() if int(record["setpoints_taken"]) and goal is None else None
-        age = (command_age_ns(state) + now - int(state["due_ns"])) / NANOSECONDS
+        age = (int(command_age_ns(record, state["now_ns"])) + now - int(state["due_ns"])) / NANOSECONDS
         seen = (int(state["oldest_ns"]) + now - int(state["sensed_ns"])) / NANOSECONDS
         values = zip(
             self._block.about["commands"], record["command"].tolist(), record["measured"].tolist(), strict=False

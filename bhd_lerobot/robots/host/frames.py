@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.control.record import command_age_ns
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.realtime.frame_reader import Boundary
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Frame, FrameReport
-from bhd_lerobot.robots.host.state import command_age_ns, raised
+from bhd_lerobot.robots.host.state import raised
 
 
 def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
@@ -52,7 +53,7 @@ def report_of(
     state, cerebellum = end["state"], mirror.cerebellum
     command, asked = (state[name][None, : cerebellum.width] for name in ("command", requested))
     columns = {
-        keys.COMMAND_AGE: np.array([command_age_ns(end)]) / NANOSECONDS,
+        keys.COMMAND_AGE: np.array([command_age_ns(state, end["now_ns"])]) / NANOSECONDS,
         keys.EFFORT: state["torque"][None, : cerebellum.controller.joints].copy(),
         keys.LATENESS: np.array([after.lateness_ns / NANOSECONDS]),
         keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,8 @@ class LiveHost:
         self.running = np.ones(1, np.bool_)
         self.link = LiveLink(mirror, mirror.config, name)
         self.clock = LiveClock(self.link, mirror.sensor_period_s)
-        self.bridge = mirror.bridge = LiveBridge(self.link.block, mirror.cerebellum, mirror.rates, self.link.wait)
+        self.bridge = LiveBridge(self.link.block, mirror.cerebellum, mirror.rates, self.link.wait)
+        mirror.bridge = cast(Any, self.bridge)  # it begins episodes
         self._sender = CommandSender(self.bridge, mirror.to_setpoints)
         self._frame_ns = NANOSECONDS // self.rates.fps
         self._reader: FrameReader | None = None

@@ -56,13 +56,6 @@ def published_dtype(host: Host) -> np.dtype:
     return np.dtype([(name, kind, shape) for name, (kind, shape, _) in published(host).items()], align=True)
 
 
-def command_age_ns(row: Any) -> int:
-    """Return how long before the tick the command in force was due [ns]; 0 for a robot that follows none."""
-    state = row["state"]
-    by_setpoint = state["mode"] == Mode.TRACKING and not state["by_goal"]
-    return int(row["now_ns"]) - int(state["due_ns"]) if by_setpoint else 0
-
-
 def problem_of(row: Any) -> str:
     """Return what is wrong with a robot by what it published, as text; empty if nothing is."""
     return bytes(row["problem"]).decode(errors="ignore")
