@@ -18,7 +18,7 @@ from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
 from bhd_lerobot.realtime.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.robots.host.host import Host
-from bhd_lerobot.robots.host.realtime import LiveHost, make_live
+from bhd_lerobot.robots.host.realtime import make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator: a brain
@@ -48,7 +48,7 @@ class BhdRobot(Robot):
     def __init__(self, config: Any) -> None:
         super().__init__(config)
         self.config = config
-        self._host: Host | LiveHost | None = None
+        self._host: Host | None = None
         self._last_observation: dict[str, Any] | None = None
         self._results: list[CommandResult] = []
         self._estop_sources: list[tuple[Source, str, float]] = []
@@ -160,7 +160,7 @@ class BhdRobot(Robot):
         """Nothing to configure beyond the configuration."""
 
     @property
-    def host(self) -> Host | LiveHost:
+    def host(self) -> Host:
         """What moves the robot: a simulation in this process, or processes on the wall clock.
 
         Raises:

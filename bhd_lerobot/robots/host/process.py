@@ -69,9 +69,10 @@ class LiveSpec:
     def of(cls, host: Host, block: str) -> Self:
         """Return what runs a host like one of this process, with the block that its robot publishes in."""
         config: Any = host.config
+        kind = getattr(host, "runs", type(host))
         kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating, NetworkConfig)
         return cls(
-            host=f"{type(host).__module__}:{type(host).__qualname__}",
+            host=f"{kind.__module__}:{kind.__qualname__}",
             plant=config.plant,
             # Those that a simulation or a plant reads, and that need no class of LeRobot.
             values={key: value for key, value in vars(config).items() if isinstance(value, kinds)},

@@ -1,17 +1,12 @@
-"""A robot on the wall clock.
-
-Cerebellum and plant run in a process of their own. Here is a mirror: a host of the same kind that is put into
-published states, to compute the truth that tasks judge by and, if it is a simulation, to render images.
-"""
+"""A robot on the wall clock: cerebellum and plant run in a process of their own."""
 
 import itertools
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import Future
 from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +23,7 @@ from bhd_lerobot.robots.host.checked_plant import Unconnected, plant_class
 from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.link import LiveLink
-from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Deliver, Frame, FrameReport
+from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Frame, FrameReport
 from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of
@@ -49,70 +44,58 @@ class LiveClock:
         return TimingStatistics.view(self._link.block.section("statistics"))
 
 
-class LiveHost:
-    """One robot on the wall clock; see `Robots`.
+class LiveHost(Host):
+    """One robot on the wall clock: a host whose ticks another process runs; its record is the one that is published.
+
+    It never ticks itself. Put into what was published, it computes the truth that tasks judge by and, if it is a
+    simulation, renders images. `make_live` makes a class of it and of the host of a kind of robot.
 
     Attributes:
-        mirror: this process's image of the robot.
-        link: its real-time process.
+        runs: what the other process runs.
+        link: that process.
         bridge: how commands get to its cerebellum.
 
     Args:
-        mirror: a host of one robot: a simulation, or the host of a plant that is connected to nothing.
+        arguments: of that host, as are the options.
         name: name of the running robot, for `bhd-monitor`.
 
     Raises:
         RealtimeError: the processes could not be started, or real time is required and was refused.
     """
 
-    n = 1
+    runs: ClassVar[type[Host]]
+    bridge: LiveBridge  # type: ignore[assignment]
 
-    def __init__(self, mirror: Host, name: str) -> None:
-        self.mirror = mirror
-        self.config, self.rates, self.body, self.world = mirror.config, mirror.rates, mirror.body, mirror.world
-        self.knows, self.camera_shapes = mirror.knows, mirror.camera_shapes
-        self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
-        self.columns = mirror.columns
-        self.running = np.ones(1, np.bool_)
-        self.link = LiveLink(mirror, mirror.config, name)
-        self.clock = LiveClock(self.link, mirror.sensor_period_s)
-        self.bridge = LiveBridge(self.link.block, mirror.cerebellum, mirror.rates, self.link.wait)
-        mirror.bridge = cast(Any, self.bridge)  # it begins episodes
-        self._sender = CommandSender(self.bridge, mirror.to_setpoints)
+    def __init__(self, *arguments: Any, name: str, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.link = LiveLink(self, self.config, name)
+        self.clock = LiveClock(self.link, self.sensor_period_s)
+        self.bridge = LiveBridge(self.link.block, self.cerebellum, self.rates, self.link.wait)
+        self._sender = CommandSender(self.bridge, self.to_setpoints)
         self._frame_ns = NANOSECONDS // self.rates.fps
         self._reader: FrameReader | None = None
         self._boundary: Any = None  # the newest boundary of a frame that was taken
-        self._shown: Any = None  # the state that the mirror shows
+        self._shown: Any = None  # what was published last that this host shows
         self._watchdog = Watchdog(0)  # of the last frame
         self._origin = 0  # when the episode's first observation was taken, monotonic [ns]
-
-    # --- the mirror --------------------------------------------------------------------------------------------------
 
     def _show(self, state: Any) -> None:
         self.bridge.show(state)
         if self._shown is not state:
             self._shown = state
-            self.mirror.show(state)
+            self.show(state)
 
     def _truth_at(self, end: Any, touched: NDArray[np.bool_]) -> Any:
         self._show(end)
-        for flag, one in zip(self.mirror.touches, touched, strict=True):
+        for flag, one in zip(self.touches, touched, strict=True):
             flag[:] = one
-        return self.mirror.truth()
+        return self.runs.truth(self)
 
     def truth(self) -> Any:
         """Return what is true at the start of the present frame."""
         if self._shown is None and self._boundary is not None:
             self._show(self._boundary.state)
-        return self.mirror.truth()
-
-    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the robot was in recorded states, or observations, shape (frames, 7)."""
-        return self.mirror.track(states)
-
-    def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return commands of the cerebellum in the space of the actions."""
-        return self.mirror.to_action(command)
+        return self.runs.truth(self)
 
     @property
     def notes(self) -> list[str]:
@@ -122,15 +105,6 @@ class LiveHost:
             for grant in self.link.grants
             if not grant["granted"]
         ]
-
-    @property
-    def estop_pressed(self) -> bool:
-        """Whether the emergency stop is pressed, be it latched already or not."""
-        return self.bridge.estop_pressed
-
-    def estop(self) -> None:
-        """Press the emergency stop."""
-        self.bridge.estop()
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
@@ -144,14 +118,13 @@ class LiveHost:
         """
         link = self.link
         link.place(scenes[0], int(seeds[0]))
-        goal = self.mirror.start_goal(scenes[0]) if self.world is None else None
+        goal = self.start_goal(scenes[0]) if self.world is None else None
         if goal is not None:
             self._go_to_start(goal)
             link.place(scenes[0], int(seeds[0]))
-        initial = self.mirror.reset(ids, scenes, seeds)
+        initial = super().reset(ids, scenes, seeds)
         self._reader = None
         self._boundary, self._shown = None, None
-        self.running[:] = True
         return initial
 
     def _go_to_start(self, goal: BrainCommand) -> None:
@@ -184,7 +157,7 @@ class LiveHost:
     def stop(self, ids: NDArray[np.intp]) -> None:
         """End the episode: the loop stands."""
         if len(ids):
-            self.running[:] = False
+            super().stop(ids)
             self.link.pause()
 
     def observe(self) -> Frame:
@@ -216,13 +189,9 @@ class LiveHost:
         return state
 
     def _frame_of(self, state: Any, seen_ns: int) -> Frame:
-        return frame_of(self.mirror, state, seen_ns, self._origin)
+        return frame_of(self, state, seen_ns, self._origin)
 
     # --- frames ------------------------------------------------------------------------------------------------------
-
-    def step(self, command: Command) -> FrameReport:
-        """Send a command, let the present frame go by, and report it."""
-        return self._frame(self.send(command), command)
 
     def send(self, command: Command) -> Acceptance:
         """Send a command and return at once.
@@ -266,7 +235,7 @@ class LiveHost:
         """Report the frame between two boundaries."""
         end = after.state
         return report_of(
-            self.mirror,
+            self,
             before,
             after,
             requested="command" if isinstance(command, Goals) else "requested",
@@ -317,38 +286,29 @@ class LiveHost:
         """The newest `Mode`, shape (1,)."""
         return self.bridge.state().mode
 
-    # --- images ------------------------------------------------------------------------------------------------------
-
-    def render(self, sim: int, camera: str) -> NDArray[np.uint8]:
-        """Return what a camera sees in the state that the mirror shows, shape (height, width, 3)."""
-        return self.mirror.render(sim, camera)
-
-    def start_rendering(self) -> None:
-        """Get ready for `render_later`."""
-        self.mirror.start_rendering()
-
-    def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
-        """Return what a camera sees in the state that the mirror shows, as an image to come."""
-        return self.mirror.render_later(sim, camera, deliver)
-
     def close(self) -> None:
         """End the robot's process and free the renderers. May be called twice."""
-        self.mirror.close()
+        super().close()
         self.link.close()
 
 
+def _kind(simulation: type[Simulation], config: Any) -> tuple[Any, list[Any]]:
+    """Return the class of a host, and what it is made of: a simulation, or with `config.plant` the plant's host."""
+    if not config.plant:
+        return simulation, [config]
+    plant_class(config.plant)  # what cannot be imported is found out before a process is started
+    return simulation.host_class, [config, Unconnected()]
+
+
 def mirror_of(simulation: type[Simulation], config: Any) -> Host:
-    """Return the host that mirrors a robot on the wall clock: a simulation, or with `config.plant` the plant's host.
+    """Return a host like that of a robot on the wall clock, which never ticks.
 
     Raises:
         ConfigError: there is no such plant.
     """
-    kind: Any = simulation
-    if config.plant:
-        plant_class(config.plant)  # what cannot be imported is found out before a process is started
-        mirror: Host = kind.host_class(config, Unconnected())
-        return mirror
-    return kind(config)
+    kind, arguments = _kind(simulation, config)
+    mirror: Host = kind(*arguments)
+    return mirror
 
 
 def make_live(simulation: type[Simulation], config: Any, name: str | None) -> LiveHost:
@@ -364,8 +324,10 @@ def make_live(simulation: type[Simulation], config: Any, name: str | None) -> Li
         RealtimeError: its processes could not be started, or real time is required and was refused.
     """
     number = next(_nameless) if name is None else 0
-    mirror = mirror_of(simulation, config)
-    return LiveHost(mirror, name or f"{config.type}-{os.getpid()}{f'-{number}' if number else ''}")
+    kind, arguments = _kind(simulation, config)
+    made: Any = type(f"Live{kind.__name__}", (LiveHost, kind), {"runs": kind})
+    host: LiveHost = made(*arguments, name=name or f"{config.type}-{os.getpid()}{f'-{number}' if number else ''}")
+    return host
 
 
 _nameless = itertools.count()  # several robots of one process that have no id

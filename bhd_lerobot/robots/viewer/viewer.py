@@ -76,7 +76,7 @@ class Viewer:
         self._own: LiveBlock | None = None
         self._lockstep: Simulation | None = None
         if isinstance(robots, LiveHost):
-            mirror, block = cast(Simulation, robots.mirror), robots.link.block
+            mirror, block = cast(Simulation, robots), robots.link.block
         else:
             mirror = self._lockstep = cast(Simulation, robots)
             block = self._own = _publish(mirror)

@@ -102,7 +102,7 @@ def test_a_goal_is_accepted_gives_feedback_and_succeeds(arm: tuple[UR5, States])
     assert (ended.task_id, ended.code) == ("there", ResultCode.SUCCEEDED)
     assert progress == sorted(progress)
     assert 0 <= progress[0] < progress[-1] <= 1
-    position = robot.host.mirror.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
+    position = robot.host.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
     assert np.linalg.norm(position - TARGETS[0]) < 0.01
     until(lambda: mode(robot) == Mode.HOLD, "it holds")
 
