@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.kernels import kernel
+from bhd_lerobot.control.kernels import fence, kernel
 from bhd_lerobot.control.record import NEVER, QUEUE, WAITING
 from bhd_lerobot.errors import ConfigError
 
 _NEVER_DUE = np.iinfo(np.int64).min
+_MOST_DROPS = 1 << 32  # states that may have been overwritten since the last that was read
 _MOST_READS = 100  # a writer overwrites what is being read once in a great while, and never so many times in a row
 
 
@@ -79,6 +80,7 @@ class CommandFifo:
         slots = self._head[ids] % QUEUE
         self._sequence[ids, slots], self._due[ids, slots] = sequence, due_ns
         self._values[ids, slots], self._waits[ids, slots] = values[ids], True
+        fence()
         self._head[ids] += 1
         return has_room
 
@@ -87,6 +89,7 @@ class CommandFifo:
 def ends(queue: Any) -> tuple[int, int]:
     """Return the numbers of the oldest entry and of the next; garbage of another process empties the queue."""
     tail, head = queue.tail, queue.head
+    fence()
     # Compiled, the difference of two numbers may have the wrong sign.
     if not (tail <= head and 0 <= head - tail <= QUEUE):
         queue.tail = tail = head
@@ -159,6 +162,7 @@ class StateRing:
         if buffer is None:
             buffer = bytearray(self.nbytes(dtype, capacity))
         self._count = np.frombuffer(buffer, np.int64, 1)
+        self._published = len(self)
         slot = self._slot(dtype)
         self._guard = np.frombuffer(buffer, slot, capacity, offset=8)["guard"]
         # As bytes: numpy copies a structure field by field, and a record has a hundred of them.
@@ -177,16 +181,19 @@ class StateRing:
 
     def __len__(self) -> int:
         """Return the number of states published so far."""
-        return int(self._count[0])
+        return max(0, int(self._count[0]))
 
     def publish(self, state: NDArray) -> None:
         """Append a state: a structured array of shape () or a record of the ring's dtype."""
-        count = int(self._count[0])
-        slot = count % self.capacity
-        self._guard[slot] += 1
+        lap, slot = divmod(self._published, self.capacity)
+        self._guard[slot] = 2 * lap + 1
+        fence()
         self._rows[slot] = np.frombuffer(state, np.uint8)
-        self._guard[slot] += 1
-        self._count[0] = count + 1
+        fence()
+        self._guard[slot] = 2 * lap + 2
+        fence()
+        self._published += 1
+        self._count[0] = self._published
 
     def latest(self) -> NDArray | None:
         """Return a copy of the newest state, or None if there is none yet.
@@ -198,6 +205,7 @@ class StateRing:
             count = len(self)
             if count == 0:
                 return None
+            fence()
             state = self.copy(count - 1)
             if state is not None:
                 return state
@@ -213,7 +221,9 @@ class StateRing:
         complete = 2 * (number // self.capacity + 1)
         if int(self._guard[slot]) != complete:
             return None
+        fence()
         state = self._rows[slot].copy()
+        fence()
         return state.view(self.dtype)[0] if int(self._guard[slot]) == complete else None
 
 
@@ -234,7 +244,11 @@ class RingReader:
 
     def read(self) -> NDArray | None:
         """Return a copy of the next state, or None if none has been published since the last."""
-        while (published := len(self._ring)) > self._next:
+        while (published := len(self._ring)) != self._next:
+            if not 0 < published - self._next < _MOST_DROPS:
+                self._next = published  # a count that cannot be, because another process wrote garbage, or its end
+                return None
+            fence()
             number = self._next
             self._next += 1
             # The writer may be about to overwrite the oldest, so it is skipped.

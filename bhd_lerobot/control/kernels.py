@@ -7,6 +7,7 @@ runs as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are 
 import hashlib
 import math
 import os
+import platform
 import re
 import sys
 import tempfile
@@ -152,6 +153,71 @@ class Kernel[**P, R]:
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
+
+
+class Fence:
+    """Keeps the order of loads and stores: what is before it is seen, and done, before what is after it.
+
+    For memory that processes share without a lock. Not between a store and a later load. On x86 there is nothing to do;
+    other processors may let others see the counter that publishes a record before the record.
+
+    Attributes:
+        order: does it, outside of machine code.
+    """
+
+    def __init__(self, machine: str) -> None:
+        self.order: Callable[[], Any] = _nothing if machine.lower() in ("x86_64", "amd64") else self._first
+
+    def __call__(self) -> None:  # noqa: D102
+        self.order()
+
+    def _first(self) -> None:
+        self.order = native_fence()
+        self.order()
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The fence inside of machine code."""
+        from numba import njit, types
+        from numba.extending import intrinsic
+
+        @intrinsic
+        def fence(_: Any) -> Any:
+            def generate(context: Any, builder: Any, *_: Any) -> Any:
+                builder.fence("acq_rel")
+                return context.get_dummy_value()
+
+            return types.void(), generate
+
+        return njit(lambda: fence())  # type: ignore[call-arg]  # noqa: PLW0108 (numba needs a function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba takes it for inside of kernels."""
+        return self.compiled._numba_type_
+
+
+def _nothing() -> None:
+    return
+
+
+def native_fence() -> Callable[[], Any]:
+    """Return a fence as a function of machine code, whether numba compiles or not."""
+    import ctypes
+
+    from llvmlite import binding
+
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    module = binding.parse_assembly("define void @order() {\n  fence acq_rel\n  ret void\n}")
+    engine = binding.create_mcjit_compiler(module, binding.Target.from_default_triple().create_target_machine())
+    engine.finalize_object()
+    function: Any = ctypes.PYFUNCTYPE(None)(engine.get_function_address("order"))
+    function.engine = engine  # the code is freed with it
+    return function
+
+
+fence = Fence(platform.machine())
 
 
 def as_objects(array: Any) -> Any:

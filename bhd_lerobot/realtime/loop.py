@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.realtime.block import Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
@@ -96,6 +97,7 @@ class RealtimeLoop:
         grid = TickGrid(start, period, self.limits.most_misses)
         words[Word.EXECUTED : Word.CATCH_UP_LOST + 1] = 0
         words[Word.START] = self.cerebellum.stamp_origin_ns = start
+        fence()
         words[Word.SEGMENT] += 1
         words[Word.PHASE] = Phase.RUNNING
         ended = start

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.errors import ConfigError
 
 
@@ -54,7 +55,9 @@ class Mailbox:
         head = self._head.item()
         if head - self._tail.item() >= self.capacity:
             return False
+        fence()
         self._records[head % self.capacity] = record
+        fence()
         self._head[0] = head + 1
         return True
 
@@ -66,6 +69,8 @@ class Mailbox:
         if not 0 < head - tail <= self.capacity:
             self._tail[0] = head  # ends that cannot be, because another process wrote garbage
             return None
+        fence()
         record = self._records[tail % self.capacity].copy()
+        fence()
         self._tail[0] = tail + 1
         return record

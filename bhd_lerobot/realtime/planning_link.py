@@ -13,6 +13,7 @@ import numpy as np
 
 from bhd_lerobot.bodies.body import HELD, Capsule
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.motion.goal_codec import (
     MESSAGE_BYTES,
     decode_goal,
@@ -138,12 +139,14 @@ class PlanningLink:
         self._dropped[0] = self._number - 1
         request = self._request
         self._guard[0] += 1
+        fence()
         request["number"], request["start_tick"], request["block"] = self._number, start_tick, 1 - self._played
         rows = request["state"]
         rows[0], rows[1], rows[2] = state.position, state.velocity, state.acceleration
         request["has_opening"], request["opening"] = opening is not None, 0.0 if opening is None else opening
         request["held"] = 0.0 if held is None else (*held.start, *held.end, held.radius)
         write_goal(request["goal"], command)
+        fence()
         self._guard[0] += 1
         self._out = True
 
@@ -151,6 +154,7 @@ class PlanningLink:
         """Return the answer; the rows of a plan are the shared ones."""
         if not self._out or self._answered.item() != self._number:
             return None
+        fence()
         self._out = False
         answer = self._answer
         if answer["code"] != ResultCode.SUCCEEDED:
@@ -215,6 +219,7 @@ class PlanServer:
             used[:, 0], used[:, 1], used[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
             header["code"], header["rows"], header["target"] = ResultCode.SUCCEEDED, trajectory.ticks, answer.target
             self.newest = trajectory
+        fence()
         self._answered[0] = number
         return True
 
@@ -223,7 +228,9 @@ class PlanServer:
         guard = self._guard.item()
         if guard == self._seen_guard or guard % 2:
             return None
+        fence()
         request = self._header["request"].copy()
+        fence()
         if self._guard.item() != guard:
             return None
         self._seen_guard = guard

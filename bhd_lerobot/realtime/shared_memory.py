@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.errors import ConfigError, RealtimeError
 
 FOLDER = Path("/dev/shm")
@@ -34,9 +35,7 @@ _MAGIC = b"bhd-blk1"
 _ALIGNMENT = 64  # a cache line: no two sections share one
 _CHECK_S = 0.002  # it takes much less to find out whether a process holds a block
 _HEADER = 4096  # bytes for the description; it grows in pages
-# Aligned 64-bit stores become visible to other processes in program order on x86 alone; on other processors the
-# counters that guard an entry could be seen before the entry.
-_ORDERED = ("x86_64", "amd64", "i686")
+_MACHINES = ("x86_64", "amd64", "aarch64", "arm64")  # an aligned store of 64 bits is seen whole
 
 
 def check_platform(machine: str | None = None, system: str | None = None) -> None:
@@ -44,10 +43,10 @@ def check_platform(machine: str | None = None, system: str | None = None) -> Non
     machine, system = machine or platform.machine(), system or platform.system()
     if system != "Linux":
         raise RealtimeError(f"clock = 'realtime' needs Linux; this is {system}. Use clock = 'lockstep'.")
-    if machine.lower() not in _ORDERED:
+    if machine.lower() not in _MACHINES:
         raise RealtimeError(
-            f"clock = 'realtime' needs a processor that keeps the order of stores ({', '.join(_ORDERED)}); this is "
-            f"{machine}. Use clock = 'lockstep'."
+            f"clock = 'realtime' needs a 64-bit x86 or ARM processor ({', '.join(_MACHINES)}); this is {machine}. Use "
+            "clock = 'lockstep'."
         )
 
 
@@ -103,6 +102,7 @@ class SharedBlock:
             ) from error
         memory[8:16] = len(text).to_bytes(8, "little")
         memory[16 : 16 + len(text)] = text
+        fence()
         memory[0:8] = _MAGIC  # last: from here on it can be attached to
         return cls._opened(path, descriptor, memory)
 

@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.bodies.scenes import scene_to_json
+from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import LiveLayout, Word
@@ -134,6 +135,7 @@ class LiveLink:
         self._ask("run", start)
         self._running = True
         self._until(lambda: words[Word.SEGMENT] > segment, _ANSWER_S, "The loop did not start")
+        fence()
         return start
 
     _running = False
