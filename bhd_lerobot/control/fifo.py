@@ -189,7 +189,6 @@ class StateRing:
         self._guard[slot] = 2 * lap + 1
         fence()
         self._rows[slot] = np.frombuffer(state, np.uint8)
-        fence()
         self._guard[slot] = 2 * lap + 2
         fence()
         self._published += 1

@@ -55,7 +55,6 @@ class Mailbox:
         head = self._head.item()
         if head - self._tail.item() >= self.capacity:
             return False
-        fence()
         self._records[head % self.capacity] = record
         fence()
         self._head[0] = head + 1
