@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain, Limits
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.geometry import inverse_kinematics
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm, wrist_centre
 from bhd_lerobot.control.geometry.numeric_inverse import REACHED, NumericInverse
 from bhd_lerobot.errors import ConfigError
 
@@ -50,8 +50,8 @@ class IkResult:
 class ArmKinematics(ForwardKinematics):
     """Forward and inverse kinematics of an arm.
 
-    Poses are tool frames in the base frame, shape (..., 4, 4). The UR geometry is solved in closed form, every other
-    chain as `numeric_inverse` describes it.
+    Poses are tool frames in the base frame, shape (..., 4, 4). A chain whose axes lie as those of a UR is solved in
+    closed form, every other one as `numeric_inverse` describes it.
 
     Args:
         limits: limits of its commands, the joints' first.
@@ -67,7 +67,8 @@ class ArmKinematics(ForwardKinematics):
         self.collision = CollisionModel(chain)
         self.lower, self.upper = np.array(limits.lower[: self.dof]), np.array(limits.upper[: self.dof])
         self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
-        self._numeric = NumericInverse(self, self.lower, self.upper) if self.ur is None else None
+        self._closed = ClosedForm.of(self)
+        self._numeric = NumericInverse(self, self.lower, self.upper) if self._closed is None else None
 
     def solutions(self, pose: Array, posture: Array | None = None) -> Array:
         """Return postures that reach a pose, permitted or not, shape (..., k, dof); NaN for a branch that does not.
@@ -76,8 +77,8 @@ class ArmKinematics(ForwardKinematics):
             pose: shape (..., 4, 4); of a chain without a closed form (4, 4).
             posture: where the arm is [rad], shape (..., dof). What the pose leaves free stays as it is there.
         """
-        if self.ur is not None:
-            return inverse_kinematics.solutions(self.ur, pose, 0.0 if posture is None else posture[..., -1])
+        if self._closed is not None:
+            return self._closed.solutions(pose, 0.0 if posture is None else posture[..., -1])
         assert self._numeric is not None
         posture = np.clip(np.zeros(self.dof), self.lower, self.upper) if posture is None else posture
         *_, (found, _) = self._numeric.search(pose, posture)
@@ -261,18 +262,19 @@ class ArmKinematics(ForwardKinematics):
                 f"The tool comes no nearer to the pose than {short:.3g} m and {angle:.3g} rad. Move the pose towards "
                 "the base, or turn it."
             )
-        assert self.ur is not None
-        centre = inverse_kinematics.wrist_centre(self.ur, pose)
-        beside, least = float(np.hypot(centre[0], centre[1])), abs(self.ur.d4)
+        assert self._closed is not None
+        arm = self._closed.arm
+        centre = wrist_centre(arm, self._closed.inside(pose))
+        beside, least = float(np.hypot(centre[0], centre[1])), abs(arm.d4)
         if beside < least:
             return (
                 f"The wrist would be {beside:.3f} m from the base's axis; {least:.3f} m is the least. "
                 "Move the tool away from the axis."
             )
-        nearest = self.tool(inverse_kinematics.nearest(self.ur, pose, float(posture[5])))
+        nearest = self.tool(self._closed.nearest(pose, float(posture[5])))
         short = np.sqrt(np.square(nearest[:, :3, 3] - pose[:3, 3]).sum(axis=1)).min()
-        far = np.sqrt(np.square(centre - (0.0, 0.0, self.ur.d1)).sum())
-        where = "too far away: move it towards" if far > abs(self.ur.a2) else "too near: move it away from"
+        far = np.sqrt(np.square(centre - (0.0, 0.0, arm.d1)).sum())
+        where = "too far away: move it towards" if far > abs(arm.a2) else "too near: move it away from"
         return f"The arm ends {short:.3f} m short of the pose, which is {where} the base's axis, or turn it."
 
 

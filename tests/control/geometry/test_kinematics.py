@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import ArmChain, Placement
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.geometry.forward_kinematics import UrGeometry
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics, UrGeometry
+from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
@@ -227,6 +229,40 @@ def test_the_closed_form_is_for_one_geometry(change: dict) -> None:
     others = {"capsules": (), "disjoint": (), "min_distance": 0.0, "min_manipulability": 0.0}
     assert UrGeometry.of(ArmChain.from_dh(CHAIN.joints, **numbers, **others)) is not None
     assert UrGeometry.of(ArmChain.from_dh(CHAIN.joints, **numbers | change, **others)) is None
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("turned", [(), (0, 4), (2,), (1, 2, 3, 5)])
+def test_axes_that_lie_as_those_of_a_ur_have_the_closed_form(turned: tuple[int, ...]) -> None:
+    """As a model of another has them: other zeros, other directions, a base and a tool that are turned."""
+    rng = np.random.default_rng(7)
+    own = ForwardKinematics(CHAIN)
+    frames = own.frames(rng.uniform(-1, 1, 6))
+    pose = own.tool(rng.uniform(-1, 1, 6))  # of the base
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    axes = [pose @ frame @ (flip if k in turned else np.eye(4)) for k, frame in enumerate(frames[:6])]
+    spins = [np.block([[Rotation.from_euler("z", angle).as_matrix(), np.zeros((3, 1))], [np.eye(4)[3:]]])
+             for angle in rng.uniform(-3, 3, 6)]  # fmt: skip
+    axes = [axis @ spin for axis, spin in zip(axes, spins, strict=True)]
+    steps = [np.linalg.inv(one) @ other for one, other in zip(axes, (*axes[1:], pose @ frames[6]), strict=True)]
+    chain = dataclasses.replace(
+        CHAIN,
+        base=Placement.of(axes[0]),
+        links=tuple(map(Placement.of, steps)),
+        tool=Placement.of(own.tool(rng.uniform(-1, 1, 6))),
+    )
+    kinematics = ArmKinematics(chain, ARM.limits)
+    assert kinematics.ur is None
+    assert ClosedForm.of(kinematics) is not None
+    for q in MANY[:50]:
+        found = kinematics.solutions(kinematics.tool(q), q)
+        exists = np.isfinite(found).all(axis=1)
+        assert pose_error(kinematics.tool(found[exists]), kinematics.tool(q)).max() < 1e-8
+        assert apart(found[exists], q).min() < 1e-6
+        assert np.abs(found[exists]).max() <= math.pi + 1e-12
+    far = kinematics.tool(HOME)
+    far[:3, 3] += 5.0
+    assert re.search("too far away", kinematics.solve(far, HOME).message)
 
 
 @each_case(
