@@ -118,7 +118,8 @@ def _recognised(forward: ForwardKinematics) -> ClosedForm | None:
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (16, _DOF))
     if not np.abs(base @ own.tool(sign * q + offset) @ tool - forward.tool(q)).max() < _AGREES:
         return None
-    return ClosedForm(own.ur, np.linalg.inv(base), np.linalg.inv(tool), sign, offset)
+    into_base, into_tool = (np.asarray(np.linalg.inv(one), np.float64) for one in (base, tool))
+    return ClosedForm(own.ur, into_base, into_tool, sign, offset)
 
 
 def _meeting(one: Array, way: Array, other: Array, other_way: Array) -> Array:
@@ -153,7 +154,7 @@ def solutions(arm: UrGeometry, pose: Array, last: Array | float = 0.0) -> Array:
     return components_last(q.reshape(_DOF, BRANCHES, *q.shape[4:]).swapaxes(0, 1), 2)
 
 
-def nearest(arm: UrGeometry, pose: Array, last: float = 0.0) -> Array:
+def nearest(arm: UrGeometry, pose: Array, last: Array | float = 0.0) -> Array:
     """Return for each branch the posture with the elbow stretched or folded as far as it takes, shape (8, 6).
 
     Those that do not reach `pose`, of shape (4, 4), end where the arm ends on the way to it. Only for poses whose wrist
