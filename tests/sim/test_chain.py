@@ -67,6 +67,7 @@ def test_frames_and_jacobian_are_those_of_the_engine(joints: int, degree: bool, 
         mujoco.mj_jacSite(model, data, *jacobian, model.site("tool").id)
         mine = mount[:3, :3] @ forward.jacobian(q).reshape(2, 3, joints)
         np.testing.assert_allclose(mine, jacobian[:, :, :joints], atol=1e-12)
+        assert np.linalg.norm(forward.tool(q)[:3, 3]) < chain.reach
 
 
 def test_the_frames_of_the_ur5_are_its_own() -> None:

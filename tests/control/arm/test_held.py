@@ -1,10 +1,12 @@
 """When a gripper counts as holding something, and what it is taken to hold."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.body import HELD, Capsule
+from bhd_lerobot.bodies.body import HELD, Capsule, Placement
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.held import follow_gripper, held_capsule
@@ -93,3 +95,28 @@ def test_it_is_forgotten_when_the_gripper_opens_or_closes_without_it(opening: fl
     assert again.end[2] > first.end[2]  # taken from where the tool is now
     hand.controller.restart(np.zeros(1, np.intp))
     assert hand.run(0.085, 0.085) == {}
+
+
+def test_it_is_the_same_whatever_the_frame_of_the_flange_is() -> None:
+    """With its edges, which lie along the fingers' way."""
+    chain, at = ARM.arm.chain, posture(0.07, 0.4)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("xyz", (0.4, -1.2, 2.0)).as_matrix()
+    turned = replace(
+        chain,
+        links=(*chain.links[:-1], Placement.of(chain.links[-1].matrix() @ turn)),
+        tool=Placement.of(turn.T @ chain.tool.matrix()),
+        capsules=tuple(capsule for capsule in chain.capsules if capsule.frame < 6),
+        disjoint=(),
+    )
+    np.testing.assert_allclose(ForwardKinematics(turned).tool(at), FORWARD.tool(at), atol=1e-12)
+    state, arm = {"position": np.array([*at, 0.05])}, {"held_ticks": STALL, "held_at": at}
+    held = [held_capsule(one, ForwardKinematics(one), state, arm) for one in (chain, turned)]
+    ends = []
+    for one, capsule in zip((chain, turned), held, strict=True):
+        assert capsule is not None
+        frame = ForwardKinematics(one).frames(at)[6]
+        parts = one.holding(capsule).capsules[-5:]
+        points = np.array([point for part in parts for point in (part.start, part.end)])
+        ends.append(points @ frame[:3, :3].T + frame[:3, 3])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)

@@ -6,11 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics, IkResult
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
 from bhd_lerobot.control.motion.trajectory import State
+from bhd_lerobot.sim.chain import chain_from_mjcf
 from tests.cases import each_case
+from tests.control.geometry.arm_models import serial
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
 
 PLANNER = GoalPlanner(ARM, HZ)
@@ -260,3 +264,52 @@ def test_a_goal_that_is_planned_anew_on_its_way_is_neither_refused_nor_later() -
             assert row + 1 + again.trajectory.ticks <= rows.ticks + 1
             checked += 1
     assert checked > 100
+
+
+def arm_of(joints: int) -> Body:
+    """The UR5's gripper at the end of another chain."""
+    body = ARM.arm
+    chain = dataclasses.replace(chain_from_mjcf(serial(joints, joints), "tool"), min_manipulability=0.0)
+
+    def each(values: tuple[float, ...]) -> tuple[float, ...]:
+        return (*(values[0],) * joints, values[-1])
+
+    names = ("velocity", "acceleration", "jerk", "stop_deceleration", "stop_jerk", "effort", "setpoint_jerk")
+    numbers = {name: each(getattr(ARM.limits, name)) for name in names}
+    limits = dataclasses.replace(
+        ARM.limits,
+        names=(*(f"{joint}.pos" for joint in chain.joints), "gripper.pos"),
+        lower=(*(-2.0,) * joints, 0.0),
+        upper=(*(2.0,) * joints, ARM.limits.upper[-1]),
+        **numbers,
+    )
+    return dataclasses.replace(ARM, arm=dataclasses.replace(body, chain=chain, limits=limits), mjcf="")
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("joints", [4, 5, 7])
+def test_goals_of_any_arm_are_planned(joints: int) -> None:
+    """To the tool's position, its orientation too with six joints or more, straight on a line, within the limits."""
+    body = arm_of(joints)
+    planner = GoalPlanner(body, HZ)
+    kinematics, start = planner.kinematics, np.append(np.full(joints, 0.3), 0.05)
+    assert kinematics.check(start[None, :joints])[0] == ResultCode.SUCCEEDED
+    for motion, far in (("joint", 0.3), ("line", 0.02)):
+        vector = pose_vectors(kinematics.tool(start[:joints] + far * np.linspace(1.0, -1.0, joints)))
+        pose = Pose(tuple(vector[:3].tolist()), tuple(vector[3:].tolist()))
+        still = np.zeros(joints + 1)
+        found = planner.plan(BrainCommand("a", target_pose=pose, motion=motion), start, still, still)
+        assert isinstance(found, Plan), found
+        path = found.trajectory
+        assert (np.abs(path.velocity) <= np.array(body.limits.velocity) + 1e-9).all()
+        assert (np.abs(path.acceleration) <= np.array(body.limits.acceleration) + 1e-9).all()
+        assert np.abs(np.diff(path.position, axis=0, prepend=start[None])).max() < 0.1
+        tool = kinematics.tool(path.position[:, :joints])
+        np.testing.assert_allclose(tool[-1, :3, 3], vector[:3], atol=2e-4)
+        np.testing.assert_allclose(tool[-1], pose.matrix(), atol=2e-4)  # which some posture reaches
+        if motion == "line":
+            first = kinematics.tool(start[:joints])[:3, 3]
+            way = vector[:3] - first
+            off = tool[:, :3, 3] - first
+            beside = off - np.outer(off @ way, way) / (way @ way)
+            assert np.linalg.norm(beside, axis=1).max() < 1e-4
