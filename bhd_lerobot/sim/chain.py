@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.body import ArmChain, Capsule, Placement
+from bhd_lerobot.bodies.body import HELD, OBSTACLE, ArmChain, Capsule, Placement
 from bhd_lerobot.control.geometry.capsules import Balls, enclosing, with_pairs
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.record import JOINTS, PAIRS, SHAPES
@@ -170,7 +170,8 @@ def _frames_of_bodies(model: mujoco.MjModel, base: int, path: Sequence[int]) -> 
     frames[base] = 0
     for body in range(1, model.nbody):
         before = frames[model.body_parentid[body]]
-        if before is not None and body != base:
+        floats = any(model.jnt_type[joint] == _FREE for joint in _joints_of(model, body))
+        if before is not None and body != base and not (floats and body not in path):
             frames[body] = before + len(_joints_of(model, body)) if body in path else before
     return frames
 
@@ -311,8 +312,9 @@ def _shapes(
                 continue
             shape = _balls(model, geom)
             if shape is not None:
-                body = model.body(model.geom_bodyid[geom]).name
-                shapes.append((model.geom(geom).name or body, frame, shape.moved(pose)))
+                name = model.geom(geom).name or model.body(model.geom_bodyid[geom]).name
+                own_name = f"link_{name}" if name.startswith((HELD, OBSTACLE)) else name  # which are no links
+                shapes.append((own_name, frame, shape.moved(pose)))
                 seen.setdefault(geom, []).append(pose)
     return shapes
 

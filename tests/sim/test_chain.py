@@ -206,8 +206,14 @@ def test_a_scene_around_the_arm_is_no_part_of_it() -> None:
         "</worldbody>", f'<geom type="plane" size="1 1 1"/><body name="cup"><freejoint/>{FRAME}</body></worldbody>'
     )
     assert chain_from_mjcf(scene, "tool") == chain_from_mjcf(ARM, "tool")
+    assert chain_from_mjcf(scene, "tool", root="world") == chain_from_mjcf(ARM, "tool", root="world")
     two = ARM.replace("</worldbody>", f"<body>{TURN.format('other')}</body></worldbody>")
     assert chain_from_mjcf(two, "tool", root="base") == chain_from_mjcf(ARM, "tool")
+
+
+def test_no_link_is_taken_for_an_obstacle_or_for_what_is_held() -> None:
+    named = ARM.replace('<geom type="capsule"', '<geom name="held_part" type="capsule"', 1)
+    assert "link_held_part" in {capsule.name for capsule in chain_from_mjcf(named, "tool").capsules}
 
 
 def test_a_home_of_joints_that_are_not_there_is_refused() -> None:

@@ -126,7 +126,10 @@ class ForwardKinematics:
         wrist joint, and the distance of the centre of the last wrist from the base's axis, measured in the arm's plane.
         """
         if self.ur is None:
-            return np.asarray(np.linalg.svd(self.jacobian(q), compute_uv=False).prod(axis=-1))
+            jacobian = self.jacobian(q)
+            if self.dof == len(_TWISTS):
+                return np.abs(np.linalg.det(jacobian))
+            return np.asarray(np.linalg.svd(jacobian, compute_uv=False).prod(axis=-1))
         a2, a3 = self.ur.a2, self.ur.a3
         joints = components_first(np.asarray(q, np.float64), 1)
         q23 = joints[1] + joints[2]
