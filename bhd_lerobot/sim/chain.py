@@ -55,8 +55,9 @@ def chain_from_mjcf(
         tool: the name of the site that is the tool frame; or the name of a body, and the tool frame in it.
         root: the name of the body whose frame is the base frame, or ``"world"``; the lowest body that the tool hangs
             on if left out, or the world if that one turns itself. Joints of the root's own are no part of the arm.
-        home: positions of joints by name [rad or m] at which capsules may not touch; those of the keyframe ``"home"``,
-            or of the first one, or the model's own if left out.
+        home: positions of joints by name [rad or m] at which capsules that touch are not checked; those of the keyframe
+            ``"home"``, or of the first one, if left out; without one the joints' zeros, or the middles of ranges that
+            do not hold them.
         min_distance: smallest distance that checks will permit [m].
 
     Raises:
@@ -266,8 +267,12 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[Array, Array]
 
 def _home(model: mujoco.MjModel, home: Mapping[str, float] | None) -> Array:
     keys = [model.key(number).name for number in range(model.nkey)]
-    qpos = model.key_qpos[keys.index("home") if "home" in keys else 0] if keys else model.qpos0
-    qpos = np.array(qpos)
+    qpos = np.array(model.key_qpos[keys.index("home") if "home" in keys else 0] if keys else model.qpos0)
+    for joint in range(0 if keys else model.njnt):
+        low, high = model.jnt_range[joint]
+        at = model.jnt_qposadr[joint]
+        if model.jnt_limited[joint] and model.jnt_type[joint] in (_HINGE, _SLIDE) and not low <= qpos[at] <= high:
+            qpos[at] = (low + high) / 2
     for name, value in (home or {}).items():
         joints = _names(model, "joint", model.njnt)
         if name not in joints:

@@ -135,6 +135,16 @@ def test_the_pairs_that_are_checked_can_meet_and_do_not_at_home() -> None:
     assert chain_from_mjcf(arm(5) % key, "tool").disjoint == chain_from_mjcf(arm(5) % "", "tool", home=folded).disjoint
 
 
+def test_a_zero_that_no_joint_may_take_is_no_home() -> None:
+    """With link 2 folded back at its zero more links touch than in the middle of its range."""
+    plain = '<body name="link_2" pos="0 0 0.3"><joint name="joint_2" axis="0 1 0" range="-2 2"/>'
+    folded = '<body name="link_2" pos="0 0 0.3" euler="3.1 0 0"><joint name="joint_2" axis="1 0 0" range="0.5 3"/>'
+    document = (arm(5) % "").replace(plain, folded)
+    chain = chain_from_mjcf(document, "tool")
+    assert chain == chain_from_mjcf(document, "tool", home={"joint_2": 1.75})
+    assert len(chain.disjoint) > len(chain_from_mjcf(document, "tool", home={"joint_2": 0.0}).disjoint)
+
+
 def test_what_collides_is_enclosed_where_something_does_and_both_ends_of_a_finger() -> None:
     seen = '<geom name="seen" type="sphere" size="0.2" contype="0" conaffinity="0"/>'
     finger = (
