@@ -60,11 +60,10 @@ class NumericInverse:
         self._scale = np.array([*[math.sqrt(0.5) * self._length] * 3, 1.0])
         tools = self._scaled(forward.tool(self._sample))
         self._tools, self._squares = tools, np.square(tools).sum(axis=1)
-        self._arm, self._geometry = np.zeros(1, ARM), np.zeros(1, GEOMETRY)
+        self._geometry = np.zeros(1, GEOMETRY)
         forward.fill(self._geometry[0])
-        self._room, self._tool = np.zeros((2 * JOINTS + 3, JOINTS)), np.zeros((3, 4))
-        self._plain = as_objects(self._arm), as_objects(self._geometry)
         self._handled = 0
+        find_posture.bind()  # on the wall clock it is compiled now, not for the first goal
 
     def starts(self, pose: Array, posture: Array) -> Array:
         """Return postures to start from, the most promising first, shape (MOST_STARTS, dof)."""
@@ -84,17 +83,19 @@ class NumericInverse:
 
         Returns:
             Postures of shape (k, dof), and what each is off by, shape (k, 3): a distance [m], an angle [rad], and the
-            root of what the orientation counts, times the length.
+            root of the squared differences of the axes' directions, each counted as above [1].
         """
         target, found, off = np.ascontiguousarray(pose[:3]), starts.copy(), np.empty((len(starts), 3))
         lower, upper = (self._lower, self._upper) if limited else (self._unlimited[0], self._unlimited[1])
-        machine = find_posture.compiled if is_worth_compiling(find_posture, self._handled) else None
+        room, tool = np.zeros((2 * JOINTS + 3, JOINTS)), np.zeros((3, 4))  # new ones: threads may share the arm
+        arm, geometry, find = np.zeros(1, ARM), self._geometry, find_posture.function
+        if compiled := is_worth_compiling(find_posture, self._handled):
+            find = find_posture.compiled
+        else:
+            arm, geometry = as_objects(arm), as_objects(geometry)
         for q, miss in zip(found, off, strict=True):
-            arguments = (q, posture, target, lower, upper, self._length, self._room, self._tool, miss)
-            if machine is not None:
-                machine(*arguments, self._arm, self._geometry)
-            else:
-                self._handled += _VALUES_PER_STEP * find_posture.function(*arguments, *self._plain)
+            steps = find(q, posture, target, lower, upper, self._length, room, tool, miss, arm, geometry)
+            self._handled += 0 if compiled else _VALUES_PER_STEP * steps
         return found, off
 
     def reaches(self, off: Array) -> NDArray[np.bool_]:
