@@ -413,25 +413,71 @@ def _edges(held: Capsule, fingers_way: tuple[float, ...]) -> list[Capsule]:
 
 @dataclass(frozen=True)
 class GripperSpec:
-    """A parallel gripper with two fingers that move as one.
+    """A gripper that one number moves: its opening, whatever its joints are.
+
+    The opening grows evenly with the joints: two slides of parallel fingers, the hinge of a jaw, or the hinges that
+    drive a linkage. Of a jaw it is the length of the arc between the finger tips.
 
     Attributes:
-        joints: joint names, left then right; each moves by half the opening.
+        joints: names of the one or two joints that the opening is read from, left then right.
         actuator: name of the actuator; its command is the opening [m].
         body: name of the body that palm and fingers belong to.
-        tendon: name of the tendon whose length is the opening.
-        pads: names of the geoms that hold, left then right.
+        tendon: name of the tendon that the actuator pulls; the first of the joints if empty.
+        pads: names of the geoms that hold.
         max_opening: largest opening [m].
         widest: narrow side of the widest object that it is given to grasp [m].
+        closed: where each joint is when it is closed [m or rad]; 0 if left out.
+        opened: where each joint is at the largest opening [m or rad]; equal shares of it if left out.
+        pull: length of what the actuator pulls when it is closed, and how much longer that is at the largest opening;
+            0 and the largest opening if left out.
     """
 
-    joints: tuple[str, str]
+    joints: tuple[str, ...]
     actuator: str
     body: str
     tendon: str
-    pads: tuple[str, str]
+    pads: tuple[str, ...]
     max_opening: float
     widest: float
+    closed: tuple[float, ...] = ()
+    opened: tuple[float, ...] = ()
+    pull: tuple[float, float] = ()  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        n = len(self.joints)
+        for name, default in (
+            ("closed", (0.0,) * n),
+            ("opened", (self.max_opening / n,) * n),
+            ("pull", (0.0, self.max_opening)),
+        ):
+            if not getattr(self, name):
+                object.__setattr__(self, name, default)
+        if not 1 <= n <= 2 or not len(self.closed) == len(self.opened) == n:
+            raise ConfigError(
+                f"The gripper has the joints {self.joints}, which are at {self.closed} when it is closed and at "
+                f"{self.opened} when it is open; it needs one or two joints, and a number for each."
+            )
+        if not self.max_opening > 0 or not all(np.subtract(self.opened, self.closed)) or not self.pull[1]:
+            raise ConfigError(
+                f"The gripper's largest opening is {self.max_opening} m, and its joints {self.joints} go from "
+                f"{self.closed} when it is closed to {self.opened}; it must be positive, and each of them must move."
+            )
+
+    @property
+    def per_joint(self) -> tuple[float, ...]:
+        """By how much the opening grows with each joint [m/m or m/rad]."""
+        moves = zip(self.opened, self.closed, strict=True)
+        return tuple(self.max_opening / (len(self.joints) * (opened - closed)) for opened, closed in moves)
+
+    @property
+    def offset(self) -> float:
+        """The opening where its joints are at 0 [m]."""
+        return -sum(one * closed for one, closed in zip(self.per_joint, self.closed, strict=True))
+
+    def joints_at(self, opening: float) -> tuple[float, ...]:
+        """Return where its joints are at an opening [m]."""
+        n = len(self.joints)
+        return tuple(closed + opening / (n * one) for closed, one in zip(self.closed, self.per_joint, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,9 +44,12 @@ LAYOUT = record(
         ("qpos", np.int64, (JOINTS,)),
         ("qvel", np.int64, (JOINTS,)),
         ("ctrl", np.int64, (JOINTS,)),
-        # Of a gripper, whose opening is a sum, the second finger's; -1 of other joints.
-        ("qpos_beside", np.int64, (JOINTS,)),
-        ("qvel_beside", np.int64, (JOINTS,)),
+        # Of a gripper, whose opening grows with one or two joints: the second one's place, -1 if there is none.
+        ("qpos_beside", np.int64),
+        ("qvel_beside", np.int64),
+        ("gripper", np.int64),  # which of the joints it is; -1 if there is none
+        ("per_joint", np.float64, (2,)),  # by how much it opens with each [m/m or m/rad]
+        ("offset", np.float64),  # the opening where they are at 0 [m]
         # Places of the readings that count touches: of anything, of the table, of itself, and of the gripper's.
         ("touch", np.int64),
         ("touch_table", np.int64),
@@ -276,10 +279,16 @@ def read_joints(  # noqa: PLR0917
     state.stamp_ns = now_ns
     for k in range(layout.joints):
         position, velocity = qpos[layout.qpos[k]], qvel[layout.qvel[k]]
-        if layout.qpos_beside[k] >= 0:
-            position += qpos[layout.qpos_beside[k]]
-            velocity += qvel[layout.qvel_beside[k]]
-        state.position[k], state.velocity[k], state.effort[k] = position, velocity, efforts[layout.qvel[k]]
+        effort = efforts[layout.qvel[k]]
+        if k == layout.gripper:
+            position *= layout.per_joint[0]
+            velocity *= layout.per_joint[0]
+            effort /= layout.per_joint[0]
+            if layout.qpos_beside >= 0:
+                position += qpos[layout.qpos_beside] * layout.per_joint[1]
+                velocity += qvel[layout.qvel_beside] * layout.per_joint[1]
+            position += layout.offset
+        state.position[k], state.velocity[k], state.effort[k] = position, velocity, effort
 
 
 @kernel()
@@ -343,7 +352,7 @@ class Frames:
         model, self._layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = self._layout[0], world.servos
         row["ticks_hz"], row["substeps"] = cerebellum.control_hz, world.physics_hz // cerebellum.control_hz
-        row["qpos_beside"], row["joints"] = -1, cerebellum.controller.joints
+        row["qpos_beside"], row["gripper"], row["joints"] = -1, -1, cerebellum.controller.joints
         servos = self._place_arm(row) if world.body.arm is not None else self._place_drive(row)
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
@@ -383,16 +392,18 @@ class Frames:
     def _place_arm(self, row: Any) -> list[int]:
         """Write where joints, fingers and touches are; return the joints' servos."""
         model, arm = self._world.model, self._world.body.need(Arm)
-        dof = len(arm.chain.joints)
-        finger, other = (model.joint(name) for name in arm.gripper.joints)
-        self._place_joints(row, (*arm.chain.joints, finger.name))
-        row["qpos_beside"][dof], row["qvel_beside"][dof] = other.qposadr[0], other.dofadr[0]
+        dof, gripper = len(arm.chain.joints), arm.gripper
+        self._place_joints(row, (*arm.chain.joints, gripper.joints[0]))
+        row["gripper"], row["offset"] = dof, gripper.offset
+        row["per_joint"][: len(gripper.joints)] = gripper.per_joint
+        for name in gripper.joints[1:]:
+            row["qpos_beside"], row["qvel_beside"] = model.joint(name).qposadr[0], model.joint(name).dofadr[0]
         servos = [model.actuator(name).id for name in arm.actuators]
         row["ctrl"][: len(servos)] = servos
         for kind, name in (("touch", "any"), ("touch_table", "table"), ("touch_self", "self")):
             row[kind] = model.sensor(f"touch_{name}").adr[0]
         row["touch_grip"] = model.sensor("touch_object_0").adr[0], MAX_OBJECTS
-        return servos[:dof]
+        return servos[:dof] if gripper.tendon else servos
 
     def _place_joints(self, row: Any, names: Sequence[str]) -> None:
         joints = [self._world.model.joint(name) for name in names]

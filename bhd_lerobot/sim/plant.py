@@ -26,7 +26,7 @@ _MOST_VIEWS = 8  # readings that are remembered
 _CLOSING_S = 1.0  # [s] for which a brake only damps: what was pressed springs back
 _CREEP = 0.001  # [rad/s] a joint that slips slower than this feels less than the slip torque
 _Array = NDArray[np.float64]
-_Views = tuple[_Array, _Array, _Array, list[tuple[_Array, _Array, _Array]]]
+_Views = tuple[_Array, _Array, _Array]
 
 
 class SimulatedPlant:
@@ -49,13 +49,17 @@ class SimulatedPlant:
     def __init__(self, world: World) -> None:
         self.n = world.n
         body, efforts = world.body, world.efforts
-        self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._fingers: list[tuple[_Array, _Array, float]] = []
         arm = body.arm
         if arm is not None:
             joints, names = arm.chain.joints, arm.actuators
-            positions, velocities = world.joint_slice(arm.gripper.joints)
-            self._fingers = world.qpos[:, positions], world.qvel[:, velocities]
-            self._grip = efforts[:, velocities.start]  # the force of their one actuator acts on each of them
+            gripper, places = arm.gripper, world.joint_places(arm.gripper.joints)
+            self._fingers = [
+                (world.qpos[:, at], world.qvel[:, dof], one)
+                for at, dof, one in zip(*places, gripper.per_joint, strict=True)
+            ]
+            self._offset = gripper.offset
+            self._grip = efforts[:, places[1][0]]  # the force of their one actuator acts on each of them
         else:
             drive = body.need(Drive)
             joints, names = drive.joints, drive.actuators
@@ -81,22 +85,24 @@ class SimulatedPlant:
                 self._views.clear()
             entry = self._views[id(out)] = out, self._bind(out)
             out.has_effort = True
-        position, velocity, effort, sums = entry[1]
+        position, velocity, effort = entry[1]
         position[:] = self._position
         velocity[:] = self._velocity
         effort[:] = self._effort
-        if self._fingers is not None:
-            out.effort[:, -1] = self._grip
-        for one, other, to in sums:
-            np.add(one, other, out=to)
+        if self._fingers:
+            first, speed, per_joint = self._fingers[0]
+            out.effort[:, -1] = self._grip / per_joint
+            opening, rate = first * per_joint, speed * per_joint
+            for first, speed, per_joint in self._fingers[1:]:
+                opening += first * per_joint
+                rate += speed * per_joint
+            out.position[:, -1] = opening + self._offset
+            out.velocity[:, -1] = rate
 
     def _bind(self, out: JointReading) -> "_Views":
         """Make the views into a reading once, not at every tick."""
-        if self._fingers is None:
-            return out.position, out.velocity, out.effort, []
-        both = zip(self._fingers, (out.position, out.velocity), strict=True)
-        sums = [(fingers[:, 0], fingers[:, 1], to[:, -1]) for fingers, to in both]
-        return out.position[:, :-1], out.velocity[:, :-1], out.effort[:, :-1], sums
+        end = -1 if self._fingers else None
+        return out.position[:, :end], out.velocity[:, :end], out.effort[:, :end]
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""

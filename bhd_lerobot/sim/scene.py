@@ -7,7 +7,7 @@ from bhd_lerobot.bodies.body import Body, Drive, Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
-from bhd_lerobot.sim.table_stage import add_table_stage
+from bhd_lerobot.sim.table_stage import add_table_stage, set_home
 
 # Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
@@ -41,6 +41,8 @@ def build_model(
         model = spec.compile()
     except ValueError as error:
         raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
+    if body.arm is not None:
+        set_home(model, body.arm)
     # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
     # account: obstacles would all stand along the axes, whatever orientation a simulation gives them.
     for index in range(model.ngeom):

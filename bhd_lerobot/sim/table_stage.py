@@ -45,7 +45,7 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
     _add_touch_sensors(spec, root, arm.gripper.body)
     for number, shape in enumerate(fixtures):
         _add_fixture(spec, root, number, shape)
-    _add_start(spec, arm)
+    spec.add_key(name="home")  # `set_home` fills it in
 
 
 def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
@@ -53,15 +53,19 @@ def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
     positions = arm.actuation == "position"
     rows = zip(arm.actuators, arm.servo_stiffness, arm.servo_damping, arm.limits.effort, strict=True)
     for number, (name, stiffness, damping, effort) in enumerate(rows):
-        gripper = number == len(arm.chain.joints)
+        grip = arm.gripper if number == len(arm.chain.joints) else None
+        tendon = grip.tendon if grip else ""
+        closed, way = (grip.pull[0], grip.pull[1] / grip.max_opening) if grip else (0.0, 1.0)
         actuator = spec.add_actuator(
             name=name,
-            target=arm.gripper.tendon if gripper else arm.chain.joints[number],
-            trntype=mujoco.mjtTrn.mjTRN_TENDON if gripper else mujoco.mjtTrn.mjTRN_JOINT,
-            forcerange=[-effort, effort],
+            target=tendon or (grip.joints[0] if grip else arm.chain.joints[number]),
+            trntype=mujoco.mjtTrn.mjTRN_TENDON if tendon else mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-effort / abs(way), effort / abs(way)],
         )
-        if gripper or positions:
-            actuator.set_to_position(kp=stiffness, kv=damping)
+        if grip or positions:
+            actuator.set_to_position(kp=stiffness / way**2, kv=damping / way**2)
+            if (closed, way) != (0.0, 1.0):  # its command is an opening, and what it pulls has another length
+                actuator.gainprm[0], actuator.biasprm[0] = stiffness / way, stiffness / way**2 * closed
         else:
             actuator.set_to_motor()
     for joint, damping, effort in zip(arm.chain.joints, arm.brake_damping, arm.limits.effort[:-1], strict=False):
@@ -252,11 +256,11 @@ def _add_fixture(spec: mujoco.MjSpec, root: str, number: int, shape: Shape) -> N
     )
 
 
-def _add_start(spec: mujoco.MjSpec, arm: Arm) -> None:
-    """Add the state that a reset leads to: the arm at home, no object on the table."""
-    fingers = [arm.home[-1] / 2] * len(arm.gripper.joints)
-    objects = [value for place in PARKED for value in (*place, 1.0, 0.0, 0.0, 0.0)]
-    spec.add_key(name="home", qpos=[*arm.home[:-1], *fingers, *objects])
+def set_home(model: mujoco.MjModel, arm: Arm) -> None:
+    """Write the state that a reset leads to: the arm at home, no object on the table."""
+    joints = (*arm.chain.joints, *arm.gripper.joints)
+    for name, value in zip(joints, (*arm.home[:-1], *arm.gripper.joints_at(arm.home[-1])), strict=True):
+        model.key_qpos[0, model.joint(name).qposadr[0]] = value
 
 
 def _visual(

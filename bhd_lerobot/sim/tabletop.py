@@ -68,7 +68,7 @@ class Tabletop:
             for k in range(MAX_OBJECTS)
         ]
         self._joints = world.joint_slice(self.arm.chain.joints)[0]
-        self._fingers = world.joint_slice(self.arm.gripper.joints)[0]
+        self._fingers = world.joint_places(self.arm.gripper.joints)[0]
         self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
         self._free_values = np.add.outer(self._free, np.arange(7)).reshape(-1)
         self._target = model.body("target").id
@@ -118,7 +118,7 @@ class Tabletop:
         world.update_constants(ids)
         for sim, scene in zip(ids, scenes, strict=True):
             world.qpos[sim, self._joints] = scene.posture[:-1]
-            world.qpos[sim, self._fingers] = scene.posture[-1] / 2
+            world.qpos[sim, self._fingers] = self.arm.gripper.joints_at(scene.posture[-1])
             for number, thing in enumerate(scene.objects):
                 turn = thing.yaw / 2
                 at = self._free[number]

@@ -220,9 +220,10 @@ class World:
         if (arm := self.body.arm) is None:
             raise SimulationError(f"hold() is for arms; {self.body.name!r} has none.")
         joints = len(arm.chain.joints)
-        fingers = self.joint_slice(arm.gripper.joints)[0]
         self.ctrl[ids, :joints] = self.qpos[ids, :joints] if arm.actuation == "position" else 0.0
-        self.ctrl[ids, joints] = self.qpos[ids, fingers.start] + self.qpos[ids, fingers.start + 1]
+        fingers = zip(self.joint_places(arm.gripper.joints)[0], arm.gripper.per_joint, strict=True)
+        openings = [self.qpos[ids, place] * one for place, one in fingers]
+        self.ctrl[ids, joints] = sum(openings[1:], openings[0]) + arm.gripper.offset
         if arm.actuation == "torque":
             bias = self.derived("qfrc_bias")
             self.forward(ids)
@@ -396,6 +397,11 @@ class World:
             names = [self.model.site(i).name for i in range(self.model.nsite)]
             raise SimulationError(unknown_name("site", name, names))
         return int(number)
+
+    def joint_places(self, names: Sequence[str]) -> tuple[list[int], list[int]]:
+        """Return where named one-dimensional joints lie in `qpos` and `qvel`."""
+        joints = [self.model.joint(name) for name in names]
+        return [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
 
     def joint_slice(self, names: Sequence[str]) -> tuple[slice, slice]:
         """Return where the named one-dimensional joints lie in `qpos` and `qvel`; they must be neighbours, in order."""
