@@ -499,15 +499,16 @@ class Workspace:
 
 @dataclass(frozen=True, kw_only=True)
 class Arm:
-    """An arm with a gripper, mounted on a table.
+    """An arm, mounted on a table, with or without a gripper.
 
-    The table's top is the plane z = 0 of the chain's base frame. A command is the position of each joint
-    [rad] in the chain's order, and then the gripper's opening [m].
+    The table's top is the plane z = 0 of the chain's base frame. A command is the position of each joint [rad] in the
+    chain's order, and then the gripper's opening [m], if there is one. What is said of the gripper here is left out
+    without one.
 
     Attributes:
         limits: limits of the commands, the gripper's last.
         chain: the geometry.
-        gripper: the gripper.
+        gripper: the gripper; None if it has none.
         servo_stiffness: torque per position error of each joint's servo [N m/rad]; force per opening error of the
             gripper's, last [N/m].
         servo_damping: torque per speed error of each joint's servo [N m s/rad], and of the gripper's [N s/m].
@@ -528,7 +529,7 @@ class Arm:
 
     limits: Limits
     chain: ArmChain
-    gripper: GripperSpec
+    gripper: GripperSpec | None
     servo_stiffness: tuple[float, ...]
     servo_damping: tuple[float, ...]
     actuators: tuple[str, ...]
@@ -597,7 +598,9 @@ class Body:
     def joints(self) -> tuple[str, ...]:
         """What is read of it, in order: the wheels, the arm's joints, and the gripper's opening."""
         wheels = self.drive.joints if self.drive is not None else ()
-        return (*wheels, *self.arm.chain.joints, "gripper") if self.arm is not None else wheels
+        if self.arm is None:
+            return wheels
+        return (*wheels, *self.arm.chain.joints, *(("gripper",) if self.arm.gripper else ()))
 
     @property
     def parts(self) -> Mapping[type, Any]:

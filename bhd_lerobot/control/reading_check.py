@@ -129,10 +129,11 @@ class ReadingCheck:
         limits["joints"] = len(body.joints)
         speeds = [body.drive.max_wheel_speed] * 2 if body.drive is not None else []
         if body.arm is not None:
-            speeds += [*body.arm.limits.velocity[:-1], np.inf]
+            dof = len(body.arm.chain.joints)
+            speeds += [*body.arm.limits.velocity[:dof], np.inf][: len(body.joints)]
             if body.arm.actuation == "torque":
                 limits["is_torque"], limits["frozen_ticks"] = True, round(_FROZEN_S * control_hz)
-                put(limits[0], "least_torque", _FROZEN_SHARE * np.asarray(body.arm.limits.effort[:-1]))
+                put(limits[0], "least_torque", _FROZEN_SHARE * np.asarray(body.arm.limits.effort[:dof]))
         fastest = _FASTER * np.array(speeds) / NANOSECONDS  # [rad/ns]
         for name, values in (("fastest", 1.0), ("step", period), ("slack", _SLACK_PERIODS * period)):
             put(limits[0], name, fastest * values)

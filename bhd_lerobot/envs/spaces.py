@@ -91,6 +91,6 @@ def action_bounds(body: Body, names: tuple[str, ...]) -> tuple[NDArray[np.float6
         low, high = limits.bounds
         return np.asarray(low), np.asarray(high)
     chain = body.arm.chain
-    reach = chain.reach
-    lower, upper = limits.lower[-1], limits.upper[-1]
-    return np.array([*[-reach] * 3, *[-1.0] * 4, lower]), np.array([*[reach] * 3, *[1.0] * 4, upper])
+    reach, dof = chain.reach, chain.dof
+    lower, upper = limits.lower[dof:], limits.upper[dof:]
+    return np.array([*[-reach] * 3, *[-1.0] * 4, *lower]), np.array([*[reach] * 3, *[1.0] * 4, *upper])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.robots.arm_host import TOOL_NAMES, observation_names
+from bhd_lerobot.robots.arm_host import observation_names, tool_names
 from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_arm import ArmConfig
 from bhd_lerobot.robots.robot import BhdRobot
@@ -65,4 +65,4 @@ class SimulatedArm(BhdRobot):
     @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the action's floats, in order."""
-        return TOOL_NAMES if self.config.action_space == "tool" else super().action_names
+        return tool_names(self.body) if self.config.action_space == "tool" else super().action_names

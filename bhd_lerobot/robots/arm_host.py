@@ -36,6 +36,12 @@ TOOL_NAMES = (
 )
 """Position [m] and orientation (unit quaternion) of the tool frame in the base frame, and the gripper's opening [m]."""
 
+
+def tool_names(body: Body) -> tuple[str, ...]:
+    """Return the names of actions that are tool poses, with the gripper's opening if there is a gripper."""
+    return TOOL_NAMES if body.need(Arm).gripper else TOOL_NAMES[:-1]
+
+
 _SLACK = 0.2  # how far a policy's quaternion may be from unit length; it is normalised
 
 
@@ -117,7 +123,7 @@ class ArmHost(Host):
         super().__init__(
             config,
             Cerebellum(body, plant, config.control_hz, controller=self.controller),
-            action_names=TOOL_NAMES if config.action_space == "tool" else body.limits.names,
+            action_names=tool_names(body) if config.action_space == "tool" else body.limits.names,
             observation_names=observation_names(body, tool_pose=config.tool_pose),
             **options,
         )
@@ -141,14 +147,18 @@ class ArmHost(Host):
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""
         position = self._newest().position
         return ArmTruth(
-            tool_pose=pose_vectors(self.kinematics.tool(position[:, :-1])),
+            tool_pose=pose_vectors(self.kinematics.tool(position[:, : self._joints])),
             object_poses=np.zeros((self.n, MAX_OBJECTS, 7)),
-            opening=position[:, -1].copy(),
+            opening=self._opening(position),
             arm_on_table=np.zeros(self.n, np.bool_),
             arm_on_object=np.zeros(self.n, np.bool_),
             self_contact=np.zeros(self.n, np.bool_),
             fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
         )
+
+    def _opening(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the openings of the grippers [m], shape (n,); 0 without one."""
+        return np.asarray(position[:, self._joints :].sum(axis=1))
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start episodes."""
@@ -164,10 +174,8 @@ class ArmHost(Host):
         """Return the goal that brings an arm to the start of a scene; it stays where it is if there is none."""
         if scene is None or self.config.control == "impedance":
             return None
-        *joints, opening = scene.posture
-        return BrainCommand(
-            "start", joint_target=tuple(joints), gripper=opening, max_velocity=_TO_START, timeout_s=60.0
-        )
+        joints, opening = scene.posture[: self._joints], (*scene.posture[self._joints :], None)[0]
+        return BrainCommand("start", joint_target=joints, gripper=opening, max_velocity=_TO_START, timeout_s=60.0)
 
     # --- tool space ---------------------------------------------------------------------------------------------------
 
@@ -175,8 +183,8 @@ class ArmHost(Host):
         """Return joint positions and openings as actions: as they are, or as tool poses."""
         if self.config.action_space == "joint" or self.config.control == "impedance":
             return command.copy()
-        tool = pose_vectors(self.kinematics.tool(command[:, :-1]))
-        return np.concatenate([tool, command[:, -1:]], axis=1)
+        tool = pose_vectors(self.kinematics.tool(command[:, : self._joints]))
+        return np.concatenate([tool, command[:, self._joints :]], axis=1)
 
     def to_setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
@@ -190,12 +198,12 @@ class ArmHost(Host):
         """
         if self.config.action_space == "joint":
             return action, {}
-        command = self.cerebellum.command if before is None else before
+        command, dof = self.cerebellum.command if before is None else before, self._joints
         setpoints, refused = command.copy(), {}
         for sim in np.flatnonzero(mask).tolist():
-            posture, problem = self._posture(sim, action[sim, :7], command[sim, :-1])
+            posture, problem = self._posture(sim, action[sim, :7], command[sim, :dof])
             if problem is None:
-                setpoints[sim, :-1], setpoints[sim, -1] = posture, action[sim, -1]
+                setpoints[sim, :dof], setpoints[sim, dof:] = posture, action[sim, 7:]
                 self._taken[sim] = action[sim, :3]
             else:
                 refused[sim] = (Reason.NO_POSTURE, problem)

@@ -111,7 +111,7 @@ class ArmSimulation(ArmHost, Simulation):
         return ArmTruth(
             tool_pose=self.table.tool_pose,
             object_poses=self.table.object_poses,
-            opening=self._newest().position[:, -1].copy(),
+            opening=self._opening(self._newest().position),
             arm_on_table=self._arm_on_table.copy(),
             arm_on_object=self._arm_on_object.copy(),
             self_contact=self._self_contact.copy(),
@@ -123,11 +123,11 @@ class ArmSimulation(ArmHost, Simulation):
         reading = self._newest()
         state = np.concatenate([reading.position, reading.velocity], axis=1)
         if np.count_nonzero(self._noise):
-            joints = self._joints
+            joints, width = self._joints, state.shape[1] // 2
             for sim in np.flatnonzero((self._noise > 0) & self.running):
                 noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, joints))
                 state[sim, :joints] += noise[0]
-                state[sim, joints + 1 : -1] += noise[1] * _SPEED_NOISE
+                state[sim, width : width + joints] += noise[1] * _SPEED_NOISE
         return self._observed(state), self._now * self.tick
 
     def _newest(self) -> PlantReading:

@@ -393,17 +393,18 @@ class Frames:
         """Write where joints, fingers and touches are; return the joints' servos."""
         model, arm = self._world.model, self._world.body.need(Arm)
         dof, gripper = len(arm.chain.joints), arm.gripper
-        self._place_joints(row, (*arm.chain.joints, gripper.joints[0]))
-        row["gripper"], row["offset"] = dof, gripper.offset
-        row["per_joint"][: len(gripper.joints)] = gripper.per_joint
-        for name in gripper.joints[1:]:
-            row["qpos_beside"], row["qvel_beside"] = model.joint(name).qposadr[0], model.joint(name).dofadr[0]
+        self._place_joints(row, (*arm.chain.joints, *(gripper.joints[:1] if gripper else ())))
+        if gripper is not None:
+            row["gripper"], row["offset"] = dof, gripper.offset
+            row["per_joint"][: len(gripper.joints)] = gripper.per_joint
+            for name in gripper.joints[1:]:
+                row["qpos_beside"], row["qvel_beside"] = model.joint(name).qposadr[0], model.joint(name).dofadr[0]
         servos = [model.actuator(name).id for name in arm.actuators]
         row["ctrl"][: len(servos)] = servos
         for kind, name in (("touch", "any"), ("touch_table", "table"), ("touch_self", "self")):
             row[kind] = model.sensor(f"touch_{name}").adr[0]
         row["touch_grip"] = model.sensor("touch_object_0").adr[0], MAX_OBJECTS
-        return servos[:dof] if gripper.tendon else servos
+        return servos[:dof] if gripper and gripper.tendon else servos
 
     def _place_joints(self, row: Any, names: Sequence[str]) -> None:
         joints = [self._world.model.joint(name) for name in names]

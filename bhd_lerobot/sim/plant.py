@@ -53,13 +53,14 @@ class SimulatedPlant:
         arm = body.arm
         if arm is not None:
             joints, names = arm.chain.joints, arm.actuators
-            gripper, places = arm.gripper, world.joint_places(arm.gripper.joints)
-            self._fingers = [
-                (world.qpos[:, at], world.qvel[:, dof], one)
-                for at, dof, one in zip(*places, gripper.per_joint, strict=True)
-            ]
-            self._offset = gripper.offset
-            self._grip = efforts[:, places[1][0]]  # the force of their one actuator acts on each of them
+            if (gripper := arm.gripper) is not None:
+                places = world.joint_places(gripper.joints)
+                self._fingers = [
+                    (world.qpos[:, at], world.qvel[:, dof], one)
+                    for at, dof, one in zip(*places, gripper.per_joint, strict=True)
+                ]
+                self._offset = gripper.offset
+                self._grip = efforts[:, places[1][0]]  # the force of their one actuator acts on each of them
         else:
             drive = body.need(Drive)
             joints, names = drive.joints, drive.actuators

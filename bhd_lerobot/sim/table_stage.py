@@ -42,7 +42,7 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
     for number in range(MAX_OBJECTS):
         _add_object(spec, number, arm.gripper)
     _add_target(spec)
-    _add_touch_sensors(spec, root, arm.gripper.body)
+    _add_touch_sensors(spec, root, arm.gripper.body if arm.gripper else root)
     for number, shape in enumerate(fixtures):
         _add_fixture(spec, root, number, shape)
     spec.add_key(name="home")  # `set_home` fills it in
@@ -68,7 +68,7 @@ def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
                 actuator.gainprm[0], actuator.biasprm[0] = stiffness / way, stiffness / way**2 * closed
         else:
             actuator.set_to_motor()
-    for joint, damping, effort in zip(arm.chain.joints, arm.brake_damping, arm.limits.effort[:-1], strict=False):
+    for joint, damping, effort in zip(arm.chain.joints, arm.brake_damping, arm.limits.effort, strict=False):
         brake = spec.add_actuator(
             name=f"{joint}_brake",
             target=joint,
@@ -157,7 +157,7 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     spec.visual.quality.offsamples = 0
 
 
-def _add_object(spec: mujoco.MjSpec, number: int, gripper: GripperSpec) -> None:
+def _add_object(spec: mujoco.MjSpec, number: int, gripper: GripperSpec | None) -> None:
     """Add a free body with one geometry to touch and some only rendered; each simulation gives them their size."""
     body = spec.worldbody.add_body(name=f"object_{number}", pos=PARKED[number], gravcomp=1.0)
     body.add_freejoint(name=f"object_{number}")
@@ -177,7 +177,7 @@ def _add_object(spec: mujoco.MjSpec, number: int, gripper: GripperSpec) -> None:
         _visual(body, "box", (0, 0, 0), (0.001,) * 3, name=f"object_{number}_{part}", group=5)
     # Written out as pairs, the pads' friction is a property of the two that touch; and only what is gripped needs
     # friction against turning.
-    for pad in gripper.pads:
+    for pad in gripper.pads if gripper else ():
         spec.add_pair(
             geomname1=pad,
             geomname2=f"object_{number}",
@@ -258,8 +258,9 @@ def _add_fixture(spec: mujoco.MjSpec, root: str, number: int, shape: Shape) -> N
 
 def set_home(model: mujoco.MjModel, arm: Arm) -> None:
     """Write the state that a reset leads to: the arm at home, no object on the table."""
-    joints = (*arm.chain.joints, *arm.gripper.joints)
-    for name, value in zip(joints, (*arm.home[:-1], *arm.gripper.joints_at(arm.home[-1])), strict=True):
+    dof, grip = len(arm.chain.joints), arm.gripper
+    joints = (*arm.chain.joints, *(grip.joints if grip else ()))
+    for name, value in zip(joints, (*arm.home[:dof], *(grip.joints_at(arm.home[dof]) if grip else ())), strict=True):
         model.key_qpos[0, model.joint(name).qposadr[0]] = value
 
 

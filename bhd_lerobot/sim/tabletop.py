@@ -62,13 +62,13 @@ class Tabletop:
             ]
             for k in range(MAX_OBJECTS)
         ]
-        self._pads = [model.geom(pad).id for pad in self.arm.gripper.pads]
+        self._pads = [model.geom(pad).id for pad in (self.arm.gripper.pads if self.arm.gripper else ())]
         self._pairs = [
             [i for i in range(model.npair) if self._geoms[k][0] in (model.pair_geom1[i], model.pair_geom2[i])]
             for k in range(MAX_OBJECTS)
         ]
         self._joints = world.joint_slice(self.arm.chain.joints)[0]
-        self._fingers = world.joint_places(self.arm.gripper.joints)[0]
+        self._fingers = world.joint_places(self.arm.gripper.joints)[0] if self.arm.gripper else []
         self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
         self._free_values = np.add.outer(self._free, np.arange(7)).reshape(-1)
         self._target = model.body("target").id
@@ -117,8 +117,10 @@ class Tabletop:
                 self._field["geom_group"][sim, self._geoms[number]] = _HIDDEN
         world.update_constants(ids)
         for sim, scene in zip(ids, scenes, strict=True):
-            world.qpos[sim, self._joints] = scene.posture[:-1]
-            world.qpos[sim, self._fingers] = self.arm.gripper.joints_at(scene.posture[-1])
+            dof = len(self.arm.chain.joints)
+            world.qpos[sim, self._joints] = scene.posture[:dof]
+            if self.arm.gripper is not None:
+                world.qpos[sim, self._fingers] = self.arm.gripper.joints_at(scene.posture[dof])
             for number, thing in enumerate(scene.objects):
                 turn = thing.yaw / 2
                 at = self._free[number]

@@ -221,9 +221,10 @@ class World:
             raise SimulationError(f"hold() is for arms; {self.body.name!r} has none.")
         joints = len(arm.chain.joints)
         self.ctrl[ids, :joints] = self.qpos[ids, :joints] if arm.actuation == "position" else 0.0
-        fingers = zip(self.joint_places(arm.gripper.joints)[0], arm.gripper.per_joint, strict=True)
-        openings = [self.qpos[ids, place] * one for place, one in fingers]
-        self.ctrl[ids, joints] = sum(openings[1:], openings[0]) + arm.gripper.offset
+        if arm.gripper is not None:
+            fingers = zip(self.joint_places(arm.gripper.joints)[0], arm.gripper.per_joint, strict=True)
+            openings = [self.qpos[ids, place] * one for place, one in fingers]
+            self.ctrl[ids, joints] = sum(openings[1:], openings[0]) + arm.gripper.offset
         if arm.actuation == "torque":
             bias = self.derived("qfrc_bias")
             self.forward(ids)

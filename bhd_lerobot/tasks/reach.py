@@ -82,7 +82,7 @@ class ReachTask(ArmTask):
         return TableScene(
             name="reach",
             objects=(),
-            posture=(*self._draw_start(rng), self.arm.home[-1]),
+            posture=(*self._draw_start(rng), *self.arm.home[len(self.arm.chain.joints) :]),
             target_pose=self._draw_target(rng),
             instruction=self.instruction(None),
             variation=draw_variation(self.config.randomisation, rng),
@@ -156,7 +156,7 @@ class ReachTask(ArmTask):
 
     def _draw_posture(self, rng: np.random.Generator, spread: float | Sequence[float]) -> NDArray[np.float64]:
         """Return a posture around home; each joint is turned by at most `spread` [rad]."""
-        home, most = np.array(self.arm.home[:-1]), np.asarray(spread, np.float64)
+        home, most = np.array(self.arm.home[: len(self.arm.chain.joints)]), np.asarray(spread, np.float64)
         return home + rng.uniform(-most, most, len(home))
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[float, ...]:

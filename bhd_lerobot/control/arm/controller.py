@@ -96,7 +96,7 @@ class ArmController(Controller):
         put_setpoint_limits(self._limits, calm, control_hz, frame_ticks)
         put_goal_limits(self._limits, arm, control_hz)
         self._put_limits(calm, control_hz, frame_ticks)
-        self._limits["holds"], self._limits["keeps_clear"] = holds, keeps_clear
+        self._limits["holds"], self._limits["keeps_clear"] = holds and arm.gripper is not None, keeps_clear
         if max_force is not None:
             put_force_limit(self._limits, body, control_hz, max_force, wrench=wrench)
         states, arms = self.states, self.arms
@@ -129,7 +129,7 @@ class ArmController(Controller):
         self._lead, self._stiffness = np.asarray(arm.lead_s), np.asarray(arm.servo_stiffness)
         # [rad] so far a joint may be from its reference when it is found that it does not follow
         speed = np.asarray(limits.velocity)
-        self._reach = (arm.blocked_rad + speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:-1]
+        self._reach = (arm.blocked_rad + speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:dof]
         self._damping, self._effort = np.asarray(arm.servo_damping), np.asarray(limits.effort)
         self._lower, self._upper, self._speed = np.asarray(limits.lower), np.asarray(limits.upper), speed
         # As the functions of a tick take them.
@@ -419,9 +419,9 @@ class ArmController(Controller):
 
     def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Continue from the posture that the arms are in; what they grip is not let go of."""
-        opening = self.command[ids, -1]
+        opening = self.command[ids, self._dof :].copy()
         self.configure(ids, reading)
-        self.command[ids, -1] = self.actuators[ids, -1] = opening
+        self.command[ids, self._dof :] = self.actuators[ids, self._dof :] = opening
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else."""

@@ -82,6 +82,10 @@ def _check_ranges(command: BrainCommand, arm: Arm) -> PlanFailure | None:
                 )
     opening = command.gripper
     if opening is not None:
+        if arm.gripper is None:
+            return PlanFailure(
+                ResultCode.BAD_TARGET, f"gripper is {opening}, and the arm has no gripper; leave it out."
+            )
         if not math.isfinite(opening):
             return PlanFailure(ResultCode.NON_FINITE, f"gripper is {opening}; it must be finite.")
         if not 0.0 <= opening <= arm.gripper.max_opening:

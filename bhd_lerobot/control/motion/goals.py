@@ -207,7 +207,7 @@ class GoalManager:
                 self._brake(sim, _Motion.BRAKE)
             return True
         self._planned[sim] = plan.trajectory.ticks
-        self._opening[sim] = float(plan.target[self._dof])
+        self._opening[sim] = float(plan.target[self._dof]) if self._arm.gripper else None
         if plan.rows is None:
             self.player.start(sim, plan.trajectory if before is None else before.then(plan.trajectory))
         else:

@@ -109,6 +109,8 @@ class GoalPlanner:
         arm = self._plan_arm(command, state[self._arm])
         if isinstance(arm, PlanFailure):
             return arm
+        if self.arm.gripper is None:
+            return Plan(arm, arm.target.copy())
         gripper = self._plan_gripper(command.gripper if command.gripper is not None else opening, state[self._gripper])
         if isinstance(gripper, PlanFailure):
             return gripper

@@ -83,7 +83,7 @@ class StallWatch:
     def __init__(self, frames: int, robot: RobotFeatures) -> None:
         self._window, self._dt = frames + 1, 1.0 / robot.fps
         self._is_base = robot.body is not None and robot.body.drive is not None
-        names = _TWIST if self._is_base else _body_of(robot).limits.names[:-1]
+        names = _TWIST if self._is_base else _joints_of(robot)
         self._width = 2 if self._is_base else len(names)
         self._columns = find_columns(robot.observation_names, names, "dagger", "observation")
         self._pose: Array = np.zeros((0, 3))
@@ -224,9 +224,9 @@ def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
     )
 
 
-def _body_of(robot: RobotFeatures) -> Body:
+def _joints_of(robot: RobotFeatures) -> tuple[str, ...]:
     if robot.body is None:
         raise ConfigError(
             "brain.stall_s needs a robot whose joints are known: a simulated one. Leave it out: --brain.stall_s=null."
         )
-    return robot.body
+    return robot.body.limits.names[: len(robot.body.need(Arm).chain.joints)]

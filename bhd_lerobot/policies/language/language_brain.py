@@ -101,7 +101,8 @@ class LanguageBrain(PickBrain):
     def bind(self, robot: RobotFeatures) -> None:
         """Find the gripper, and the objects or the camera that shows them."""
         super().bind(robot)
-        self._home = robot.need(Arm).home
+        arm = robot.need(Arm)
+        self._home = arm.home[: len(arm.chain.joints)]
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
 
@@ -250,7 +251,7 @@ class LanguageBrain(PickBrain):
         work.stage, work.plan, work.grasp, self._sights[sim].objects = "home", None, None, None
         return BrainCommand(
             self.new_id(sim, "home"),
-            joint_target=self._home[:-1],
+            joint_target=self._home,
             max_velocity=_HOME_SPEED,
             max_acceleration=_HOME_CHANGE,
         )

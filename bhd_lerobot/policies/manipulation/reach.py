@@ -30,12 +30,13 @@ class ReachBrain(GoalBrain):
         super().__init__(config or ReachBrainConfig())
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._tries: dict[int, int] = {}
-        self._home: tuple[float, ...] = ()
+        self._home: tuple[float, ...] = ()  # of the joints
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the target, and home."""
         super().bind(robot)
-        self._home = robot.need(Arm).home
+        arm = robot.need(Arm)
+        self._home = arm.home[: len(arm.chain.joints)]
         self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
@@ -53,7 +54,7 @@ class ReachBrain(GoalBrain):
                 return None
             if self.doing[sim] != "go home":
                 self.doing[sim] = "go home"
-                return self._goal(sim, "home", joint_target=self._home[:-1])
+                return self._goal(sim, "home", joint_target=self._home)
         if seen.environment_state is None:
             raise AssertionError("The brain was bound to a target.")
         x, y, z, *quaternion = seen.environment_state[sim, self._columns].tolist()
