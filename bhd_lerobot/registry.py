@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.robots.config import RobotConfig
 
+import bhd_lerobot.robots.config_arm
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
 import bhd_lerobot.ros2.robots.config_robot
@@ -17,7 +18,7 @@ import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
 from bhd_lerobot.bodies.body import PARTS, Body
-from bhd_lerobot.bodies.registry import BODIES
+from bhd_lerobot.bodies.registry import BODIES, parts_of_type
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.registry import Registry, with_article
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain
@@ -75,6 +76,8 @@ class _Blanked(BlankedBrain):
 
 
 _SIMULATIONS: dict[str, Any] = {
+    "arm": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
+    "so101": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
     "turtlebot3": "bhd_lerobot.robots.base_simulation:BaseSimulation",
     "ur5": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
 }
@@ -166,7 +169,9 @@ def parts_of(robot: Any) -> Set[type]:
     """
     if not is_ours(robot_type := robot if isinstance(robot, str) else robot.type):
         return frozenset()
-    body: Body = BODIES[robot_type]() if isinstance(robot, str) else robot.body()
+    if isinstance(robot, str):
+        return parts_of_type(robot_type)
+    body: Body = robot.body()
     return body.parts.keys()
 
 

@@ -17,9 +17,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "options": (),
     "bodies": ("options",),
     "sim": (
-        *("versions", "bodies.body", "bodies.tabletop"),
+        *("versions", "bodies"),
         *("control", "control.geometry", "control.tick", "control.cerebellum"),
     ),
+    "sim.files": ("bodies", "control", "control.geometry", "sim"),
     "control": ("bodies.body",),
     "control.geometry": ("versions", "bodies.body", "control"),
     "control.motion": ("versions", "bodies.body", "control", "control.geometry"),
@@ -35,7 +36,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("realtime", "options", "bodies.body", "control", "datasets.format", "robots.host"),
-    "robots": ("realtime", "tasks", "bodies", "sim", "control.*", "robots.host", "ros2.live.network"),
+    "robots": ("realtime", "tasks", "bodies", "sim.*", "control.*", "robots.host", "ros2.live.network"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
     "policies": (*_TASKS, "datasets.format.features"),
@@ -126,7 +127,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "apps.view": ("tasks", "bodies", "control", "control.geometry", *_DATASETS, "datasets.assembly", "datasets.edit"),
     "apps.monitor": ("control", "control.motion", "realtime", "datasets.format", "apps.view"),
-    "apps.doctor": ("options", "versions", "tasks", "policies", "bodies", "sim", "realtime", "datasets.format"),
+    "apps.doctor": (
+        *("options", "versions", "tasks", "policies", "bodies", "sim", "realtime", "datasets.format"),
+        "control.geometry",
+    ),
     "api": (
         *("options", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
     ),

@@ -2,10 +2,12 @@
 
 __all__ = [
     "arenas",
+    "arm_file",
     "body",
     "differential_base",
     "registry",
     "scenes",
+    "so101",
     "tabletop",
     "truth",
     "turtlebot3",

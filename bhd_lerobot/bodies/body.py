@@ -481,6 +481,32 @@ class GripperSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Handling:
+    """How an arm takes things from its table, from above.
+
+    Attributes:
+        scale: measures of the objects that it is given, compared with those of the UR5's.
+        finger: half the thickness of a finger, and a little room [m].
+        palm: from the tool centre point up to where an object would touch the palm [m].
+        lowest: the tool centre point above the table when the finger tips are just above it [m].
+        travel: height of the tool above the table on free motions: the finger tips stay above every object [m].
+        lift: height by which it can lift what it has grasped anywhere on its table [m].
+        neutral: direction from the right to the left finger, beside that from the base to the tool, when the wrist is
+            turned as at home [rad].
+        hand_over: where a person can take what it holds [m].
+    """
+
+    scale: float = 1.0
+    finger: float = 0.018
+    palm: float = 0.055
+    lowest: float = 0.024
+    travel: float = 0.22
+    lift: float = 0.15
+    neutral: float = 0.0
+    hand_over: tuple[float, float, float] = (0.40, -0.40, 0.35)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Workspace:
     """Where tasks put targets and objects, in an arm's base frame: before the arm, over its table.
 
@@ -489,12 +515,31 @@ class Workspace:
         around_home: a posture of a target turns each joint from home by at most this [rad].
         table: two corners of the rectangle that objects stand in [m].
         reach: horizontal distance from the base beyond which a tool that points down does not get [m].
+        handling: how things are taken from the table.
     """
 
     tool: tuple[tuple[float, float, float], tuple[float, float, float]]
     around_home: tuple[float, ...]
     table: tuple[tuple[float, float], tuple[float, float]]
     reach: float
+    handling: Handling = Handling()
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """What moves as one with a joint of an arm, in the frame of the chain that turns with it.
+
+    Attributes:
+        mass: [kg].
+        centre: of mass [m].
+        about: rotational inertia about the centre of mass, by rows [kg m^2].
+        rotor: of the motor, as the joint feels it [kg m^2].
+    """
+
+    mass: float
+    centre: tuple[float, float, float]
+    about: tuple[tuple[float, float, float], ...]
+    rotor: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -521,7 +566,11 @@ class Arm:
         workspace: where tasks put targets and objects.
         payload: largest mass in the gripper [kg].
         load: mass that the gripper is declared to carry, at the tool centre point [kg]: motions are planned with it.
+        inertias: of each joint, the gripper at its opening at home as a part of the last; those of the body's MJCF if
+            left out, whose joints are then the chain's and the gripper's, each about an axis of its body.
         latency_s: time until a command acts [s]; the reference is led by it, as by the servos' own lag.
+        arrived_rad: a joint nearer to its target than this that stands still has arrived [rad]: friction, and what
+            the gripper holds, keep soft servos off by a part of it.
         blocked_rad: a joint that is farther than this from its reference does not follow it [rad]; goals end then.
             What the latency accounts for is added to it.
         blocked_s: an arm with such a joint, whose servo gives all it has, is stopped after so long [s].
@@ -540,7 +589,9 @@ class Arm:
     load: float = 0.0
     brake_damping: tuple[float, ...] = ()
     brake_slip: tuple[float, ...] = ()
+    inertias: tuple[Inertia, ...] = ()
     latency_s: float = 0.0
+    arrived_rad: float = 0.002
     blocked_rad: float = 0.1
     blocked_s: float = 0.05
 

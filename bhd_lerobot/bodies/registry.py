@@ -1,16 +1,28 @@
 """The body of every robot, for whoever reads its data and makes no robot."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
 
-from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.options.registry import Registry
 
-_OWN: dict[str, Callable[[], Body]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
-BODIES = Registry("body", _OWN)
+_OWN: dict[str, Callable[[], Body] | str] = {
+    "turtlebot3": turtlebot3_burger,
+    "ur5": ur5,
+    "arm": ur5,  # stands for the arms that are files
+    "so101": "bhd_lerobot.sim.files.arm:so101",
+}
+_OF_FILES = ("arm", "so101")  # types whose bodies take seconds to be made
+BODIES: Registry[Callable[[], Body]] = Registry("body", _OWN)
 """What makes the body of a robot with the options that it has by default, by the robot's type."""
+
+
+def parts_of_type(robot_type: str) -> Set[type]:
+    """Return the parts that robots of a type have by default."""
+    return {Arm, GripperSpec} if robot_type in _OF_FILES else BODIES[robot_type]().parts.keys()
+
 
 _unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
 
@@ -22,7 +34,7 @@ def body_with(part: type) -> Body:
 
 def body_of(robot_type: str | None) -> Body | None:
     """Return the body of a robot as a dataset names it; None if it names none, or there is no such robot."""
-    if robot_type is None:
+    if robot_type is None or robot_type == "arm":  # one of a file: it stands for all of them, and is none
         return None
     if robot_type not in BODIES and robot_type not in _unknown:
         load_plugins()

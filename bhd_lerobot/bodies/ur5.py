@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Literal
 
-from bhd_lerobot.bodies.body import Arm, ArmChain, Body, CameraSpec, Capsule, GripperSpec, Limits, Workspace
+from bhd_lerobot.bodies.body import Arm, ArmChain, Body, CameraSpec, Capsule, GripperSpec, Handling, Limits, Workspace
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -62,6 +62,8 @@ _DISJOINT = (
 )
 _MOVING = ("upper_arm", "elbow", "forearm", "wrist_1", "wrist_2", "wrist_3", *_TOOLING)
 
+# [rad] The fingers stand one behind the other at home: see `Handling.neutral`.
+NEUTRAL = math.pi - math.atan2(0.10915, 0.48690)
 _PAYLOAD = 5.0  # [kg]
 _BRAKING_SPEED = 0.35  # [rad/s] the speed at which a brake gives a joint's largest torque
 _SLIP = 0.1  # share of a joint's largest torque with which its brake slips
@@ -147,6 +149,7 @@ def ur5(
                 around_home=(1.0, 0.9, 0.9, 1.2, 1.2, math.pi),
                 table=((0.35, -0.30), (0.65, 0.30)),
                 reach=0.80,
+                handling=Handling(neutral=NEUTRAL),
             ),
             payload=_PAYLOAD,
             load=load,

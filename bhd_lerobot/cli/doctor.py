@@ -4,15 +4,19 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.console import Console
+
 from bhd_lerobot.apps.doctor.doctor import RunTrials, examine_and_print
 from bhd_lerobot.apps.doctor.trials import run_trials
-from bhd_lerobot.options.command import Parser, exit_status
+from bhd_lerobot.options.command import Parser, Program, exit_status
+from bhd_lerobot.options.command import run as run_program
 
 
 def _parser() -> Parser:
     parser = Parser(
         prog="bhd-doctor",
-        description="Check this machine; print symptom, cause and remedy of each problem. Exit status 1: a problem.",
+        description="Check this machine; print symptom, cause and remedy of each problem. Exit status 1: a problem. "
+        "With --robot.type=… and its other options: print what is understood of an arm, and write --picture=FILE.",
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
@@ -30,6 +34,12 @@ def _parser() -> Parser:
 
 def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
     """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if any(one.startswith("--robot.") for one in given):
+        import bhd_lerobot.registry  # noqa: F401  registers the robots
+        from bhd_lerobot.apps.doctor.robot import RobotDescription, describe_robot
+
+        return run_program(Program(RobotDescription, lambda config: describe_robot(config, Console())), given)
     return exit_status(lambda: examine_and_print(_parser().parse(arguments), run))
 
 

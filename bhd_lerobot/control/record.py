@@ -307,6 +307,7 @@ ARM_LIMITS = record(
         ("effort", *_vector),
         # Goals and what is in their way.
         ("blocked_rad", _f),
+        ("arrived_rad", _f),
         ("latency_s", _f),
         ("acceleration", *_vector),
         ("blocked_ticks", _i),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.robots.arm_host import observation_names, tool_names
 from bhd_lerobot.robots.arm_simulation import ArmSimulation
-from bhd_lerobot.robots.config_arm import ArmConfig
+from bhd_lerobot.robots.config_arm import ArmConfig, FileArmConfig, SO101Config
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
@@ -66,3 +66,17 @@ class SimulatedArm(BhdRobot):
     def action_names(self) -> tuple[str, ...]:
         """Names of the action's floats, in order."""
         return tool_names(self.body) if self.config.action_space == "tool" else super().action_names
+
+
+class FileArm(SimulatedArm):
+    """An arm from an MJCF or a URDF: its joints, and `gripper` if it has one."""
+
+    config_class = FileArmConfig
+    name = "arm"
+
+
+class SO101(SimulatedArm):
+    """SO-101 with its jaw: `shoulder_pan`, `shoulder_lift`, `elbow_flex`, `wrist_flex`, `wrist_roll`, `gripper`."""
+
+    config_class = SO101Config
+    name = "so101"

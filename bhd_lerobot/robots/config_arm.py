@@ -2,11 +2,15 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
 from bhd_lerobot.bodies.body import OBSTACLE, Body, Capsule
+from bhd_lerobot.bodies.so101 import SO101
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
@@ -80,3 +84,114 @@ class ArmConfig(BhdRobotConfig):
     @abstractmethod
     def body(self) -> Body:
         """Return the hardware that this configuration describes."""
+
+
+@dataclass
+class GripperOptions:
+    """The gripper of an arm in a file.
+
+    Attributes:
+        name: its actuator, the tendon that this pulls, or its joint, by name; the one that the file has if empty,
+            ``none`` for an arm without one.
+        open: where its joint is when it is open [m or rad]; the end of its range that is farther open if not set.
+        closed: where its joint is when it is closed [m or rad]; the other end if not set.
+        opening: distance between the fingers where it is open [m]; the way of its finger tips if not set.
+    """
+
+    name: str = ""
+    open: float | None = None
+    closed: float | None = None
+    opening: float | None = None
+
+
+@dataclass(kw_only=True)
+class ModelArmConfig(ArmConfig):
+    """Options of arms whose model is a file. A subclass says which, in `file`."""
+
+    @property
+    @abstractmethod
+    def file(self) -> ArmFile:
+        """The file, and what it does not say."""
+
+    def body(self) -> Body:
+        """Return the hardware that this configuration describes."""
+        from bhd_lerobot.sim.files.arm import arm_body  # imports MuJoCo
+
+        if self.control == "impedance":
+            raise ConfigError("robot.control is 'impedance'; this arm has position servos: use --robot.control=servo.")
+        return arm_body(
+            self.file,
+            load=self.payload,
+            obstacles=self.capsules,
+            command_timeout_s=1 / self.fps + self.stale_after_s,
+            camera_width=self.camera_width,
+            camera_height=self.camera_height,
+        )
+
+
+@RobotConfig.register_subclass("so101")
+@dataclass(kw_only=True)
+class SO101Config(ModelArmConfig):
+    """Configuration of the robot type ``so101``: the options of an arm."""
+
+    @property
+    def file(self) -> ArmFile:
+        """The file, and what it does not say."""
+        return SO101
+
+
+@RobotConfig.register_subclass("arm")
+@dataclass(kw_only=True)
+class FileArmConfig(ModelArmConfig):
+    """Configuration of the robot type ``arm``: any arm, by its file. What is not set is read from it, or guessed.
+
+    A subclass with values of its own is a robot of its own.
+
+    Attributes:
+        mjcf: the file: MJCF, or URDF as MuJoCo reads it. Of a scene the robot alone is taken.
+        tool: the site of the tool centre point, or a body, by name.
+        tool_offset: where the tool centre point is in that site or body, x, y, z [m].
+        gripper: the gripper.
+        home: posture that it starts in, one number for each joint [rad].
+        ranges: lowest and highest position [rad] of joints by name, in place of the file's.
+        velocity: largest speed of each joint, or of all of them [rad/s]; a URDF says it, for an MJCF 2 is an estimate.
+        acceleration: largest acceleration, likewise [rad/s^2].
+        effort: largest torque, likewise [N m].
+    """
+
+    mjcf: Path | None = None
+    tool: str = ""
+    tool_offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    gripper: GripperOptions = field(default_factory=GripperOptions)
+    home: list[float] = field(default_factory=list)
+    ranges: dict[str, list[float]] = field(default_factory=dict)
+    velocity: list[float] = field(default_factory=list)
+    acceleration: list[float] = field(default_factory=list)
+    effort: list[float] = field(default_factory=list)
+
+    @property
+    def file(self) -> ArmFile:
+        """The file, and what it does not say.
+
+        Raises:
+            ConfigError: there is none, or what is said of it is not valid.
+        """
+        if not self.mjcf:
+            raise ConfigError("robot.mjcf is not set: name the file of the arm, --robot.mjcf=FILE, an MJCF or a URDF.")
+        for name, values in self.ranges.items():
+            if len(values) != 2:
+                raise ConfigError(f"robot.ranges has {values} for {name!r}; it needs the lowest and the highest [rad].")
+        if len(self.tool_offset) != 3 or not np.isfinite(self.tool_offset).all():
+            raise ConfigError(f"robot.tool_offset is {self.tool_offset}; it needs three finite numbers [m].")
+        return ArmFile(
+            name=self.type,
+            path=str(self.mjcf),
+            tool=self.tool,
+            tool_offset=tuple(self.tool_offset),
+            gripper=GripperFile(**vars(self.gripper)),
+            home=tuple(self.home),
+            ranges=tuple((name, *values) for name, values in self.ranges.items()),
+            velocity=tuple(self.velocity),
+            acceleration=tuple(self.acceleration),
+            effort=tuple(self.effort),
+        )

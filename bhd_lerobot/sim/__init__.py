@@ -7,6 +7,7 @@ __all__ = [
     "description",
     "efforts",
     "engine",
+    "files",
     "frames",
     "lidar",
     "plant",

@@ -294,8 +294,7 @@ def _shapes(
         into: the transforms from the world into the frames in which the chain's joints are where the model has them.
     """
     own = [geom for geom in range(model.ngeom) if frames[model.geom_bodyid[geom]] is not None]
-    if frames[0] == 0:
-        own = [geom for geom in own if frames[model.geom_bodyid[geom]]]  # what stands in the world is no arm
+    own = [geom for geom in own if model.geom_bodyid[geom]]  # what stands in the world is no arm
     collide = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
     solid = {frames[model.geom_bodyid[geom]] for geom in collide}
     others = [j for j in range(model.njnt) if j not in joints and model.jnt_type[j] in (_HINGE, _SLIDE)]

@@ -291,6 +291,8 @@ def _draw_objects(
     task: PickConfig, arm: Arm, names: Sequence[tuple[str, str]], rng: np.random.Generator
 ) -> list[TableObject]:
     """Return objects of these colours and kinds that stand apart; fewer if the last found no place."""
+    gripper, handling = arm.gripper, arm.workspace.handling
+    assert gripper is not None
     objects: list[TableObject] = []
     unseen = task.objects == "unseen"
     for colour, kind in names:
@@ -299,12 +301,12 @@ def _draw_objects(
         if unseen:
             ranges = _UNSEEN[kind][int(rng.integers(2))]
             change |= {"size": (1.0, 1.0, 1.0), "shade": _other_shade(colour, rng), "style": "other", "marks": ()}
-        length = rng.uniform(*ranges[0])
-        width = length if kind == "cup" else rng.uniform(*ranges[1])
-        height = rng.uniform(*ranges[2])
+        length = handling.scale * rng.uniform(*ranges[0])
+        width = length if kind == "cup" else handling.scale * rng.uniform(*ranges[1])
+        height = handling.scale * rng.uniform(*ranges[2])
         factor = change["size"]
         size_x = length / 2 * factor[0]
-        size_y = min(width / 2 * factor[0 if kind == "cup" else 1], arm.gripper.widest / 2)
+        size_y = min(width / 2 * factor[0 if kind == "cup" else 1], gripper.widest / 2)
         size_x = size_y if kind == "cup" else size_x
         place = _draw_place(math.hypot(size_x, size_y) if kind == "box" else size_x, arm, objects, rng)
         if place is None:
@@ -319,7 +321,7 @@ def _draw_objects(
                 x=float(place[0]),
                 y=float(place[1]),
                 yaw=float(rng.uniform(-math.pi, math.pi)),
-                mass=float(rng.uniform(0.08, 0.30) * change["mass"]),
+                mass=float(rng.uniform(0.08, 0.30) * change["mass"] * handling.scale**2),
                 friction=float(0.9 * change["friction"]),
                 shade=change["shade"],
                 style=change["style"],
@@ -347,7 +349,10 @@ def _draw_place(
         place = rng.uniform(*arm.workspace.table)
         for item in objects:
             other = math.hypot(item.size_x, item.size_y) if item.kind == "box" else item.size_x
-            if math.hypot(place[0] - item.x, place[1] - item.y) < radius + other + _APART:
+            if (
+                math.hypot(place[0] - item.x, place[1] - item.y)
+                < radius + other + _APART * arm.workspace.handling.scale
+            ):
                 break
         else:
             return np.asarray(place)

@@ -164,7 +164,7 @@ class ReachTask(ArmTask):
             posture = self._draw_posture(rng, self.config.start_spread_rad)
             if self._kinematics.check(posture) == ResultCode.SUCCEEDED:
                 return tuple(posture.tolist())
-        raise AssertionError("No start posture is free; home is.")
+        raise ConfigError("No posture near the arm's home is free; give another home.")
 
     def _draw_target(self, rng: np.random.Generator) -> tuple[float, ...]:
         """Return a pose that an admissible posture has: reachable by construction."""
@@ -177,4 +177,6 @@ class ReachTask(ArmTask):
                 continue
             if kinematics.check(posture) == ResultCode.SUCCEEDED:
                 return tuple(pose_vectors(tool).tolist())
-        raise AssertionError("No target was found; the box before the arm is full of them.")
+        raise ConfigError(
+            "The arm reaches no pose within its workspace from postures near its home; give another home."
+        )

@@ -74,7 +74,9 @@ class BhdKeyboardArm(KeyboardTeleoperator):
 
     @property
     def _widest(self) -> float:
-        return self._arm.gripper.max_opening if self.config.opening is None else self.config.opening
+        gripper = self._arm.gripper
+        largest = gripper.max_opening if gripper else 0.0
+        return largest if self.config.opening is None else self.config.opening
 
     @property
     def action_features(self) -> dict[str, type]:

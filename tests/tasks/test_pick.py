@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
@@ -27,6 +28,7 @@ from tests.tasks.support import Judged
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "record"
 
 FPS = 10
+HANDLING = ur5().need(Arm).workspace.handling
 WILD = RandomisationConfig(enabled=True)
 SCENE = TableScene(
     name="pick",
@@ -140,7 +142,9 @@ def test_every_object_can_be_grasped_without_touching_another(randomisation: Ran
         state = task.environment_state(truth_of([task.sample(seed)]))
         objects = read_objects(state.reshape(MAX_OBJECTS, len(OBJECT_FIELDS)))
         for one in objects:
-            grasp = plan_grasp(one, [other for other in objects if other.index != one.index], MAX_OPENING)
+            grasp = plan_grasp(
+                one, [other for other in objects if other.index != one.index], MAX_OPENING, handling=HANDLING
+            )
             assert grasp is not None
             assert grasp.room > 0
 

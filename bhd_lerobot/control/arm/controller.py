@@ -387,7 +387,7 @@ class ArmController(Controller):
         step = np.where((step * way > 0.0) & (np.abs(step) <= np.abs(way)), step, gradual)
         self.command[sim, :dof] = now + step
         # The gripper is in nobody's way: it comes to rest.
-        last = self.actuators[sim, dof:] - arm["before"][dof : dof + 1]
+        last = self.actuators[sim, dof:] - arm["before"][dof : self.width]
         last -= np.clip(last, -self._bend[dof:], self._bend[dof:])
         self.command[sim, dof:] = self.actuators[sim, dof:] + last
         self.velocity[sim] = self.acceleration[sim] = 0.0

@@ -104,3 +104,15 @@ def with_pairs(chain: ArmChain, home: Array, lower: Array, upper: Array) -> ArmC
     at_home = model.each(home[None])[: len(pairs), 0]
     may = (at_home >= chain.min_distance) & (nearest < _NEVER) & (near < _ALWAYS * _POSTURES)
     return replace(chain, disjoint=tuple(pair for pair, one in zip(pairs, may, strict=True) if one))
+
+
+def left_out(chain: ArmChain) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of capsules on links that are no neighbours whose distance is not checked."""
+    checked = {frozenset(pair) for pair in chain.disjoint}
+    capsules = chain.capsules
+    return tuple(
+        (one.name, other.name)
+        for number, one in enumerate(capsules)
+        for other in capsules[number + 1 :]
+        if abs(one.frame - other.frame) > 1 and frozenset((one.name, other.name)) not in checked
+    )

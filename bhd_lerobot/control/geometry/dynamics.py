@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.versions import check_version
@@ -71,25 +71,8 @@ class ArmDynamics:
 
     def __init__(self, body: Body) -> None:
         arm = body.need(Arm)
-        opening = arm.home[-1]
-        if not 0.0 <= opening <= arm.gripper.max_opening:
-            raise ConfigError(
-                f"The gripper's opening is {opening} m; it must be between 0 and {arm.gripper.max_opening} m."
-            )
-        whole = _parse(body)
-        joints, wanted = tuple(whole.names)[1:], (*arm.chain.joints, *arm.gripper.joints)
-        if joints != wanted:
-            raise ConfigError(f"The MJCF of {body.name!r} has the joints {joints}; it needs {wanted}.")
-        posture = pinocchio.neutral(whole)
-        if not whole.existFrame(TOOL_SITE):
-            if not re.search(rf"<site\b[^>]*\bname=[\"']{TOOL_SITE}[\"']", body.mjcf):
-                raise ConfigError(f"The MJCF of {body.name!r} has no site {TOOL_SITE!r}, the tool centre point.")
-            _add_tool(whole, arm, posture)
-        posture[-2:] = opening / 2
-        locked = [whole.getJointId(name) for name in arm.gripper.joints]
-        self.model = pinocchio.buildReducedModel(whole, locked, posture)
+        self.model = _of_inertias(arm) if arm.inertias else _of_mjcf(body)
         self.dof = self.model.nv
-        self.model.armature = whole.armature[: self.dof]  # version 3 of Pinocchio drops it; the fingers are the last
         self._tool = self.model.getFrameId(TOOL_SITE)
         if arm.load:
             last = self.model.frames[self._tool].parentJoint
@@ -122,7 +105,7 @@ class ArmDynamics:
             velocity: joint speeds [rad/s], shape (n, 6).
         """
         n, dof, model, data = len(position), self.dof, self.model, self._data
-        mass, coriolis, jacobian = (np.empty((n, dof, dof)) for _ in range(3))
+        mass, coriolis, jacobian = (np.empty((n, rows, dof)) for rows in (dof, dof, 6))
         gravity, tool = np.empty((n, dof)), np.empty((n, 4, 4))
         for sim in range(n):
             q, v = position[sim], velocity[sim]
@@ -171,6 +154,40 @@ def acceleration_share(body: Body) -> float:
 def product(matrices: Array, vectors: Array) -> Array:
     """Return each matrix, shape (n, i, j), times its vector, shape (n, j); the same bits whatever n is."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _of_mjcf(body: Body) -> pinocchio.Model:
+    arm, gripper = body.need(Arm), body.need(GripperSpec)
+    opening = arm.home[-1]
+    if not 0.0 <= opening <= gripper.max_opening:
+        raise ConfigError(f"The gripper's opening is {opening} m; it must be between 0 and {gripper.max_opening} m.")
+    whole = _parse(body)
+    joints, wanted = tuple(whole.names)[1:], (*arm.chain.joints, *gripper.joints)
+    if joints != wanted:
+        raise ConfigError(f"The MJCF of {body.name!r} has the joints {joints}; it needs {wanted}.")
+    posture = pinocchio.neutral(whole)
+    if not whole.existFrame(TOOL_SITE):
+        if not re.search(rf"<site\b[^>]*\bname=[\"']{TOOL_SITE}[\"']", body.mjcf):
+            raise ConfigError(f"The MJCF of {body.name!r} has no site {TOOL_SITE!r}, the tool centre point.")
+        _add_tool(whole, arm, posture)
+    posture[-2:] = opening / 2
+    locked = [whole.getJointId(name) for name in gripper.joints]
+    model = pinocchio.buildReducedModel(whole, locked, posture)
+    model.armature = whole.armature[: model.nv]  # version 3 of Pinocchio drops it; the fingers are the last
+    return model
+
+
+def _of_inertias(arm: Arm) -> pinocchio.Model:
+    model, last = pinocchio.Model(), 0
+    places = (arm.chain.base, *arm.chain.links)
+    for name, place, inertia in zip(arm.chain.joints, places, arm.inertias, strict=False):
+        last = model.addJoint(last, pinocchio.JointModelRZ(), pinocchio.SE3(place.matrix()), name)
+        about = pinocchio.Inertia(inertia.mass, np.array(inertia.centre), np.array(inertia.about))
+        model.appendBodyToJoint(last, about, pinocchio.SE3.Identity())
+    model.armature = np.array([inertia.rotor for inertia in arm.inertias])
+    tool = pinocchio.SE3(places[-1].matrix() @ arm.chain.tool.matrix())
+    model.addFrame(pinocchio.Frame(TOOL_SITE, last, 0, tool, pinocchio.FrameType.OP_FRAME))
+    return model
 
 
 def _add_tool(whole: pinocchio.Model, arm: Arm, posture: Array) -> None:

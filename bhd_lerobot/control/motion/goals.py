@@ -52,14 +52,14 @@ class GoalManager:
     ) -> None:
         self._arm, n = body.need(Arm), len(arms)
         self._hz, self._dof = control_hz, len(self._arm.chain.joints)
-        dof = self._dof
+        width = len(self._arm.limits.names)
         self.planner = GoalPlanner(body, control_hz)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
         self.busy: NDArray[np.bool_] = states["busy"]
         self.following: NDArray[np.bool_] = arms["follows"]
-        self.player = TrajectoryPlayer(arms, dof + 1)
+        self.player = TrajectoryPlayer(arms, width)
         self._states, self._arms, self._follows = states, arms, states["follows_goal"]
-        self._reference = states["command"][:, : dof + 1], arms["speed"][:, : dof + 1], arms["change"][:, : dof + 1]
+        self._reference = states["command"][:, :width], arms["speed"][:, :width], arms["change"][:, :width]
         self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
         self._books = [GoalBook() for _ in range(n)]
         self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is

@@ -10,8 +10,7 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.kernels import kernel
 
-JOINT_TOLERANCE = 0.002  # [rad] a joint this close to its target has arrived,
-JOINT_STILL = 0.01  # [rad/s] if it is also slower than this: it does not move
+JOINT_STILL = 0.01  # [rad/s] a joint that has arrived is also slower than this: it does not move
 SETTLING_S = 0.5  # [s] after its trajectory's end that the arm may take to arrive
 OPENING_TOLERANCE = 0.002  # [m] a gripper this close to its target has arrived
 GRIPPER_STILL = 0.002  # [m/s] a gripper that is slower than this
@@ -36,7 +35,7 @@ _NONE, _OFF, _ARRIVED, _NOT_ARRIVED, _NOT_GRIPPED, _TIMEOUT = (int(one) for one 
 def put_goal_limits(row: Any, arm: Arm, control_hz: int) -> None:
     """Write into a record of `ARM_LIMITS` how goals are judged."""
     row["dof"] = dof = len(arm.chain.joints)
-    row["blocked_rad"], row["latency_s"] = arm.blocked_rad, arm.latency_s
+    row["blocked_rad"], row["latency_s"], row["arrived_rad"] = arm.blocked_rad, arm.latency_s, arm.arrived_rad
     row["acceleration"][:dof] = arm.limits.acceleration[:dof]
     seconds = {"settling": SETTLING_S, "gripping": GRIPPING_S, "stall": GRIPPER_STALL_S}
     for name, value in seconds.items():
@@ -104,7 +103,7 @@ def judge_end(state: Any, arm: Any, limits: Any) -> int:
     last, is_away = limits.dof, False
     for k in range(last):
         off = abs(state.position[k] - arm.aim[k])
-        is_away = is_away or off / JOINT_TOLERANCE > 1.0 or abs(state.velocity[k]) / JOINT_STILL > 1.0
+        is_away = is_away or off / limits.arrived_rad > 1.0 or abs(state.velocity[k]) / JOINT_STILL > 1.0
     is_away = is_away and arm.moves_arm
     is_open = arm.moves_gripper and abs(state.position[last] - arm.aim[last]) > OPENING_TOLERANCE
     is_open = is_open and arm.still < limits.stall_ticks
@@ -129,11 +128,11 @@ def explain_verdict(verdict: int, body_arm: Arm, state: Any, arm: Any, control_h
         return ResultCode.TIMEOUT, f"The goal was not reached within its {seconds:.3g} s."
     if verdict == Verdict.NOT_ARRIVED:
         off, speed = abs(position - arm["aim"][:dof]), abs(state["velocity"][:dof])
-        joint = int(np.maximum(off / JOINT_TOLERANCE, speed / JOINT_STILL).argmax())
+        joint = int(np.maximum(off / body_arm.arrived_rad, speed / JOINT_STILL).argmax())
         return ResultCode.GOAL_TOLERANCE, (
             f"{joints[joint]} is {off[joint]:.4f} rad from its target at {speed[joint]:.3f} rad/s, "
             f"{SETTLING_S} s after the end of the motion; "
-            f"{JOINT_TOLERANCE} rad and {JOINT_STILL} rad/s are the most."
+            f"{body_arm.arrived_rad:.4g} rad and {JOINT_STILL} rad/s are the most."
         )
     if verdict == Verdict.NOT_GRIPPED:
         return ResultCode.GOAL_TOLERANCE, (

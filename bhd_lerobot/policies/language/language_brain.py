@@ -216,7 +216,7 @@ class LanguageBrain(PickBrain):
             return super()._choose_grasp(target, others)
         grasp = super()._choose_grasp(target, others)
         # A side that leaves room for errors, unless other objects are in the way there.
-        careful = plan_grasp(target, others, self._max_opening - 2 * _WIDER)
+        careful = plan_grasp(target, others, self._max_opening - 2 * _WIDER, handling=self._handling)
         if careful is not None and grasp is not None and careful.room >= min(grasp.room, _ROOM):
             grasp = careful
         if grasp is None:  # what seems a little too wide may fit after all

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -68,11 +68,14 @@ class GoalBrain(ConfiguredBrain, ABC):
             ConfigError: no joint of the arm is so fast.
         """
         arm = robot.need(Arm)
-        most = max(arm.limits.velocity[: len(arm.chain.joints)])
-        if (speed := getattr(self.config, "max_velocity", 0.0)) > most:
-            raise ConfigError(
-                f"brain.max_velocity is {speed}; the arm's fastest joint turns at {most:.6g} rad/s at most."
-            )
+        for name, limits in (("max_velocity", arm.limits.velocity), ("max_acceleration", arm.limits.acceleration)):
+            most, own = max(limits[: len(arm.chain.joints)]), type(self.config)
+            if (value := getattr(self.config, name, 0.0)) <= most:
+                continue
+            if value != getattr(own, name):
+                unit = "rad/s" if name == "max_velocity" else "rad/s^2"
+                raise ConfigError(f"brain.{name} is {value}; the arm's fastest joint has {most:.6g} {unit} at most.")
+            self.config = replace(self.config, **{name: most})  # slower than what is usual
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Start an episode in one simulation."""

@@ -8,19 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Handling
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.control.geometry.poses import pose_vectors
 
-_FINGER = 0.018  # [m] half the thickness of a finger, and a little room
-_PALM = 0.055  # [m] from the tool centre point up to where an object would touch the palm
-_LOWEST = 0.024  # [m] the tool centre point above the table: the finger tips reach 14 mm farther
 _ROOM = 0.026  # [m] by which the gripper is opened wider than the object
 _FIT = 0.008  # [m] by which the open gripper must at least be wider than the object
 _ENOUGH = 0.025  # [m] more room than this beside the fingers is of no use
 _CUP_YAWS = 12
-# [rad] Direction from the right to the left finger, beside that from the base to the tool, when the wrist is turned as
-# at home, where the fingers stand one behind the other.
-_NEUTRAL = math.pi - math.atan2(0.10915, 0.48690)
 
 
 @dataclass(frozen=True)
@@ -63,6 +58,7 @@ class Grasp:
         opening: what to open the gripper to before [m].
         width: thickness of the object between the fingers [m].
         room: free space beside the fingers [m]; negative if something is in the way.
+        usual: by which the gripper is opened wider than an object whose pose is known exactly [m].
     """
 
     x: float
@@ -72,11 +68,12 @@ class Grasp:
     opening: float
     width: float
     room: float
+    usual: float = _ROOM
 
     @property
     def wider(self) -> float:
         """By which the opening is wider than for an object whose pose is known exactly [m]; negative if narrower."""
-        return self.opening - self.width - _ROOM
+        return self.opening - self.width - self.usual
 
     def pose(self, height: float) -> Pose:
         """Return the tool's pose above the grasp, at a height over the table [m]."""
@@ -100,6 +97,7 @@ def plan_grasp(
     enough: float = _ENOUGH,
     wider: float = 0.0,
     least: float = 0.0,
+    handling: Handling,
 ) -> Grasp | None:
     """Return the grasp with the most room for the fingers, and of those the one with the least turn of the wrist.
 
@@ -111,38 +109,38 @@ def plan_grasp(
         enough: more room than this beside the fingers is of no use [m].
         wider: by which the gripper is opened wider than for an object whose pose is known exactly, if it can be [m].
         least: by which it must at least be possible, for a side of the object to be grasped at [m].
+        handling: the arm's.
 
     Returns:
         The grasp, or None if the object does not fit between the fingers.
     """
     x, y, _ = target.position
     height = target.size[2]
-    z = max(height / 2, height - _PALM, _LOWEST)
+    z, finger = max(height / 2, height - handling.palm, handling.lowest), handling.finger
+    room, fit = _ROOM * handling.scale, _FIT * handling.scale
     grasps = []
     for yaw, width in _sides(target):
-        opening = min(max_opening, width + _ROOM + wider)
-        if width + _FIT + least > max_opening:
+        opening = min(max_opening, width + room + wider)
+        if width + fit + least > max_opening:
             continue
-        reach = opening / 2 + _FINGER
+        reach = opening / 2 + finger
         fingers = [(x + sign * reach * math.cos(yaw), y + sign * reach * math.sin(yaw)) for sign in (-1, 1)]
         gaps = [
-            math.hypot(fx - o.position[0], fy - o.position[1]) - o.radius - _FINGER
-            for fx, fy in fingers
-            for o in others
+            math.hypot(fx - o.position[0], fy - o.position[1]) - o.radius - finger for fx, fy in fingers for o in others
         ]
-        grasps.append(Grasp(x, y, z, yaw, opening, width, min(gaps, default=enough)))
+        grasps.append(Grasp(x, y, z, yaw, opening, width, min(gaps, default=enough), room))
     if not grasps:
         return None
-    neutral = neutral_yaw(x, y) if near is None else near
+    neutral = neutral_yaw(x, y, handling) if near is None else near
     best = max(grasps, key=lambda grasp: (min(grasp.room, enough), -_turn(grasp.yaw, neutral)))
     # Fingers are alike: of the two ways to stand on that line, the one with the smaller turn of the wrist.
     away = (best.yaw - neutral + math.pi / 2) % math.pi - math.pi / 2
     return replace(best, yaw=neutral + away)
 
 
-def neutral_yaw(x: float, y: float) -> float:
+def neutral_yaw(x: float, y: float, handling: Handling) -> float:
     """Return the direction of the line through the fingers for which the wrist need not turn [rad]."""
-    return math.atan2(y, x) + _NEUTRAL
+    return math.atan2(y, x) + handling.neutral
 
 
 def _sides(target: SeenObject) -> list[tuple[float, float]]:

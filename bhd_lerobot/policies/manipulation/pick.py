@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, GripperSpec
+from bhd_lerobot.bodies.body import Arm, GripperSpec, Handling
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError, PerceptionError
@@ -26,7 +26,6 @@ from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, sce
 
 SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
 _MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
-TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
 _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
 
@@ -72,13 +71,14 @@ class PickBrain(GoalBrain):
         super().__init__(config or PickBrainConfig())
         self._work: dict[int, Work] = {}
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._opening, self._max_opening = 0, 0.0
+        self._opening, self._max_opening, self._handling = 0, 0.0, Handling()
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
         super().bind(robot)
         self._find_objects(robot)
         self._max_opening = robot.need(GripperSpec).max_opening
+        self._handling = robot.need(Arm).workspace.handling
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
 
     def _find_objects(self, robot: RobotFeatures) -> None:
@@ -166,7 +166,7 @@ class PickBrain(GoalBrain):
 
     def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
         """Return how to grasp the object; None if it does not fit between the fingers."""
-        return plan_grasp(target, others, self._max_opening)
+        return plan_grasp(target, others, self._max_opening, handling=self._handling)
 
     def _carry_out(self, sim: int, skill: Skill, grasp: Grasp) -> BrainCommand | None:
         """Return the next goal of a skill that needs the grasp."""
@@ -178,12 +178,13 @@ class PickBrain(GoalBrain):
             work.stage = "close"
             command = BrainCommand(self.new_id(sim, "close"), gripper=max(0.0, grasp.width - SQUEEZE))
         elif skill == Skill.LIFT:
-            command = self._line(sim, "lift", grasp, grasp.z + config.lift_m)
+            command = self._line(sim, "lift", grasp, grasp.z + min(config.lift_m, self._handling.lift))
         elif skill == Skill.HAND_OVER:
             work.stage = "hand_over"
+            x, y, z = self._handling.hand_over
             command = BrainCommand(
                 self.new_id(sim, "hand_over"),
-                target_pose=pointing_down(*_HAND_OVER, yaw=neutral_yaw(*_HAND_OVER[:2])),
+                target_pose=pointing_down(x, y, z, yaw=neutral_yaw(x, y, self._handling)),
                 max_velocity=config.max_velocity / 2,
                 max_acceleration=config.max_acceleration / 2,
             )
@@ -240,7 +241,7 @@ class PickBrain(GoalBrain):
         work.stage = stage
         return BrainCommand(
             self.new_id(sim, stage),
-            target_pose=grasp.pose(TRAVEL),
+            target_pose=grasp.pose(self._handling.travel),
             gripper=opening,
             max_velocity=config.max_velocity,
             max_acceleration=config.max_acceleration,
@@ -273,4 +274,3 @@ _LAST_STAGE: dict[Skill, tuple[str, ...]] = {
     Skill.HAND_OVER: ("hand_over",),
     Skill.PLACE: ("release",),
 }
-_HAND_OVER = (0.40, -0.40, 0.35)  # [m] beside the table's middle, where a person can take it

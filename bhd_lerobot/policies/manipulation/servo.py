@@ -14,14 +14,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, GripperSpec
+from bhd_lerobot.bodies.body import Arm, GripperSpec, Handling
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Positive, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
-from bhd_lerobot.policies.manipulation.pick import SQUEEZE, TRAVEL
+from bhd_lerobot.policies.manipulation.pick import SQUEEZE
 from bhd_lerobot.policies.manipulation.reach import TARGET
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ class _ServoBrain(ConfiguredBrain):
     def __init__(self, config: ServoConfig) -> None:
         super().__init__(config)
         self._tool: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._gripper, self._max_opening = 0, 0.0
+        self._gripper, self._max_opening, self._handling = 0, 0.0, Handling()
         self._error = np.asarray(config.camera_error_m, np.float64)
 
     def bind(self, robot: RobotFeatures) -> None:
@@ -106,6 +106,7 @@ class _ServoBrain(ConfiguredBrain):
                 f"{', '.join(robot.action_names[:3])}, …. Set --robot.action_space=tool --robot.tool_pose=true."
             )
         self._max_opening = robot.need(GripperSpec).max_opening
+        self._handling = robot.need(Arm).workspace.handling
         if (wider := getattr(self.config, "wider_m", 0.0)) > self._max_opening:
             raise ConfigError(f"brain.wider_m is {wider}; the gripper opens by {self._max_opening} m at the most.")
         self._tool = find_columns(robot.observation_names, _TOOL, self.name, "observation")
@@ -199,13 +200,15 @@ class PickServoBrain(_ServoBrain):
         low, over = bottom + grasp.z, bottom + target.size[2] + _OVER
         apart, height = math.hypot(tool[0] - x, tool[1] - y), float(tool[2])
         turn = abs(math.remainder(yaw - grasp.yaw, math.pi))
-        fast, slow = self.config.lead_m, self.config.down_m
+        fast, slow, travel = self.config.lead_m, self.config.down_m, self._handling.travel
         if apart < _AROUND and abs(height - low) < _AROUND:
             width = _width(target, yaw)
             closed = max(0.0, width - SQUEEZE)
             if _HELD[0] < opening - width < _HELD[1]:
                 # As it is held, and from where it is: what is between the fingers is not turned.
-                pose = pointing_down(float(tool[0]), float(tool[1]), grasp.z + self.config.lift_m, yaw)
+                pose = pointing_down(
+                    float(tool[0]), float(tool[1]), grasp.z + min(self.config.lift_m, self._handling.lift), yaw
+                )
                 return pose, slow, closed
             if height < low + _REACHED and turn < _TURNED_AROUND:
                 return pointing_down(x, y, low, yaw), slow, closed
@@ -217,9 +220,9 @@ class PickServoBrain(_ServoBrain):
             down = low + share * (over - low)
             lead = fast if height > over + _BRAKE and not share else slow
             return pointing_down(x, y, down, grasp.yaw), lead, grasp.opening
-        if height < TRAVEL - _CLEAR:  # up first, turned as it is: something may stand beside it
-            return pointing_down(float(tool[0]), float(tool[1]), TRAVEL, yaw), slow, grasp.opening
-        return pointing_down(x, y, TRAVEL + _ABOVE, grasp.yaw), fast, grasp.opening
+        if height < travel - _CLEAR:  # up first, turned as it is: something may stand beside it
+            return pointing_down(float(tool[0]), float(tool[1]), travel, yaw), slow, grasp.opening
+        return pointing_down(x, y, travel + _ABOVE, grasp.yaw), fast, grasp.opening
 
     def _plan(self, target: SeenObject, others: Sequence[SeenObject], yaw: float) -> Grasp | None:
         """Return the grasp of an object; the widest that there is room for.
@@ -229,7 +232,16 @@ class PickServoBrain(_ServoBrain):
         """
         wider, grasp = self.config.wider_m, None
         for extra, least in ((wider, wider), (wider, 0.0), (0.0, 0.0)) if wider else ((0.0, 0.0),):
-            grasp = plan_grasp(target, others, self._max_opening, near=yaw, enough=_ROOM, wider=extra, least=least)
+            grasp = plan_grasp(
+                target,
+                others,
+                self._max_opening,
+                near=yaw,
+                enough=_ROOM,
+                wider=extra,
+                least=least,
+                handling=self._handling,
+            )
             if grasp is not None and grasp.room >= _ROOM:
                 break
         return grasp

@@ -4,7 +4,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -324,7 +324,8 @@ def describe(config: Any) -> dict[str, Any]:
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
     left_out += [name for name in LEFT_OUT_IF_OFF if not getattr(config, name, None)]
-    values = {key: _without_place(value) for key, value in vars(config).items() if key not in left_out}
+    plain = {key: asdict(value) if is_dataclass(value) else value for key, value in vars(config).items()}  # type: ignore[arg-type]
+    values = {key: _without_place(value) for key, value in plain.items() if key not in left_out}
     return {
         "type": config.type,
         **values,

@@ -8,11 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
 from tests.cases import each_case
+
+HANDLING = ur5().need(Arm).workspace.handling
 
 angles = st.floats(-math.pi, math.pi)
 
@@ -38,7 +41,7 @@ def between_lines(first: float, second: float) -> float:
 @given(angles, st.floats(0.09, 0.2), st.floats(0.01, 0.07))
 def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: float) -> None:
     for length, width, across in ((wide, narrow, yaw + math.pi / 2), (narrow, wide, yaw)):
-        grasp = plan_grasp(box(length, width, yaw=yaw), [], MAX_OPENING)
+        grasp = plan_grasp(box(length, width, yaw=yaw), [], MAX_OPENING, handling=HANDLING)
         assert grasp is not None
         assert grasp.width == narrow
         assert between_lines(grasp.yaw, across) < 1e-9
@@ -48,8 +51,8 @@ def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: fl
 @given(angles, st.floats(0.01, 0.09), st.floats(0.01, 0.09), st.floats(0, 0.03))
 def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_left(yaw, length, width, wider):
     one = box(length, width, yaw=yaw)
-    usual, wide = (plan_grasp(one, [], MAX_OPENING, wider=more) for more in (0.0, wider))
-    careful = plan_grasp(one, [], MAX_OPENING, wider=wider, least=wider)
+    usual, wide = (plan_grasp(one, [], MAX_OPENING, handling=HANDLING, wider=more) for more in (0.0, wider))
+    careful = plan_grasp(one, [], MAX_OPENING, handling=HANDLING, wider=wider, least=wider)
     assert (usual is None) == (wide is None)
     if usual is not None and wide is not None:
         assert wide == dataclasses.replace(usual, opening=min(MAX_OPENING, usual.opening + wider), room=wide.room)
@@ -61,12 +64,14 @@ def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_lef
 
 @each_case("one", [box(0.09, 0.079), cup(0.079), box(0.3, 0.3)])
 def test_what_fits_on_no_side_has_no_grasp(one: SeenObject) -> None:
-    assert plan_grasp(one, [], MAX_OPENING) is None
+    assert plan_grasp(one, [], MAX_OPENING, handling=HANDLING) is None
 
 
 @given(angles, st.floats(0.3, 0.65), st.floats(-0.3, 0.3))
 def test_a_box_turned_by_half_a_turn_is_the_same_box(yaw: float, x: float, y: float) -> None:
-    one, two = (plan_grasp(box(0.08, 0.05, x=x, y=y, yaw=a), [], MAX_OPENING) for a in (yaw, yaw + math.pi))
+    one, two = (
+        plan_grasp(box(0.08, 0.05, x=x, y=y, yaw=a), [], MAX_OPENING, handling=HANDLING) for a in (yaw, yaw + math.pi)
+    )
     assert one is not None
     assert two is not None
     assert between_lines(one.yaw, two.yaw) < 1e-9
@@ -76,23 +81,23 @@ def test_a_box_turned_by_half_a_turn_is_the_same_box(yaw: float, x: float, y: fl
 @given(angles, angles, st.floats(0.3, 0.65), st.floats(-0.3, 0.3))
 def test_of_two_ways_round_it_is_the_one_with_less_turn_of_the_wrist(yaw, other, x, y):
     for one in (box(0.08, 0.05, x=x, y=y, yaw=yaw), cup(x=x, y=y, yaw=other)):
-        grasp = plan_grasp(one, [], MAX_OPENING)
+        grasp = plan_grasp(one, [], MAX_OPENING, handling=HANDLING)
         assert grasp is not None
-        assert abs(grasp.yaw - neutral_yaw(x, y)) <= math.pi / 2 + 1e-9
+        assert abs(grasp.yaw - neutral_yaw(x, y, HANDLING)) <= math.pi / 2 + 1e-9
 
 
 def test_at_home_the_wrist_is_not_turned() -> None:
     arm = ur5()
     tool = ForwardKinematics(arm.arm.chain).tool(np.array(arm.arm.home[:6]))
     fingers = math.atan2(tool[1, 1], tool[0, 1])  # the tool's y axis: from the left to the right finger
-    assert between_lines(fingers, neutral_yaw(*tool[:2, 3])) < 1e-6
+    assert between_lines(fingers, neutral_yaw(*tool[:2, 3], HANDLING)) < 1e-6
 
 
 def test_a_cup_alone_is_taken_with_next_to_no_turn() -> None:
     for y in (-0.3, 0.0, 0.2):
-        grasp = plan_grasp(cup(y=y), [], MAX_OPENING)
+        grasp = plan_grasp(cup(y=y), [], MAX_OPENING, handling=HANDLING)
         assert grasp is not None
-        assert between_lines(grasp.yaw, neutral_yaw(0.5, y)) <= math.pi / 24 + 1e-9
+        assert between_lines(grasp.yaw, neutral_yaw(0.5, y, HANDLING)) <= math.pi / 24 + 1e-9
 
 
 def fingers(grasp) -> np.ndarray:
@@ -110,7 +115,7 @@ def test_fingers_never_stand_in_a_neighbour_when_another_way_has_room(seed: int)
         angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(0.08, 0.16)
         place = {"x": 0.5 + distance * math.cos(angle), "y": distance * math.sin(angle)}
         others.append(cup(0.05, **place, index=index))
-    grasp = plan_grasp(target, others, MAX_OPENING)
+    grasp = plan_grasp(target, others, MAX_OPENING, handling=HANDLING)
     assert grasp is not None
 
     def room(line: float) -> float:
@@ -139,7 +144,7 @@ def test_the_tool_points_straight_down_with_its_fingers_on_the_line(x: float, y:
 
 @given(st.floats(0.005, 0.3))
 def test_finger_tips_stay_above_the_table_and_the_palm_above_the_object(height: float) -> None:
-    grasp = plan_grasp(cup(height=height), [], MAX_OPENING)
+    grasp = plan_grasp(cup(height=height), [], MAX_OPENING, handling=HANDLING)
     assert grasp is not None
     assert grasp.z - 0.014 >= 0.01 - 1e-12  # the tips reach 14 mm farther than the tool centre point
     assert grasp.z + 0.055 >= height - 1e-12
