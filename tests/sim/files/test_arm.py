@@ -1,0 +1,216 @@
+"""Arms from files: what is read agrees with MuJoCo, whatever the file is like, and what is missing is asked for."""
+
+import os
+import re
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
+from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
+from bhd_lerobot.bodies.so101 import SO101
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.sim.files.arm import arm_body
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.world import World
+from tests.cases import each_case
+
+TEXT = resources.files("bhd_lerobot.bodies").joinpath("so101.xml").read_text(encoding="utf-8")
+ARM_ONLY = re.sub(r'<body name="jaw".*?</body>', "", TEXT, flags=re.DOTALL).replace(
+    '<position name="gripper" joint="gripper"/>', ""
+)
+BARE = re.sub(r"<actuator>.*</actuator>", "", ARM_ONLY, flags=re.DOTALL)
+MOTORS = re.sub(r"<position name=", '<motor ctrlrange="-2.94 2.94" name=', ARM_ONLY).replace(
+    '<position kp="17.8" forcerange="-2.94 2.94"/>', ""
+)
+LOOP = '<equality><connect body1="wrist" body2="base" anchor="0 0 0"/></equality>'
+CAPSULE = 'type="capsule" fromto="0 0 0.022 0.026 0 0.100" size="0.021"'
+
+
+def written(folder: Path, text: str, name: str = "arm.xml", **options: object) -> ArmFile:
+    """Return a file with a text."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return ArmFile("arm", str(path), **options)  # type: ignore[arg-type]
+
+
+def tool_poses(body: Body, postures: np.ndarray) -> np.ndarray:
+    """Return where MuJoCo has the tool, shape (n, 4, 4)."""
+    model = mujoco.MjModel.from_xml_string(body.mjcf)
+    data, poses = mujoco.MjData(model), np.tile(np.eye(4), (len(postures), 1, 1))
+    at = [model.joint(name).qposadr[0] for name in body.need(Arm).chain.joints]
+    for pose, posture in zip(poses, postures, strict=True):
+        data.qpos[at] = posture
+        mujoco.mj_kinematics(model, data)
+        pose[:3, :3], pose[:3, 3] = data.site("tool").xmat.reshape(3, 3), data.site("tool").xpos
+    return poses
+
+
+def postures_of(body: Body, count: int = 20) -> np.ndarray:
+    """Return postures within the limits."""
+    limits, dof = body.limits, body.need(Arm).chain.dof
+    return np.random.default_rng(0).uniform(limits.lower[:dof], limits.upper[:dof], (count, dof))
+
+
+VARIANTS = {
+    "as it is": TEXT,
+    "without a gripper": ARM_ONLY,
+    "motors": MOTORS,
+    "no actuators": BARE.replace('frictionloss="0.052"', 'frictionloss="0.052" actuatorfrcrange="-2.94 2.94"'),
+    "a scene": TEXT.replace(
+        "<worldbody>",
+        '<worldbody><light pos="0 0 2"/><camera name="front" pos="1 0 1"/>'
+        '<geom name="floor" type="plane" size="1 1 1"/>'
+        '<body name="block" pos="0.3 0 1"><freejoint/><geom type="box" size="0.02 0.02 0.02"/></body>',
+    ),
+    "elsewhere": TEXT.replace('<body name="base">', '<body name="base" pos="1 2 0.7" euler="0 0 1.5707963">'),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_tool_and_torques_are_those_of_mujoco(variant: str, tmp_path: Path) -> None:
+    body = arm_body(written(tmp_path, VARIANTS[variant]))
+    arm, postures = body.need(Arm), postures_of(body)
+    np.testing.assert_allclose(ForwardKinematics(arm.chain).tool(postures), tool_poses(body, postures), atol=1e-6)
+    model = mujoco.MjModel.from_xml_string(body.mjcf)
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    places = [model.joint(name) for name in arm.chain.joints]
+    model.dof_frictionloss[:] = 0.0
+    for posture in postures[:5]:
+        speed, acceleration = rng.uniform(-1, 1, (2, arm.chain.dof))
+        data.qpos[:], data.qvel[:], data.qacc[:] = model.qpos0, 0.0, 0.0
+        if arm.gripper is not None:
+            for name, value in zip(arm.gripper.joints, arm.gripper.opened, strict=True):
+                data.qpos[model.joint(name).qposadr[0]] = value
+        for place, one, two, three in zip(places, posture, speed, acceleration, strict=True):
+            data.qpos[place.qposadr[0]], data.qvel[place.dofadr[0]] = one, two
+            data.qacc[place.dofadr[0]] = three
+        mujoco.mj_inverse(model, data)
+        wanted = data.qfrc_inverse + data.qfrc_constraint
+        found = ArmDynamics(body).torque(posture[None], speed[None], acceleration[None])[0]
+        np.testing.assert_allclose(found, wanted[[place.dofadr[0] for place in places]], atol=2e-3)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_home_is_free_and_before_the_arm(variant: str, tmp_path: Path) -> None:
+    body = arm_body(written(tmp_path, VARIANTS[variant]))
+    arm = body.need(Arm)
+    kinematics, home = ArmKinematics(arm.chain, arm.limits), np.array(arm.home[: arm.chain.dof])
+    assert int(kinematics.check(home[None])[0]) == ResultCode.SUCCEEDED
+    low, high = np.array(arm.workspace.tool)
+    assert ((kinematics.tool(home)[:3, 3] > low) & (kinematics.tool(home)[:3, 3] < high)).all()
+
+
+def test_however_the_file_is_written_it_is_the_same_arm(tmp_path: Path) -> None:
+    plain, scene, elsewhere = (
+        arm_body(written(tmp_path, VARIANTS[name], f"{number}.xml")).need(Arm)
+        for number, name in enumerate(("as it is", "a scene", "elsewhere"))
+    )
+    for other in (scene, elsewhere):
+        np.testing.assert_allclose(other.home, plain.home, atol=1e-5)
+        np.testing.assert_allclose(other.limits.acceleration, plain.limits.acceleration, rtol=1e-4)
+        assert other.chain.disjoint == plain.chain.disjoint
+    degrees = re.sub(
+        r'range="(-?[\d.]+) (-?[\d.]+)"',
+        lambda found: f'range="{np.degrees(float(found[1])):.9g} {np.degrees(float(found[2])):.9g}"',
+        TEXT.replace('forcerange="-2.94 2.94"', "FORCE").replace('angle="radian"', 'angle="degree"'),
+    ).replace("FORCE", 'forcerange="-2.94 2.94"')
+    degrees = degrees.replace('euler="0 -0.1745 0"', 'euler="0 -9.998 0"').replace(
+        'euler="0 0.11 0"', 'euler="0 6.303 0"'
+    )
+    turned = arm_body(written(tmp_path, degrees, "degrees.xml")).need(Arm)
+    np.testing.assert_allclose(turned.limits.upper, plain.limits.upper, atol=1e-5)
+
+
+@each_case(
+    ("gripper", "at", "opening"),
+    [
+        (GripperFile(closed=-0.1745, open=0.85, opening=0.073), -0.1745, 0.0),
+        (GripperFile(closed=-0.1745, open=0.85, opening=0.073), 0.85, 0.073),
+        (GripperFile(closed=0.85, open=-0.1745, opening=0.05), 0.85, 0.0),  # the other way round
+        (GripperFile(name="gripper", open=1.0, closed=0.0, opening=0.08), 0.5, 0.04),
+    ],
+)
+def test_the_opening_is_read_and_commanded_in_metres(
+    gripper: GripperFile, at: float, opening: float, tmp_path: Path
+) -> None:
+    body = arm_body(written(tmp_path, TEXT, gripper=gripper))
+    spec = body.need(GripperSpec)
+    assert spec.joints_at(opening) == pytest.approx([at], abs=1e-6)
+    world = World(body)
+    plant, reading = SimulatedPlant(world), PlantReading(1, len(body.joints))
+    command = np.array([[*body.need(Arm).home[:-1], opening]])
+    for _ in range(1000):
+        plant.write(command)
+        world.step()
+    plant.read(reading)
+    np.testing.assert_allclose(reading.position, command, atol=0.004)
+    assert world.qpos[0, world.joint_places(["gripper"])[0][0]] == pytest.approx(at, abs=0.05)
+
+
+@each_case(
+    ("text", "options", "message"),
+    [
+        ("<mujoco><worldbody><body", {}, "which MuJoCo cannot read"),
+        (TEXT.replace('size="0.021" mass="0.048"', 'size="0.021 0.1 0.1" mass="-1"'), {}, "arm.xml"),
+        (TEXT, {"tool": "gripper_fram"}, "Did you mean 'gripper_frame'"),
+        (TEXT, {"tool": "upper_arm"}, r"has 2 joints before it \(shoulder_pan, shoulder_lift\).*robot.tool"),
+        (TEXT.replace('<site name="gripper_frame" pos="0.0982 0 0.013"/>', ""), {"tool": "foot"}, "Sites|site or body"),
+        (TEXT.replace('name="elbow_flex" range', 'name="elbow_flex" type="slide" range'), {}, "elbow_flex.* is a slide"),
+        (TEXT.replace('<body name="base">', '<body name="base"><freejoint/>'), {}, "is free or a ball"),
+        (TEXT.replace('<joint name="elbow_flex" range="-1.69 1.69"/>', '<joint name="elbow_flex"/>'), {},
+         r"no range for elbow_flex.*--robot.ranges='\{elbow_flex"),
+        (TEXT, {"ranges": (("elbow", -1.0, 1.0),)}, "Did you mean 'elbow_flex'"),
+        (TEXT, {"ranges": (("elbow_flex", 1.0, -1.0),)}, "the first must be smaller"),
+        (TEXT.replace(' forcerange="-2.94 2.94"', ""), {}, "largest torque is not known.*--robot.effort"),
+        (BARE, {}, "shoulder_pan' has no actuator.*--robot.effort"),
+        (TEXT, {"effort": (1.0, 2.0)}, "robot.effort is .* or 5: one for each joint"),
+        (TEXT, {"home": (0.0, 0.0)}, "robot.home has 2 numbers; the arm has 5 joints"),
+        (TEXT, {"home": (0.0, 2.0, 0.0, 0.0, 0.0)}, "shoulder_lift is at 2.000 rad at home; its range is -1.745 to"),
+        (TEXT, {"gripper": GripperFile(name="jaws")}, "Did you mean|gripper.*robot.gripper.name"),
+        (TEXT, {"gripper": GripperFile(open=0.5, closed=0.5)}, "open and closed; they must differ"),
+        (TEXT, {"gripper": GripperFile(open=2.5)}, r"robot.gripper.open is 2.5; the joint 'gripper' goes from -0.1745"),
+        (TEXT, {"gripper": GripperFile(opening=-0.1)}, "robot.gripper.opening is -0.1"),
+        (
+            TEXT.replace("<actuator>", LOOP + "<actuator>"), {}, "closes a loop",
+        ),
+        (
+            TEXT.replace(CAPSULE, 'type="mesh" mesh="link"').replace(
+                "<asset>", '<asset><mesh name="link" file="link.stl"/>'
+            ), {}, "link.stl",
+        ),
+        (
+            TEXT.replace("</worldbody>", '<body name="other"><joint name="j" axis="0 0 1" range="-1 1"/>'
+                         '<geom type="sphere" size="0.1"/></body></worldbody>'),
+            {}, "more than one tree with joints: base, other.*robot.tool",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_or_missing_is_named_with_its_remedy(
+    text: str, options: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
+        arm_body(written(tmp_path, text, **options))
+
+
+def test_a_file_that_is_not_there_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"'/nowhere/arm\.xml', and there is no such file"):
+        arm_body(replace(SO101, path="/nowhere/arm.xml"))
+
+
+def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
+    file = written(tmp_path, TEXT)
+    before = arm_body(file)
+    Path(file.path).write_text(TEXT.replace("-2.94 2.94", "-1.9 1.9"), encoding="utf-8")
+    os.utime(file.path, (1, 1))
+    assert before.limits.effort[0] == 2.94
+    assert arm_body(file).limits.effort[0] == 1.9
