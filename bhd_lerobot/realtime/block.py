@@ -153,6 +153,7 @@ class LiveBlock:
         self.state_dtype = npy.descr_to_dtype(_tuples(layout["state"]))
         fields = self.state_dtype.fields or {}
         if "state" in fields and fields["state"][0] != STATE:
+            block.close()
             raise RealtimeError(
                 f"The robot {self.name!r} runs version {self.about.get('version')} of bhd_lerobot and this is version "
                 f"{_VERSION}, whose record is another. Run the same version on both sides."
@@ -181,6 +182,18 @@ class LiveBlock:
             RealtimeError: there is none.
         """
         return cls(SharedBlock.watch(name))
+
+    @property
+    def phase(self) -> Phase:
+        """What the loop's process is doing.
+
+        Raises:
+            RealtimeError: another process has overwritten it.
+        """
+        phase = int(self.words[Word.PHASE])
+        if phase not in Phase:
+            raise RealtimeError(f"The memory of the robot {self.name!r} was overwritten: its phase is {phase}.")
+        return Phase(phase)
 
     @property
     def is_held(self) -> bool:

@@ -202,7 +202,7 @@ class PlanServer:
         request = self._take()
         if request is None:
             return False
-        number, rows = int(request["number"]), self._memory.rows[int(request["block"])]
+        number, rows = int(request["number"]), self._memory.rows[int(request["block"]) % 2]
         self._served = number
         if self._unwanted(number):
             return True
@@ -240,11 +240,11 @@ class PlanServer:
         return self._dropped.item() >= number
 
     def _plan(self, request: Any, capacity: int) -> Plan | PlanFailure:
-        opening = float(request["opening"]) if request["has_opening"] else None
-        position, velocity, acceleration = request["state"]
-        *ends, radius = request["held"].tolist()
-        held = Capsule(HELD, self._planner.dof, tuple(ends[:3]), tuple(ends[3:]), radius) if radius else None
         try:
+            opening = float(request["opening"]) if request["has_opening"] else None
+            position, velocity, acceleration = request["state"]
+            *ends, radius = request["held"].tolist()
+            held = Capsule(HELD, self._planner.dof, tuple(ends[:3]), tuple(ends[3:]), radius) if radius else None
             # The name is the cerebellum's business, and may be longer than a record's.
             command = replace(decode_goal(request["goal"]), task_id=f"request {request['number']}")
             plan = self._planner.plan(command, position, velocity, acceleration, opening=opening, held=held)

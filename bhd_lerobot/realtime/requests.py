@@ -103,8 +103,8 @@ class RequestServer:
         Args:
             now_ns: the present time on the caller's clock [ns].
         """
-        if len(self._requests) and not self._events.full:
-            self._answer(self._requests.take(), now_ns)
+        if not self._events.full and (request := self._requests.take()) is not None:
+            self._answer(request, now_ns)
         results = self._cerebellum.controller.take_results(0)
         if results:
             self._unposted.extend(results)

@@ -1,8 +1,10 @@
 """The bridge over shared memory, with both of its ends in one process and on a virtual clock."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import closing
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Mode, Reason, Request
 from bhd_lerobot.control.record import STATE
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime import block
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Word
 from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.realtime.requests import RequestServer
@@ -78,6 +81,17 @@ def rig() -> Iterator[Rig]:
 
 def drive(value: float) -> np.ndarray:
     return np.array([[value, 0.0]])
+
+
+def test_a_reader_of_another_version_is_refused_with_both_versions(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(block, "_VERSION", "9.9.9")
+    LiveBlock.watch(rig.block.name).close()  # its record is the same
+    monkeypatch.setattr(block, "STATE", np.dtype([("mode", np.int8)]))
+    before = len(os.listdir("/proc/self/fd"))
+    for opened in (LiveBlock.watch, LiveBlock.attach):
+        with pytest.raises(RealtimeError, match=rf"runs version {re.escape(version('lerobot_robot_bhd'))} .* 9\.9\.9"):
+            opened(rig.block.name)
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_invalid_setpoints_are_refused_at_once_with_the_reason(rig: Rig) -> None:

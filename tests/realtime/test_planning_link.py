@@ -277,3 +277,17 @@ def test_what_cannot_be_is_refused() -> None:
     for timeout_s in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ConfigError, match="time-out is"):
             PlanningLink(bytearray(PlanningLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)
+
+
+def test_garbage_over_a_request_ends_no_planner() -> None:
+    rng = np.random.default_rng(0)
+    _, server, planner, block = linked()
+    for number in range(300):
+        block[:400] = rng.bytes(400)
+        np.frombuffer(block, np.int64)[:2] = 2 * number + 2, number + 1  # a request that is whole, and new
+        server.serve_once()
+    _, server, planner, block = linked()
+    link = PlanningLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
+    link.request(0, ramp(3), STATE, None, 0)
+    assert server.serve_once()
+    assert len(answer(link).rows) == 3

@@ -17,7 +17,7 @@ from bhd_lerobot.apps.view.packing import to_json
 from bhd_lerobot.apps.view.server import bare_application, listening, page
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
+from bhd_lerobot.realtime.block import LiveBlock, Word
 
 _PERIOD_S = 1 / 30  # between two states that the page is sent
 _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
@@ -41,7 +41,7 @@ class LivePage:
         count, scene = block.scene
         state: Any = block.ring.latest()
         told: dict[str, Any] = {
-            "phase": Phase(int(words[Word.PHASE])).name.lower(),
+            "phase": block.phase.name.lower(),
             "estop": bool(words[Word.ESTOP] != words[Word.ESTOP_ACKNOWLEDGED]),
         }
         if state is None:

@@ -119,7 +119,7 @@ class Sampler:
     def end(self) -> str | None:
         """Return as text how the robot ended, ``"ended"`` if that was in order, or None if it still runs."""
         words = self._block.words
-        if words[Word.PHASE] == Phase.ENDED:
+        if self._block.phase == Phase.ENDED:
             # The brain's process asks for both; a loop that finds itself alone has at most one of them.
             if words[Word.END] and words[Word.PAUSE]:
                 return "ended"
@@ -131,7 +131,7 @@ class Sampler:
         block, words, about = self._block, self._block.words.copy(), self._block.about
         state: Any = block.ring.latest()
         now = self._clock()
-        phase = Phase(int(words[Word.PHASE]))
+        phase = block.phase
         running = phase == Phase.RUNNING
         rates = self._rates(now, words, state)
         self._spreads = self._read_spreads()
