@@ -53,14 +53,8 @@ class Word(IntEnum):
     """The same of the cerebellum's process."""
     PLANT_LOST = 12
     """Not 0: what drives the robot has ended, and a reset cannot help. Written by the cerebellum."""
-    EXECUTED = 16
-    """Ticks executed in the present segment."""
-    SKIPPED = 17
-    """Ticks skipped in it."""
-    OVERRUNS = 18
-    """Ticks of it that ended after their successor was due."""
     CATCH_UP_LOST = 19
-    """Ticks of it by which the simulation fell behind, beyond what it may catch up at once."""
+    """Ticks of the present segment by which the simulation fell behind, beyond what it may catch up at once."""
     RECORDER_FRAMES = 24
     """Frames of it that the brain's process has read. Written by the brain's process, as is the next."""
     RECORDER_DROPS = 25

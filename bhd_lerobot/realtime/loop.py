@@ -95,7 +95,7 @@ class RealtimeLoop:
         words, clock, sleep, period = self.words, self._clock, self._sleep, self.period_ns
         start = clock() + period if start_ns is None else start_ns
         grid = TickGrid(start, period, self.limits.most_misses)
-        words[Word.EXECUTED : Word.CATCH_UP_LOST + 1] = 0
+        words[Word.CATCH_UP_LOST] = 0
         words[Word.START] = self.cerebellum.stamp_origin_ns = start
         fence()
         words[Word.SEGMENT] += 1
@@ -103,7 +103,6 @@ class RealtimeLoop:
         ended = start
         # Plain numbers: an index of an enumeration costs a call.
         pause, end, alive = int(Word.PAUSE), int(Word.END), int(Word.CEREBELLUM_ALIVE)
-        executed, skipped, overruns = int(Word.EXECUTED), int(Word.SKIPPED), int(Word.OVERRUNS)
         while not (words[pause] or words[end]) or (self._may_stand is not None and not self._may_stand()):
             now = clock()
             left = grid.next_due_ns - now
@@ -117,7 +116,6 @@ class RealtimeLoop:
             grid.end(ended)
             self._count(slot.due_ns, now, ended, slot.skipped)
             words[alive] = ended
-            words[executed], words[skipped], words[overruns] = grid.executed, grid.skipped, grid.overruns
         words[Word.PHASE] = Phase.STANDING
         return grid
 

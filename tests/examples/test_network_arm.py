@@ -180,7 +180,9 @@ def _runs(process: Fork, name: str) -> bool:
     if block is True:
         return False
     until(
-        lambda: (block.words[Word.SEGMENT] >= 2 and block.words[Word.EXECUTED] > 250) or process.poll() is not None,
+        lambda: (
+            (block.words[Word.SEGMENT] >= 2 and block.ring.latest()["executed"] > 250) or process.poll() is not None
+        ),
         "the first episode runs, or it ended",
     )
     block.close()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.cli import record, serve
 from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig
 from bhd_lerobot.ros2.live.node import Node, Publisher, Subscription
@@ -180,11 +181,12 @@ def _record(options: list[str], starts: Path) -> int:
     begin = LiveHost.begin
 
     def noting(host: LiveHost) -> None:
-        has_begun = host._reader is not None
+        words = host.link.block.words
+        segments = int(words[Word.SEGMENT])
         begin(host)
-        if not has_begun:
+        if words[Word.SEGMENT] > segments:
             with starts.open("a") as file:
-                print(host._origin / NANOSECONDS, file=file)
+                print(words[Word.START] / NANOSECONDS - 1 / host.rates.control_hz, file=file)
 
     LiveHost.begin = noting  # type: ignore[method-assign]
     return record.main(options)

@@ -24,6 +24,8 @@ HEARTBEATS = {
 }
 POSE = ("x", "y", "yaw")
 
+_NOTHING: dict[str, Any] = {"mode": None, "estop_latched": False, "command_age": None, "observation_age": None}
+_NOTHING |= {"executed": 0, "skipped": 0, "overruns": 0}  # of a robot that has published nothing
 _WINDOW_NS = 2 * NANOSECONDS  # over which rates are measured
 
 
@@ -150,9 +152,6 @@ class Sampler:
             frame_rate=rates.get("frames") if words[Word.RECORDER_FRAMES] else None,
             fps=int(about["fps"]),
             command_rate=rates.get("setpoints"),
-            executed=int(words[Word.EXECUTED]),
-            skipped=int(words[Word.SKIPPED]),
-            overruns=int(words[Word.OVERRUNS]),
             catch_up_lost=int(words[Word.CATCH_UP_LOST]),
             recorder_drops=int(words[Word.RECORDER_DROPS]),
             lateness=self._spreads[0],
@@ -163,7 +162,7 @@ class Sampler:
                 name: max(0, now - int(words[word])) / NANOSECONDS if words[word] else None
                 for name, word in HEARTBEATS.items()
             },
-            **{"mode": None, "estop_latched": False, "command_age": None, "observation_age": None} | moment,
+            **_NOTHING | moment,
         )
 
     def _of_state(self, state: Any, now: int, running: bool, rates: dict[str, float]) -> dict[str, Any]:
@@ -183,6 +182,7 @@ class Sampler:
             for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS))
         }
         return {
+            **{name: int(state[name]) for name in ("executed", "skipped", "overruns")},
             "mode": mode.name,
             "estop_latched": mode == Mode.ESTOP,
             "command_age": max(0.0, age) if by_setpoint and running else None,

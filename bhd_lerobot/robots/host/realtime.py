@@ -48,7 +48,8 @@ class LiveHost(Host):
     """One robot on the wall clock: a host whose ticks another process runs; its record is the one that is published.
 
     It never ticks itself. Put into what was published, it computes the truth that tasks judge by and, if it is a
-    simulation, renders images. `make_live` makes a class of it and of the host of a kind of robot.
+    simulation, renders images. `make_live` makes a class of it and of the host of a kind of robot, none of whose
+    private names it shares.
 
     Attributes:
         runs: what the other process runs.
@@ -72,29 +73,29 @@ class LiveHost(Host):
         self.clock = LiveClock(self.link, self.sensor_period_s)
         self.bridge = LiveBridge(self.link.block, self.cerebellum, self.rates, self.link.wait)
         self._sender = CommandSender(self.bridge, self.to_setpoints)
-        self._frame_ns = NANOSECONDS // self.rates.fps
-        self._reader: FrameReader | None = None
-        self._boundary: Any = None  # the newest boundary of a frame that was taken
-        self._shown: Any = None  # what was published last that this host shows
-        self._watchdog = Watchdog(0)  # of the last frame
-        self._origin = 0  # when the episode's first observation was taken, monotonic [ns]
+        self.__frame_ns = NANOSECONDS // self.rates.fps
+        self.__reader: FrameReader | None = None
+        self.__boundary: Any = None  # the newest boundary of a frame that was taken
+        self.__shown: Any = None  # what was published last that this host shows
+        self.__watchdog = Watchdog(0)  # of the last frame
+        self.__origin = 0  # when the episode's first observation was taken, monotonic [ns]
 
-    def _show(self, state: Any) -> None:
+    def __show(self, state: Any) -> None:
         self.bridge.show(state)
-        if self._shown is not state:
-            self._shown = state
+        if self.__shown is not state:
+            self.__shown = state
             self.show(state)
 
-    def _truth_at(self, end: Any, touched: NDArray[np.bool_]) -> Any:
-        self._show(end)
+    def __truth_at(self, end: Any, touched: NDArray[np.bool_]) -> Any:
+        self.__show(end)
         for flag, one in zip(self.touches, touched, strict=True):
             flag[:] = one
         return self.runs.truth(self)
 
     def truth(self) -> Any:
         """Return what is true at the start of the present frame."""
-        if self._shown is None and self._boundary is not None:
-            self._show(self._boundary.state)
+        if self.__shown is None and self.__boundary is not None:
+            self.__show(self.__boundary.state)
         return self.runs.truth(self)
 
     @property
@@ -120,14 +121,14 @@ class LiveHost(Host):
         link.place(scenes[0], int(seeds[0]))
         goal = self.start_goal(scenes[0]) if self.world is None else None
         if goal is not None:
-            self._go_to_start(goal)
+            self.__go_to_start(goal)
             link.place(scenes[0], int(seeds[0]))
         initial = super().reset(ids, scenes, seeds)
-        self._reader = None
-        self._boundary, self._shown = None, None
+        self.__reader = None
+        self.__boundary, self.__shown = None, None
         return initial
 
-    def _go_to_start(self, goal: BrainCommand) -> None:
+    def __go_to_start(self, goal: BrainCommand) -> None:
         self.bridge.restart(np.zeros(1, np.intp))
         self.link.run()
         refusal = self.bridge.submit(goal)
@@ -148,11 +149,11 @@ class LiveHost(Host):
         Raises:
             RealtimeError: a process has ended or does not answer.
         """
-        if self._reader is None:
-            self._reader = FrameReader(self.link.block.ring, self.rates.ticks_per_frame)
+        if self.__reader is None:
+            self.__reader = FrameReader(self.link.block.ring, self.rates.ticks_per_frame)
             self.link.block.words[[Word.RECORDER_FRAMES, Word.RECORDER_DROPS]] = 0
-            self._origin = self.link.run() - NANOSECONDS // self.rates.control_hz
-            self._take(0)
+            self.__origin = self.link.run() - NANOSECONDS // self.rates.control_hz
+            self.__take(0)
 
     def stop(self, ids: NDArray[np.intp]) -> None:
         """End the episode: the loop stands."""
@@ -163,8 +164,8 @@ class LiveHost(Host):
     def observe(self) -> Frame:
         """Return the observation that the present frame began with; its age is what it is now."""
         self.begin()
-        self._show(self._boundary.state)
-        return self._frame_of(self._boundary.state, time.monotonic_ns())
+        self.__show(self.__boundary.state)
+        return self.__frame_of(self.__boundary.state, time.monotonic_ns())
 
     def latest(self) -> Frame:
         """Return the newest observation, whatever frame it is in.
@@ -172,24 +173,24 @@ class LiveHost(Host):
         Raises:
             RealtimeError: a process has ended, or is stopped.
         """
-        state = self._newest()
-        self._show(state)
-        return self._frame_of(state, time.monotonic_ns())
+        state = self.__newest_row()
+        self.__show(state)
+        return self.__frame_of(state, time.monotonic_ns())
 
-    def _newest(self) -> Any:
+    def __newest_row(self) -> Any:
         """Return the newest state; the last state of a process that has ended, or is stopped, does not count."""
         self.link.check()
         state = self.bridge.latest
         silence = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
-        if self._reader is not None and self.running[0] and silence > _SILENCE_S:
+        if self.__reader is not None and self.running[0] and silence > _SILENCE_S:
             raise RealtimeError(
                 f"The cerebellum's process ({self.link.pid}) has published nothing for {silence:.1f} s: "
                 "it is stopped, or gets no processor time. Disconnect and connect again."
             )
         return state
 
-    def _frame_of(self, state: Any, seen_ns: int) -> Frame:
-        return frame_of(self, state, seen_ns, self._origin)
+    def __frame_of(self, state: Any, seen_ns: int) -> Frame:
+        return frame_of(self, state, seen_ns, self.__origin)
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
@@ -199,8 +200,8 @@ class LiveHost(Host):
         Raises:
             RealtimeError: a process has ended, or is stopped.
         """
-        self._show(self._newest())  # what a tool pose is solved from is where the arm is commanded to be
-        start = self._boundary.frame * self._frame_ns if isinstance(command, Chunk) else None
+        self.__show(self.__newest_row())  # what a tool pose is solved from is where the arm is commanded to be
+        start = self.__boundary.frame * self.__frame_ns if isinstance(command, Chunk) else None
         return self._sender.send(command, self.running, start)
 
     def act(self, command: Command) -> ActionReport:
@@ -216,22 +217,22 @@ class LiveHost(Host):
     def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
         """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report."""
         # Boundary k is the end of tick k F - 1, one period before k frames.
-        now = time.monotonic_ns() - self._origin
-        last = max(self._boundary.frame + 1, now // self._frame_ns + 1)
-        boundaries = [self._boundary]
+        now = time.monotonic_ns() - self.__origin
+        last = max(self.__boundary.frame + 1, now // self.__frame_ns + 1)
+        boundaries = [self.__boundary]
         while boundaries[-1].frame < last:
-            boundaries.append(self._take(boundaries[-1].frame + 1))
-        reports = [self._report(*pair, command) for pair in pairwise(boundaries)]
+            boundaries.append(self.__take(boundaries[-1].frame + 1))
+        reports = [self.__report(*pair, command) for pair in pairwise(boundaries)]
         *missed, report = reports
         report.sent, report.refusals, report.missed = receipt.sent, receipt.refusals, missed
         if receipt.refusals:
             report.limits |= int(Limit.POSTURE)
         if results := receipt.all_results(0, self.bridge.take_results()):
             report.results = {0: results}
-        self._watchdog = Watchdog(int(report.watchdog[0]))
+        self.__watchdog = Watchdog(int(report.watchdog[0]))
         return report
 
-    def _report(self, before: Boundary, after: Boundary, command: Command) -> FrameReport:
+    def __report(self, before: Boundary, after: Boundary, command: Command) -> FrameReport:
         """Report the frame between two boundaries."""
         end = after.state
         return report_of(
@@ -239,21 +240,21 @@ class LiveHost(Host):
             before,
             after,
             requested="command" if isinstance(command, Goals) else "requested",
-            truth=partial(self._truth_at, end, end["touches"] > before.state["touches"]),
-            origin_ns=self._origin,
+            truth=partial(self.__truth_at, end, end["touches"] > before.state["touches"]),
+            origin_ns=self.__origin,
         )
 
-    def _take(self, number: int) -> Boundary:
+    def __take(self, number: int) -> Boundary:
         """Wait for a boundary of this number or, if that one was lost, a later one."""
-        link, reader, words = self.link, self._reader, self.link.block.words
+        link, reader, words = self.link, self.__reader, self.link.block.words
         if reader is None:
             raise RealtimeError("The robot is in no episode. Call reset() first.")
-        due = self._origin + number * self._frame_ns
+        due = self.__origin + number * self.__frame_ns
         while True:
             boundary = reader.read()
             if boundary is not None and boundary.state["segment"] == words[Word.SEGMENT]:
                 if boundary.frame >= number:
-                    self._boundary = boundary
+                    self.__boundary = boundary
                     words[Word.RECORDER_FRAMES] += boundary.frame > 0
                     words[Word.RECORDER_DROPS] = boundary.drops
                     return boundary
@@ -273,7 +274,7 @@ class LiveHost(Host):
     @property
     def problem(self) -> str:
         """What was wrong with the plant in its last fault, or which watchdog noticed something, as text."""
-        noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._watchdog)
+        noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self.__watchdog)
         return problem_of(self.bridge.latest) or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
 
     @property

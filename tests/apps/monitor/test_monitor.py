@@ -91,7 +91,6 @@ class Robot:
                 state["state"][name] = values[0] if values.size == 1 else np.pad(values, (0, room(name) - values.size))
             else:
                 state[name] = value
-        words[Word.EXECUTED] = state["executed"]
         self.block.ring.publish(state)
         for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE):
             words[word] = self.now
@@ -226,6 +225,8 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
         setpoints_taken=7,
         now_ns=30_000_000,
         oldest_ns=150_000_000,
+        skipped=3,
+        overruns=4,
         requested=[[0.2, 1.0]],
         command=[[0.1, 0.5]],
         measured=[[0.09, 0.4]],
@@ -234,7 +235,7 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
         watchdogs=[2 * int(watchdog == Watchdog.BRAIN) for watchdog in WATCHDOGS],
         refusals=[9 if reason in (Reason.ACCEPTED, Reason.STALE) else 0 for reason in Reason],
     )
-    words[Word.SKIPPED], words[Word.OVERRUNS], words[Word.CATCH_UP_LOST], words[Word.RECORDER_DROPS] = 3, 4, 5, 6
+    words[Word.CATCH_UP_LOST], words[Word.RECORDER_DROPS] = 5, 6
     robot.now += S // 100
     sampler, block = robot.sampler()
     shown = sampler.sample()
