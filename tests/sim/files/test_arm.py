@@ -165,7 +165,7 @@ def test_the_opening_is_read_and_commanded_in_metres(
         (TEXT, {"tool": "gripper_fram"}, "Did you mean 'gripper_frame'"),
         (TEXT, {"tool": "upper_arm"}, r"has 2 joints before it \(shoulder_pan, shoulder_lift\).*robot.tool"),
         (TEXT.replace('<site name="gripper_frame" pos="0.0982 0 0.013"/>', ""), {"tool": "foot"}, "Sites|site or body"),
-        (TEXT.replace('name="elbow_flex.* a slide"),
+        (TEXT.replace('"elbow_flex" range', '"elbow_flex" type="slide" range'), {}, "elbow_flex.* is a slide"),
         (TEXT.replace('<body name="base">', '<body name="base"><freejoint/>'), {}, "is free or a ball"),
         (TEXT.replace('<joint name="elbow_flex" range="-1.69 1.69"/>', '<joint name="elbow_flex"/>'), {},
          r"no range for elbow_flex.*--robot.ranges='\{elbow_flex"),
@@ -202,6 +202,7 @@ def test_what_is_wrong_or_missing_is_named_with_its_remedy(
         arm_body(written(tmp_path, text, **options))
 
 
+@pytest.mark.law
 def test_a_file_that_is_not_there_is_named() -> None:
     with pytest.raises(ConfigError, match=r"'/nowhere/arm\.xml', and there is no such file"):
         arm_body(replace(SO101, path="/nowhere/arm.xml"))
