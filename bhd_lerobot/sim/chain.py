@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import HELD, OBSTACLE, ArmChain, Capsule, Placement
-from bhd_lerobot.control.geometry.capsules import Balls, enclosing, with_pairs
+from bhd_lerobot.control.geometry.capsules import Balls, enclosing, halves, with_pairs
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.record import JOINTS, PAIRS, SHAPES
 from bhd_lerobot.errors import ConfigError, unknown_name
@@ -94,8 +94,8 @@ def chain_from_mjcf(
     places = forward.frames(np.array([_zero(model, joint) for joint in joints]))
     shapes = _shapes(model, joints, frames, at_home, np.linalg.inv(places) @ into_base)
     posture = at_home[model.jnt_qposadr[joints]]
-    for most in (SHAPES, 2, 1):
-        capsules = _capsules(shapes, most)
+    for most, cut in ((SHAPES, True), (SHAPES, False), (2, False), (1, False)):
+        capsules = _capsules(shapes, most, cut=cut)
         chain = replace(chain, capsules=capsules, min_manipulability=least)
         if len(capsules) <= _MOST_SHAPES:
             chain = with_pairs(chain, posture, lower, upper)
@@ -352,11 +352,13 @@ def _balls(model: mujoco.MjModel, geom: int) -> Balls | None:
     return Balls(points, np.zeros(len(points)))
 
 
-def _capsules(shapes: Sequence[tuple[str, int, Balls]], most: int) -> tuple[Capsule, ...]:
+def _capsules(shapes: Sequence[tuple[str, int, Balls]], most: int, *, cut: bool) -> tuple[Capsule, ...]:
     """Return capsules around shapes, so many for each frame at the most."""
     capsules: dict[str, Capsule] = {}
     for frame in sorted({frame for _, frame, _ in shapes}):
         own = [(name, shape) for name, number, shape in shapes if number == frame]
+        if cut:
+            own = [(name, half) for name, shape in own for half in halves(shape)]
         for name, shape in own if len(own) <= most else _merged(own, most):
             start, end, radius = enclosing(shape)
             unique = next(one for one in chained((name,), (f"{name}_{k}" for k in count(2))) if one not in capsules)

@@ -1,5 +1,7 @@
 """The geometry of arms that are read from models, beside the engine that simulates these."""
 
+from itertools import product
+
 import mujoco
 import numpy as np
 import pytest
@@ -118,6 +120,28 @@ def test_capsules_enclose_the_shapes_closely() -> None:
         assert volume < 4 * 8 * np.prod(model.geom_aabb[model.geom(name).id, 3:])
     np.testing.assert_allclose((capsules["ball"].radius, capsules["pill"].radius), (0.04, 0.03))
     np.testing.assert_allclose(np.linalg.norm(np.subtract(capsules["pill"].end, capsules["pill"].start)), 0.1)
+
+
+def test_a_crooked_mesh_is_enclosed_by_two_capsules() -> None:
+    """Every point of its hull is in one of them."""
+    box = np.array(list(product((-1.0, 1.0), repeat=3)))
+    points = np.concatenate((box * (0.02, 0.02, 0.1) + (0.0, 0.0, 0.1), box * (0.09, 0.02, 0.02) + (0.07, 0.0, 0.2)))
+    vertices = " ".join(map(str, points.ravel()))
+    mesh, geom = f'<asset><mesh name="ell" vertex="{vertices}"/></asset>', '<geom name="ell" type="mesh" mesh="ell"/>'
+    model = mujoco.MjModel.from_xml_string((arm(4, geom) % "").replace("<worldbody>", f"{mesh}<worldbody>", 1))
+    chain = chain_from_mjcf(model, "tool")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    last = np.linalg.inv(ForwardKinematics(chain).frames(np.zeros(4))[4]) @ in_frame(data, "body", "link_3")
+    capsules = [capsule for capsule in chain.capsules if capsule.name in ("ell", "ell_2")]
+    assert len(capsules) == 2
+    inside = RNG.dirichlet(np.full(16, 0.3), 500) @ points @ last[:3, :3].T + last[:3, 3]
+    depths = []
+    for capsule in capsules:
+        start, way = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
+        share = np.clip((inside - start) @ way / max(way @ way, 1e-12), 0, 1)
+        depths.append(np.linalg.norm(inside - start - share[:, None] * way, axis=1) - capsule.radius)
+    assert np.min(depths, axis=0).max() < 1e-6
 
 
 def test_the_pairs_that_are_checked_can_meet_and_do_not_at_home() -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from bhd_lerobot.bodies.body import ArmChain
 from bhd_lerobot.control.geometry.collision import CollisionModel
@@ -11,7 +12,10 @@ from bhd_lerobot.control.geometry.collision import CollisionModel
 Array = NDArray[np.float64]
 
 _RADII = np.linspace(1.0, 2.0, 41)  # of the radius that the sides need; with a larger one a capsule may be shorter
-_ROUNDS = 200  # towards the middle of a disc
+_ROUNDS, _QUICK = 200, 40  # towards the middle of a disc
+_FEW = 8  # points of a shape that is not cut: a box
+_CUTS = np.linspace(0.2, 0.8, 7)  # where along it
+_SMALLER = 0.9  # of the volume: two capsules in place of one
 _COVER = 1.0 + 1e-9
 _POSTURES, _BATCH = 2000, 100
 _NEVER = 0.02  # [m] capsules that stay so far apart in all of these postures do not meet
@@ -38,24 +42,56 @@ class Balls:
         return Balls(self.centres @ pose[:3, :3].T + pose[:3, 3], self.radii)
 
 
-def enclosing(shape: Balls) -> tuple[Array, Array, float]:
+def enclosing(shape: Balls, rounds: int = _ROUNDS) -> tuple[Array, Array, float]:
     """Return the ends and the radius of a small capsule around a shape, along one of its principal axes [m]."""
     centres, radii = shape.centres, shape.radii
     if len(centres) <= 2 and np.ptp(radii) == 0.0:  # a ball or a capsule
         return centres[0], centres[-1], float(radii[0])
     middle = centres.mean(axis=0)
     _, axes = np.linalg.eigh((centres - middle).T @ (centres - middle))
-    found = [_along(axis, middle, centres, radii) for axis in axes.T]
+    found = [_along(axis, middle, centres, radii, rounds) for axis in axes.T]
     return min(found, key=lambda capsule: _volume(*capsule))
 
 
-def _along(axis: Array, middle: Array, centres: Array, radii: Array) -> tuple[Array, Array, float]:
+def halves(shape: Balls) -> list[Balls]:
+    """Return two parts of a shape if the capsules around them are much smaller than the one around it, or the shape.
+
+    Only the hull of points is cut, squarely to its longest axis.
+    """
+    points = shape.centres
+    if shape.radii.any() or len(points) <= _FEW:
+        return [shape]
+    try:
+        triangles = ConvexHull(points).simplices
+    except QhullError:  # it is flat
+        return [shape]
+    one, other = points[triangles], points[np.roll(triangles, 1, axis=1)]  # the ends of its edges
+    one, other = one.reshape(-1, 3), other.reshape(-1, 3)
+    middle = points.mean(axis=0)
+    _, axes = np.linalg.eigh((points - middle).T @ (points - middle))
+    axis = axes[:, -1]
+    along, first, last = (which @ axis for which in (points, one, other))
+    best, least = [shape], _SMALLER * _volume(*enclosing(shape, _QUICK))
+    for share in _CUTS:
+        cut = along.min() + share * np.ptp(along)
+        crosses = (first < cut) & (last >= cut)
+        at = ((cut - first[crosses]) / (last[crosses] - first[crosses]))[:, None]
+        edge = one[crosses] + at * (other[crosses] - one[crosses])
+        parts = [np.concatenate((points[side], edge)) for side in (along < cut, along >= cut)]
+        both = [Balls(part, np.zeros(len(part))) for part in parts]
+        size = sum(_volume(*enclosing(part, _QUICK)) for part in both)
+        if size < least:
+            best, least = both, size
+    return best
+
+
+def _along(axis: Array, middle: Array, centres: Array, radii: Array, rounds: int) -> tuple[Array, Array, float]:
     """Return the smallest capsule in a direction."""
     along = (centres - middle) @ axis
     across = centres - middle - along[:, None] * axis
     centre = across.mean(axis=0)
     best, least = centre, np.inf
-    for number in range(_ROUNDS):  # towards what is farthest, by less and less (Bădoiu and Clarkson)
+    for number in range(rounds):  # towards what is farthest, by less and less (Bădoiu and Clarkson)
         far = np.linalg.norm(across - centre, axis=1) + radii
         if far.max() < least:
             best, least = centre, float(far.max())
