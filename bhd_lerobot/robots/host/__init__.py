@@ -9,7 +9,6 @@ __all__ = [
     "process",
     "realtime",
     "robots",
-    "sender",
     "simulation",
     "state",
 ]

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
-from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Clock, Deliver, Frame, FrameReport
-from bhd_lerobot.robots.host.sender import CommandSender
 
 
 class Host(ABC):
@@ -74,7 +73,6 @@ class Host(ABC):
         self.running = np.ones(n, np.bool_)
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
-        self._sender = CommandSender(self.bridge, self.to_setpoints)
         self._no_physics = np.zeros((n, 0)), np.zeros((n, 0))
 
     @property
@@ -179,9 +177,54 @@ class Host(ABC):
         """Return the newest observation, whatever frame it is in."""
         return self.observe()
 
-    def send(self, command: Command) -> Acceptance:
-        """Send a command to the running robots; no time goes by. Return what was accepted of it."""
-        return self._sender.send(command, self.running)
+    def send(self, command: Command, start_ns: int | None = None) -> Acceptance:
+        """Send a command to the running robots; no time goes by. Return what was accepted of it.
+
+        Args:
+            command: what the robots are to do; None continues with the last chunk or goal.
+            start_ns: when a chunk begins [ns]; now if None.
+        """
+        receipt = Acceptance(SendResult(np.zeros(self.n, np.int8)))
+        match command:
+            case None:
+                pass
+            case Chunk(actions):
+                self._send_chunk(actions, start_ns, receipt)
+            case Goals(commands):
+                for sim, goals in commands.items():
+                    refusals = [refusal for goal in goals if (refusal := self.bridge.submit(goal, sim)) is not None]
+                    if refusals:
+                        receipt.results[sim] = refusals
+            case _:
+                self._send_setpoint(command, receipt)
+        return receipt
+
+    def _send_setpoint(self, action: NDArray[np.float64], receipt: Acceptance) -> None:
+        mask = self.running
+        if not mask.any():
+            return
+        setpoints, refused = self.to_setpoints(action, mask, None)
+        if refused:
+            mask = mask.copy()
+            mask[list(refused)] = False
+        receipt.sent = self.bridge.send(setpoints, mask)
+        receipt.refuse(refused)
+
+    def _send_chunk(self, actions: NDArray[np.float64], start_ns: int | None, receipt: Acceptance) -> None:
+        rows: list[NDArray[np.float64]] = []
+        for action in actions:
+            setpoints, refused = self.to_setpoints(action, self.running, rows[-1] if rows else None)
+            receipt.refuse(refused)
+            if refused:
+                break  # the actions before it are sent
+            rows.append(setpoints)
+        results = self.bridge.send_chunk(np.array(rows), self.running, start_ns) if rows else []
+        if results:
+            # Of each robot, the first reason that is a refusal.
+            reasons = np.array([result.reasons for result in results])
+            first = reasons[(reasons != 0).argmax(axis=0), np.arange(self.n)]
+            sent = receipt.sent.reasons
+            sent[sent == Reason.ACCEPTED] = first[sent == Reason.ACCEPTED]
 
     def _frame(self, receipt: Acceptance, command: Command) -> FrameReport:
         """Let one frame go by, and report what happened in it and to the command that it began with."""

@@ -24,7 +24,6 @@ from bhd_lerobot.robots.host.frames import frame_of, report_of
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.link import LiveLink
 from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Frame, FrameReport
-from bhd_lerobot.robots.host.sender import CommandSender
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of
 
@@ -72,7 +71,6 @@ class LiveHost(Host):
         self.link = LiveLink(self, self.config, name)
         self.clock = LiveClock(self.link, self.sensor_period_s)
         self.bridge = LiveBridge(self.link.block, self.cerebellum, self.rates, self.link.wait)
-        self._sender = CommandSender(self.bridge, self.to_setpoints)
         self.__frame_ns = NANOSECONDS // self.rates.fps
         self.__reader: FrameReader | None = None
         self.__boundary: Any = None  # the newest boundary of a frame that was taken
@@ -194,7 +192,7 @@ class LiveHost(Host):
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
-    def send(self, command: Command) -> Acceptance:
+    def send(self, command: Command, start_ns: int | None = None) -> Acceptance:
         """Send a command and return at once.
 
         Raises:
@@ -202,7 +200,7 @@ class LiveHost(Host):
         """
         self.__show(self.__newest_row())  # what a tool pose is solved from is where the arm is commanded to be
         start = self.__boundary.frame * self.__frame_ns if isinstance(command, Chunk) else None
-        return self._sender.send(command, self.running, start)
+        return super().send(command, start)
 
     def act(self, command: Command) -> ActionReport:
         """Send a command and return at once, with the newest command of the cerebellum as what is applied.
