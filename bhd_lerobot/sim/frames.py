@@ -209,7 +209,7 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
                 tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
                 closing = ctrl[layout.brake : layout.brake + its.dof]
                 if state.mode_is_new:
-                    set_brake(brakes, closing, sim, state.mode)
+                    set_brake(brakes, sim, state.mode)
                     state.mode_is_new = False
                 speeds = qvel[layout.qvel[0] : layout.qvel[0] + its.dof]
                 run_brake(brakes, closing, speeds, sim, layout.friction, layout.closing_ticks)

@@ -151,35 +151,29 @@ class Brakes:
     def set_mode(self, modes: NDArray[np.int8]) -> None:
         """Close the brakes in modes without motion, and open the others; `modes` has shape (n,)."""
         for sim, mode in enumerate(modes.tolist()):
-            set_brake(self.ticks, self._ctrl[sim], sim, mode)
+            set_brake(self.ticks, sim, mode)
+        self._ctrl[:] = self.ticks[:, None] >= 0  # also of robots that nothing is written to yet
 
     def run(self) -> None:
         """Advance by one tick."""
-        for sim in np.flatnonzero(self.ticks >= 0).tolist():
+        for sim in range(len(self.ticks)):
             run_brake(self.ticks, self._ctrl[sim], self._velocity[sim], sim, self.friction, self.closing_ticks)
 
 
 @kernel()
-def set_brake(ticks: NDArray[np.int64], ctrl: _Array, sim: int, mode: int) -> None:
+def set_brake(ticks: NDArray[np.int64], sim: int, mode: int) -> None:
     """Close the brake of an arm in a mode without motion, and open it in others."""
-    if _HOLD <= mode <= _STOPPING:
-        ticks[sim] = -1
-    elif ticks[sim] < 0:
-        ticks[sim] = 0
-    else:
-        return
-    for k in range(len(ctrl)):
-        ctrl[k] = 0.0 if ticks[sim] < 0 else 1.0
+    ticks[sim] = -1 if _HOLD <= mode <= _STOPPING else max(ticks[sim], 0)
 
 
 @kernel()
 def run_brake(  # noqa: PLR0917
     ticks: NDArray[np.int64], ctrl: _Array, speed: _Array, sim: int, friction: _Array, closing_ticks: int
 ) -> None:
-    """Advance the brake of an arm by one tick."""
-    if ticks[sim] < 0:
-        return
-    ticks[sim] += 1
-    if ticks[sim] > closing_ticks:
-        for k in range(len(ctrl)):
-            ctrl[k] = 1.0 + friction[k] / max(abs(speed[k]), _CREEP)
+    """Advance the brake of an arm by one tick; whoever put the arm somewhere else may have written to its command."""
+    is_closed = ticks[sim] >= 0
+    ticks[sim] += is_closed
+    for k in range(len(ctrl)):
+        ctrl[k] = is_closed
+        if ticks[sim] > closing_ticks:
+            ctrl[k] += friction[k] / max(abs(speed[k]), _CREEP)

@@ -6,9 +6,10 @@ from numpy.typing import NDArray
 
 from benchmarks._impedance_attacks import ATTACKS, attack
 from benchmarks.wire import Judge, make
+from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.control.plant import Plant, PlantReading
-from tests.robots.impedance_rig import Rig
+from tests.robots.impedance_rig import Rig, forward_posture
 
 Array = NDArray[np.float64]
 
@@ -113,6 +114,50 @@ def test_closed_brakes_give_way_to_what_pushes_and_a_reset_is_refused_until_it_i
     assert rig.bridge.activate().accepted.all()
     rig.wait(0.5)
     assert np.linalg.norm(rig.log["tool"][-1] - pushed) < 0.01
+
+
+def put_back(rig: Rig, turned: float = 0.0) -> None:
+    """Put the arm somewhere else, its shoulder raised by an angle [rad], and let the controller forget the rest."""
+    rig.world.reset()
+    rig.world.qpos[:, :6] = forward_posture()
+    rig.world.qpos[:, 1] -= turned
+    rig.world.hold()
+    rig.cerebellum.restart(np.arange(1))
+
+
+def test_brakes_are_closed_however_early_after_a_restart_something_presses() -> None:
+    ways = []
+    for is_closed in (False, True):
+        rig = Rig()
+        if is_closed:  # they are when it is put back
+            rig.bridge.estop()
+            rig.wait(0.1)
+        put_back(rig)
+        rig.bridge.estop()
+        rig.wait(0.002)
+        start, rig.push[0] = rig.log["tool"][-1], -20.0
+        rig.wait(0.5)
+        ways.append(np.linalg.norm(rig.log["tool"][-1] - start))
+    assert ways[1] == pytest.approx(ways[0], rel=0.05)
+
+
+@pytest.mark.parametrize("turned", [0.3, 0.8])
+def test_an_arm_that_is_not_configured_stays_where_it_was_put(turned: float) -> None:
+    rig = Rig()
+    put_back(rig, turned)
+    posture = rig.world.qpos[0, :6].copy()
+    rig.wait(1.0)
+    assert rig.mode == Mode.UNCONFIGURED
+    assert np.abs(rig.world.qpos[0, :6] - posture).max() < 0.002
+
+
+@pytest.mark.parametrize(("damping", "most"), [(1400.0, 17.0), (100.0, 12.0)])
+def test_a_damper_presses_a_wall_no_harder_than_stated(damping: float, most: float) -> None:
+    rig = Rig(wall=True, compliance=Compliance((0.0,) * 6, damping=(damping,) * 3 + (20.0,) * 3, max_force=10.0))
+    rig.move((0.2, 0.0, 0.0), 0.05)
+    assert rig.mode == Mode.TRACKING
+    pressed = np.linalg.norm(rig.logged("force", -500), axis=1)
+    assert 1.0 < pressed.mean() < most
 
 
 def test_what_rests_on_an_arm_forbids_its_activation_with_the_force() -> None:

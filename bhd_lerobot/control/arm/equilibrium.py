@@ -130,7 +130,8 @@ def move_equilibrium(state: Any, spring: Any, limits: Any) -> None:
     spring.opening_speed += clamp(change, -hardest / hz, hardest / hz)
     for k in range(3):
         spring.place[k] += spring.speed[k] / hz
-    spring.opening += spring.opening_speed / hz
+    opening = spring.opening + spring.opening_speed / hz
+    spring.opening = clamp(opening, limits.lower[limits.dof], limits.upper[limits.dof])
     turn_by(spring.turn, spring.speed[3:], 1.0 / hz)
 
 

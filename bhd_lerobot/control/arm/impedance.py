@@ -197,7 +197,7 @@ class ImpedanceController(Controller):
 
     def efforts(self, reading: PlantReading) -> Array:
         """Return the torques of the motors, weight included [N m], and the commanded force of the gripper [N]."""
-        efforts = self.actuators.copy()
+        efforts: Array = self.states["written"][:, : self.joints].copy()
         stiffness, damping = self.arm.servo_stiffness[-1], self.arm.servo_damping[-1]
         efforts[:, -1] = (efforts[:, -1] - reading.position[:, -1]) * stiffness - reading.velocity[:, -1] * damping
         return efforts

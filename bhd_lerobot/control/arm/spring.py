@@ -52,9 +52,6 @@ _GUARD = int(Watchdog.GUARD)
 def tell_spring(state: Any, spring: Any, limits: Any) -> None:
     """Take the modes that a robot has entered, and its setpoint."""
     if state.goes_back:
-        # The equilibrium is where the tool is, and torques go on from those that the motors have.
-        for k in range(limits.width):
-            state.actuators[k] = state.written[k]
         spring.opening, spring.opening_speed = state.written[limits.dof], 0.0
         for k in range(6):
             spring.wrench[k] = 0.0
@@ -102,6 +99,8 @@ def move_spring(state: Any, spring: Any, limits: Any) -> None:
     dof, speed = limits.dof, state.velocity
     for k in range(dof):
         spring.position[k] = state.position[k]
+        if spring.is_fresh:  # where the arm was put, its weight is carried
+            spring.carried[k] = state.position[k]
     find_dynamics(spring, limits, state.position, speed)
     observe_contact(state, spring, limits)
     for i in range(6):
@@ -122,7 +121,7 @@ def move_spring(state: Any, spring: Any, limits: Any) -> None:
             spring.wanted[k] = spring.needs[k]
     is_limited, spring.is_still = False, True
     for k in range(dof):
-        before, step = state.actuators[k], limits.effort[k] / (FULL_TORQUE_S * limits.hz)
+        before, step = state.written[k], limits.effort[k] / (FULL_TORQUE_S * limits.hz)
         given = clamp(clamp(spring.wanted[k], before - step, before + step), -limits.effort[k], limits.effort[k])
         is_limited = is_limited or given != spring.wanted[k]
         state.actuators[k] = given
@@ -211,7 +210,9 @@ def find_wanted_torques(state: Any, spring: Any, limits: Any, speed: Array) -> N
     find_mobility(spring, limits, _MOBILITY_DAMPING)
     find_push(spring)
     limit_push(state, spring, share_to_stop(spring, limits))
-    if not spring.is_fixed:
+    if spring.is_fixed:
+        limit_lead(state, spring)
+    else:
         find_damping(spring)
     damping = spring.fixed_damping if spring.is_fixed else spring.damping
     for i in range(6):
@@ -264,6 +265,30 @@ def limit_push(state: Any, spring: Any, share: float) -> None:
         allowed = min(clamp(largest * (1.0 - ahead / (_EASES * most)), least, largest), size * share)
         for k in range(3 * part, 3 * part + 3):
             spring.push[k] *= allowed / max(size, _TINY)
+
+
+@kernel()
+def limit_lead(state: Any, spring: Any) -> None:
+    """Let a damping that was given pull the tool along with the equilibrium by no more than the push leaves.
+
+    Beside what it takes from the tool's own speed: of the largest force and moment, or what free motion needs.
+    """
+    share = 1.0
+    for part in range(2):
+        pulls = drags = 0.0
+        for i in range(3 * part, 3 * part + 3):
+            pull = drag = 0.0
+            for j in range(6):
+                pull += spring.fixed_damping[i, j] * spring.lead[j]
+                drag += spring.fixed_damping[i, j] * spring.tool_speed[j]
+            pulls, drags = pulls + pull * pull, drags + pull * drag
+        size = max(math.sqrt(pulls), _TINY)
+        left = max(spring.largest[part] - length(spring.push, 3 * part), _FREE_TURN if part else _FREE_PUSH)
+        share = min(share, (left + max(drags / size, 0.0)) / size)
+    if share < 1.0:
+        state.limits |= _EFFORT
+    for k in range(6):
+        spring.lead[k] *= share
 
 
 @kernel()

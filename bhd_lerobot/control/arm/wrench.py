@@ -27,7 +27,7 @@ def observe_contact(state: Any, spring: Any, limits: Any) -> None:
     by_sensors = spring.is_braked and limits.has_effort  # what a brake gives is known to them alone
     for k in range(limits.dof):
         rate = spring.gradient[k] - spring.gravity[k]
-        applied = state.effort[k] if by_sensors else state.actuators[k]
+        applied = state.effort[k] if by_sensors else state.written[k]
         if spring.is_fresh:  # the first reading says nothing about what led to it
             spring.expected[k] = spring.momentum[k]
         else:

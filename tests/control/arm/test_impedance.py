@@ -45,10 +45,10 @@ class StuckPlant(Plant):
 
 
 class StuckRig:
-    def __init__(self) -> None:
-        self.plant = StuckPlant()
-        self.controller = ImpedanceController(ARM, 1, HZ, 20)
-        self.cerebellum = Cerebellum(ARM, self.plant, HZ, controller=self.controller)
+    def __init__(self, hz: int = HZ) -> None:
+        self.plant, self._hz, self._frame_ticks = StuckPlant(), hz, hz // 25
+        self.controller = ImpedanceController(ARM, 1, hz, self._frame_ticks)
+        self.cerebellum = Cerebellum(ARM, self.plant, hz, controller=self.controller)
         self.ticks = self.sequence = 0
         for request in (Request.CONFIGURE, Request.ACTIVATE):
             assert self.cerebellum.request(request).accepted.all()
@@ -56,7 +56,7 @@ class StuckRig:
 
     @property
     def now(self) -> int:
-        return self.ticks * 1_000_000_000 // HZ
+        return self.ticks * 1_000_000_000 // self._hz
 
     @property
     def mode(self) -> Mode:
@@ -72,7 +72,7 @@ class StuckRig:
             self.sequence += 1
             sent = self.cerebellum.offer(Setpoint(self.sequence, self.now, self.target))
             assert sent.reasons.tolist() == [Reason.ACCEPTED]
-            self.tick(20)
+            self.tick(self._frame_ticks)
 
 
 def test_the_command_is_the_pose_and_the_opening() -> None:
@@ -184,6 +184,30 @@ def test_values_that_are_no_numbers_stop_the_arm() -> None:
     assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written[-1]).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_a_spoilt_torque_reaches_neither_the_motors_nor_the_estimate_of_contacts(value: float) -> None:
+    rig = StuckRig()
+    rig.send(5)
+    rig.controller.actuators[:] = value
+    rig.tick(50)
+    assert np.isfinite(rig.plant.written).all()
+    np.testing.assert_allclose(rig.controller.contact_wrench, 0.0, atol=1.0)
+    assert rig.mode == Mode.TRACKING
+
+
+@pytest.mark.parametrize("hz", [50, 75, 100, 500, 1000])
+def test_the_opening_stops_at_the_ends_of_its_range_at_any_rate(hz: int) -> None:
+    rig = StuckRig(hz)
+    for opening in (0.0, MAX_OPENING, -1.0, 1.0):
+        rig.target[0, 7] = opening
+        rig.send(25)
+        assert rig.mode == Mode.TRACKING
+        assert rig.plant.written[-1][6] == pytest.approx(np.clip(opening, 0.0, MAX_OPENING), abs=1e-6)
+    opened = np.array(rig.plant.written)[:, 6]
+    assert (opened >= 0.0).all()
+    assert (opened <= MAX_OPENING).all()
 
 
 def test_a_broken_encoder_is_a_fault_and_does_not_spread() -> None:
