@@ -203,10 +203,11 @@ class Cerebellum:
         if self.may_write:
             self.plant.write(self.written)
 
-    def serve(self) -> None:
-        """Let the controller do what ticks wait for."""
+    def serve(self, ids: NDArray[np.intp] | None = None) -> None:
+        """Let the controller do what the ticks of some robots wait for, of all if None."""
+        waiting = np.flatnonzero(self.controller.arms["stage"]) if ids is None else ids
         try:
-            for sim in np.flatnonzero(self.controller.arms["stage"]).tolist():
+            for sim in waiting.tolist():
                 self.controller.serve(sim)
         except BaseException:
             self._keep_stops()

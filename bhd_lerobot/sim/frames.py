@@ -7,9 +7,10 @@ import ctypes
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Lock
 from typing import Any, Protocol
 
@@ -30,6 +31,7 @@ from bhd_lerobot.sim.world import World
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _LEFT_OUT = ("read", "write", "set_mode", "step", "tick")  # methods that frames in machine code do not call
 _NO_RING: NDArray[np.float64] = np.zeros((0, 1, 1))
+_SHARES = 2  # of the simulations for each thread: what one waits for is done while others go on
 _OUTPUTS = 16  # fields that may be read after a frame
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.float64]
@@ -366,6 +368,7 @@ class Frames:
         self._seen: list[bytes] = []  # the fields that they were made with, and of each simulation
         self._rows: list[bytes | None] = [None] * world.n
         self._threads: list[_Thread] = []
+        self._free: SimpleQueue[_Thread] = SimpleQueue()
         self._pool: ThreadPoolExecutor | None = None
         self._addresses, self._numbers, self._zeros = np.zeros((3, world.n), np.int64)
         self._at_once = _NO_RING, self._zeros, self._zeros, 0
@@ -434,18 +437,17 @@ class Frames:
             return False
         self._take_models()
         if self._pid != os.getpid():  # after a fork there are no threads
-            self._pid, self._pool, self._threads = os.getpid(), None, []
+            self._pid, self._pool, self._threads, self._free = os.getpid(), None, [], SimpleQueue()
         if not self._threads:
             self._threads = [_Thread(self._world, self._layout) for _ in range(self._world.threads)]
+            for thread in self._threads:
+                self._free.put(thread)
             if len(self._threads) > 1:
                 self._pool = ThreadPoolExecutor(len(self._threads), "frames")
         self._numbers[ids] = first_tick
         if own.controller.arms is not None:
             own.controller.arms["stage"] = 0  # whatever interrupted the last frame
         self._run(ids, first_tick, ticks)
-        while len(ids := ids[self._numbers[ids] < first_tick + ticks]):
-            own.serve()
-            self._run(ids, first_tick, ticks)
         own.now_ns = (first_tick + ticks - 1) * NANOSECONDS // own.control_hz
         if self._late is not None and self._late.is_late:
             self._late.pass_by(ticks)
@@ -458,25 +460,34 @@ class Frames:
         return any(name in vars(one) for one in watched for name in _LEFT_OUT)
 
     def _run(self, ids: NDArray[np.intp], first_tick: int, ticks: int) -> None:
-        """Let ticks go by until each simulation is at the end, or waits for its controller."""
-        shared = self._shared
+        """Let ticks go by; what ticks of some simulations wait for is done while others go on."""
         if self._pool is None:
-            self._threads[0].run(self._kernel, ids, self._addresses, shared, self._numbers, first_tick, ticks)
+            while len(ids):
+                ids = self._run_share(ids, first_tick, ticks, self._shared)
+                if len(ids):
+                    self._cerebellum.serve(ids)
             return
-        shares = np.array_split(ids, len(self._threads))
-        calls = zip(self._threads, shares, strict=True)
-        jobs = [
-            self._pool.submit(
-                thread.run, self._kernel, share, self._addresses, shared, self._numbers, first_tick, ticks
-            )
-            for thread, share in calls
-            if len(share)
-        ]
+        shares = np.array_split(ids, min(len(ids), _SHARES * len(self._threads)))
+        jobs = {self._pool.submit(self._run_share, share, first_tick, ticks, self._shared) for share in shares}
         try:
-            for job in jobs:
-                job.result()
+            while jobs:
+                done, jobs = wait(jobs, return_when=FIRST_COMPLETED)
+                for job in done:
+                    left = job.result()
+                    if len(left):
+                        self._cerebellum.serve(left)
+                        jobs.add(self._pool.submit(self._run_share, left, first_tick, ticks, self._shared))
         finally:
             wait(jobs)  # whatever interrupts this: no other frame begins meanwhile
+
+    def _run_share(self, ids: NDArray[np.intp], first_tick: int, ticks: int, shared: Any) -> NDArray[np.intp]:
+        """Let ticks of some simulations go by; return those that wait for their controller."""
+        thread = self._free.get()
+        try:
+            thread.run(self._kernel, ids, self._addresses, shared, self._numbers, first_tick, ticks)
+        finally:
+            self._free.put(thread)
+        return ids[self._numbers[ids] < first_tick + ticks]
 
     @property
     def _are_copied(self) -> bool:
@@ -528,7 +539,7 @@ class Frames:
         """End the threads. May be called twice."""
         if self._pool is not None:
             self._pool.shutdown()
-            self._pool, self._threads = None, []
+            self._pool, self._threads, self._free = None, [], SimpleQueue()
 
 
 class _Thread:

@@ -31,6 +31,7 @@ _ATTEMPTS = 8  # postures that reach a pose, of which so many are tried
 _TORQUE_STEP_S = 0.01  # between two states of a trajectory whose torques are looked at
 _SLOWER = 8  # times that a motion is planned with smaller accelerations, until its torques fit
 _LEAST_SHARE = 0.05  # of the accelerations, with which a motion is still one
+_MOST_HELD = 64  # things whose distances are remembered
 _ROUNDING = 1e-9  # [m] a distance that shrinks by less does not shrink
 
 
@@ -73,6 +74,7 @@ class GoalPlanner:
         # Without a load the limits leave the motors room enough.
         self._dynamics = ArmDynamics(body) if arm.load and body.mjcf else None
         self._collision = self.kinematics.collision  # of the arm and what it holds, for the plan that is made
+        self._holding: dict[Capsule, CollisionModel] = {}  # of what was held last
         self._calm = self.limits.scaled(1.0, acceleration_share(body))
 
     def check(self, command: BrainCommand) -> PlanFailure | None:
@@ -104,7 +106,11 @@ class GoalPlanner:
             return failure
         self._collision = self.kinematics.collision
         if held is not None:
-            self._collision = CollisionModel(self.arm.chain.holding(held))
+            if held not in self._holding:
+                while len(self._holding) >= _MOST_HELD:
+                    del self._holding[next(iter(self._holding))]
+                self._holding[held] = CollisionModel(self.arm.chain.holding(held))
+            self._collision = self._holding[held]
         state = State.of(position, velocity, acceleration)
         arm = self._plan_arm(command, state[self._arm])
         if isinstance(arm, PlanFailure):

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 class TrajectoryPlayer:
     """One trajectory for each arm, or none: rows of one block, from the next to the end, in the arms' records.
 
+    Each arm has rows of its own, which no other arm's trajectory moves: others may be played meanwhile.
+
     Attributes:
         rows: position, velocity and acceleration at each tick, shape (T, 3, dof).
 
@@ -24,18 +26,18 @@ class TrajectoryPlayer:
 
     def __init__(self, arms: NDArray[Any], dof: int) -> None:
         self._next, self._end = arms["row"], arms["end"]
-        self._block: Array = np.zeros((4096, 3, dof))
-        self.rows, self._used = self._block, 0
+        self.rows: Array = np.zeros((4096, 3, dof))
+        self._block, self._used = self.rows, 0
+        self._first, self._room = np.zeros((2, len(arms)), np.int64)
 
     def start(self, sim: int, trajectory: Trajectory) -> None:
         """Play a trajectory from the next tick on; it takes the place of the one that is being played."""
-        self.stop(sim)
-        if self._used + trajectory.ticks > len(self._block):
-            self._make_room(trajectory.ticks)
-        begin, end = self._used, self._used + trajectory.ticks
+        if trajectory.ticks > self._room[sim]:
+            self._make_room(sim, 1 << (trajectory.ticks - 1).bit_length())
+        begin, end = int(self._first[sim]), int(self._first[sim]) + trajectory.ticks
         rows = self._block[begin:end]
         rows[:, 0], rows[:, 1], rows[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
-        self._next[sim], self._end[sim], self._used, self.rows = begin, end, end, self._block
+        self._next[sim], self._end[sim], self.rows = begin, end, self._block
 
     def borrow(self, rows: Array) -> None:
         """Play rows of another owner from the next tick on, without copying them; for one arm.
@@ -50,8 +52,6 @@ class TrajectoryPlayer:
     def stop(self, sim: int) -> None:
         """Play nothing for an arm: its reference stays as it is."""
         self._next[sim] = self._end[sim] = 0
-        if not (self._next < self._end).any():
-            self._used = 0
 
     def is_playing(self, sim: int) -> bool:
         """Return whether anything is left to be played for an arm."""
@@ -67,19 +67,14 @@ class TrajectoryPlayer:
             return None
         return State.of(*self.rows[min(int(self._next[sim]) + ticks, int(self._end[sim])) - 1])
 
-    def _make_room(self, ticks: int) -> None:
-        """Move the rows that are still to be played to the front of a block that holds `ticks` more."""
-        ids = np.flatnonzero(self._next < self._end)
-        lengths = self._end[ids] - self._next[ids]
-        needed = int(lengths.sum()) + ticks
-        # Half of the block stays free, so that rows are moved seldom.
-        block = np.zeros((max(len(self._block), 2 * needed), *self._block.shape[1:]))
-        used = 0
-        for sim, length in zip(ids, lengths, strict=True):
-            block[used : used + length] = self._block[self._end[sim] - length : self._end[sim]]
-            self._next[sim], self._end[sim] = used, used + length
-            used += length
-        self._block, self._used = block, used
+    def _make_room(self, sim: int, ticks: int) -> None:
+        """Give an arm more rows, at the end of the block."""
+        first, self._used = self._used, self._used + ticks
+        self._first[sim], self._room[sim] = first, ticks
+        if self._used > len(self._block):
+            block = np.zeros((2 * self._used, *self._block.shape[1:]))
+            block[:first] = self._block[:first]
+            self._block = block
 
 
 @kernel()
