@@ -61,6 +61,8 @@ def test_setpoints_of_a_brain_move_an_arm(domain: int, tmp_path: Path) -> None:
             return bool(np.abs(log_of(log, "state")[-1]["position"] - np.array(target[:6])).max() < 0.01)
 
         until(arrives, "the arm is where it was sent")
+        last = log_of(log, "state")[-1]["monotonic"]  # a setpoint that is under way would take the goal's place
+        until(lambda: log_of(log, "state")[-1]["monotonic"] > last + 2, "the last setpoint has come")
         pose = {"position": {"x": -0.4, "y": 0.2, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
         goal = {"task_id": "far", "target_pose": pose, "max_velocity": 0.1}
         side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
