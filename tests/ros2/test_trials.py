@@ -125,7 +125,7 @@ def check_source(
 
 
 KILLED = {  # a part of its command line, None for bhd-record itself; what is said of it
-    "robot": ("", "/joint_states has sent no message for"),
+    "robot": ("", r"/joint_states has sent no message for|The wheels read"),  # whichever is noticed first
     "recording": (None, ""),
     "cerebellum": ("robots.host.process", "The cerebellum's process was killed by signal 9"),
     "node": ("ros2.live.process node", "The process of the ROS 2 node ended with status -9"),
@@ -139,9 +139,7 @@ def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(killed
     log = tmp_path / "robot.jsonl"
     with (
         Peer("standin_turtlebot3.py", "--open", "--log", log, domain=domain) as robot,
-        Recording(
-            "turtlebot3", *DRIVE, "--dataset.num_episodes=9", domain=domain, folder=tmp_path, silence_s=3
-        ) as recording,
+        Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=9", domain=domain, folder=tmp_path) as recording,
     ):
         recording.wait_for_episode(2)
         until(lambda: log_of(log, "pose")[-1]["twist"][0] > 0.1, "the robot moves")
@@ -154,7 +152,7 @@ def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(killed
             assert time.monotonic() - killed_at < 20  # not because the brain was silent for so long
         assert recording.process.wait() != 0
         if part is not None:
-            assert cause in recording.text
+            assert re.search(cause, recording.text)
     if killed == "recording":
         assert data(["repair", str(recording.root)]) == 0
     outcomes = outcomes_of(recording.root)
