@@ -157,7 +157,8 @@ def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(killed
         assert data(["repair", str(recording.root)]) == 0
     outcomes = outcomes_of(recording.root)
     assert outcomes[0] == "timeout"
-    assert outcomes[1:] in ([], ["fault"])
+    assert set(outcomes[1:-1]) <= {"timeout"}
+    assert outcomes[-1] in ("timeout", "fault")
     assert data(["check", str(recording.root)]) == 0
 
 
