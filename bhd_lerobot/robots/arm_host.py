@@ -203,7 +203,7 @@ class ArmHost(Host):
         for sim in np.flatnonzero(mask).tolist():
             posture, problem = self._posture(sim, action[sim, :7], command[sim, :dof])
             if problem is None:
-                setpoints[sim, :dof], setpoints[sim, dof:] = posture, action[sim, 7:]
+                setpoints[sim] = (*posture, *action[sim, 7:])  # of an impedance the pose itself
                 self._taken[sim] = action[sim, :3]
             else:
                 refused[sim] = (Reason.NO_POSTURE, problem)
