@@ -166,7 +166,7 @@ class LiveBlock:
         Raises:
             RealtimeError: there is none.
         """
-        return cls(SharedBlock.attach(name))
+        return cls._of(SharedBlock.attach(name))
 
     @classmethod
     def watch(cls, name: str) -> Self:
@@ -175,7 +175,15 @@ class LiveBlock:
         Raises:
             RealtimeError: there is none.
         """
-        return cls(SharedBlock.watch(name))
+        return cls._of(SharedBlock.watch(name))
+
+    @classmethod
+    def _of(cls, block: SharedBlock) -> Self:
+        try:
+            return cls(block)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            block.close()
+            raise RealtimeError(f"The memory of the robot {block.name!r} is damaged, or of another version.") from error
 
     @property
     def phase(self) -> Phase:

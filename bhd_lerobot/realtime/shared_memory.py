@@ -166,10 +166,15 @@ class SharedBlock:
     @classmethod
     def _opened(cls, path: Path, descriptor: int, memory: mmap.mmap) -> Self:
         length = int.from_bytes(memory[8:16], "little")
-        described = json.loads(memory[16 : 16 + length])
         start = -(-(16 + length) // _HEADER) * _HEADER
-        block = cls(path, descriptor, memory, {k: (start + o, s) for k, (o, s) in described["sections"].items()})
-        block.about = described["about"]
+        try:
+            described = json.loads(memory[16 : 16 + length])
+            sections = {name: (start + offset, size) for name, (offset, size) in described["sections"].items()}
+            block = cls(path, descriptor, memory, sections)
+            block.about = described["about"]
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            os.close(descriptor)
+            raise RealtimeError(f"{path} is damaged: another process has overwritten what describes it.") from error
         return block
 
     @staticmethod

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import shutil
 import socket
 import time
@@ -13,6 +14,7 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime import shared_memory
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout
 from bhd_lerobot.realtime.shared_memory import SharedBlock, check_platform, names, sweep
 from tests.forks import Fork
 from tests.waiting import until
@@ -190,3 +192,30 @@ def test_of_several_simultaneous_creators_at_most_one_gets_the_name(name: str, t
     assert all("running already" in line or line == "made\n" for line in replies), replies
     for process in processes:
         process.kill()
+
+
+def test_a_damaged_description_is_an_error_of_ours_and_nothing_stays_open(name: str) -> None:
+    rng, opened = random.Random(0), 0
+    made = LiveLayout(np.dtype([("x", np.float64)]), 4).create(name, {})
+    [path] = files(name)
+    intact = path.read_bytes()[:600]
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(200):
+        damaged = bytearray(intact)
+        size = rng.choice((1, 8, 100))
+        at = rng.randrange(8, 500)
+        damaged[at : at + size] = rng.randbytes(size)
+        with path.open("r+b") as file:
+            file.write(damaged)
+        for open_it in (LiveBlock.attach, LiveBlock.watch):
+            try:
+                open_it(made.name).close()
+                opened += 1
+            except RealtimeError:
+                pass
+    assert opened < 200
+    assert len(os.listdir("/proc/self/fd")) == before
+    with path.open("r+b") as file:
+        file.write(intact)
+    LiveBlock.attach(made.name).close()
+    made.close()

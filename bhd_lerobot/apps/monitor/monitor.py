@@ -36,7 +36,7 @@ def running(wanted: str | None = None) -> list[LiveBlock]:
     for name in names():
         try:
             block = LiveBlock.watch(name)
-        except (RealtimeError, KeyError, TypeError, ValueError):  # gone in the meantime, or the block of something else
+        except RealtimeError:  # gone in the meantime, or of another version
             if name == wanted:
                 raise
             continue
