@@ -52,8 +52,11 @@ from bhd_lerobot.recording.config import RecordConfig as RecordConfig
 from bhd_lerobot.registry import register_brain as register_brain
 from bhd_lerobot.registry import register_robot as register_robot
 from bhd_lerobot.registry import register_task as register_task
+from bhd_lerobot.robots.arm import SimulatedArm as SimulatedArm
 from bhd_lerobot.robots.base import SimulatedBase as SimulatedBase
 from bhd_lerobot.robots.config import MobileBaseConfig as MobileBaseConfig
+from bhd_lerobot.robots.config_arm import FileArmConfig as FileArmConfig
+from bhd_lerobot.robots.config_arm import GripperOptions as GripperOptions
 from bhd_lerobot.robots.config_ur5 import UR5Config as UR5Config
 from bhd_lerobot.robots.conformance import check_robot as check_robot
 from bhd_lerobot.robots.host.config import RealtimeConfig as RealtimeConfig

@@ -493,6 +493,8 @@ class Handling:
         lift: height by which it can lift what it has grasped anywhere on its table [m].
         neutral: direction from the right to the left finger, beside that from the base to the tool, when the wrist is
             turned as at home [rad].
+        fixed: from the tool centre point to the finger that does not move, along the tool's y axis [m]; None if both
+            move.
         hand_over: where a person can take what it holds [m].
     """
 
@@ -503,6 +505,7 @@ class Handling:
     travel: float = 0.22
     lift: float = 0.15
     neutral: float = 0.0
+    fixed: float | None = None
     hand_over: tuple[float, float, float] = (0.40, -0.40, 0.35)
 
 

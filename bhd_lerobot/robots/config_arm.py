@@ -169,6 +169,17 @@ class FileArmConfig(ModelArmConfig):
     acceleration: list[float] = field(default_factory=list)
     effort: list[float] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        # As they are recorded, and as JSON has them.
+        self.mjcf = None if self.mjcf is None else Path(self.mjcf)
+        self.gripper = GripperOptions(**self.gripper) if isinstance(self.gripper, dict) else self.gripper
+        super().__post_init__()
+
+    def check_rates(self) -> None:
+        """Check that the robot works at its rates, as far as it is known what robot it is."""
+        if self.mjcf is not None:
+            super().check_rates()
+
     @property
     def file(self) -> ArmFile:
         """The file, and what it does not say.

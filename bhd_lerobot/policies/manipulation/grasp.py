@@ -135,7 +135,12 @@ def plan_grasp(
     best = max(grasps, key=lambda grasp: (min(grasp.room, enough), -_turn(grasp.yaw, neutral)))
     # Fingers are alike: of the two ways to stand on that line, the one with the smaller turn of the wrist.
     away = (best.yaw - neutral + math.pi / 2) % math.pi - math.pi / 2
-    return replace(best, yaw=neutral + away)
+    best = replace(best, yaw=neutral + away)
+    if handling.fixed is None:
+        return best
+    # Only one finger moves: the middle between them is elsewhere.
+    aside = best.opening / 2 - handling.fixed
+    return replace(best, x=best.x + aside * math.cos(best.yaw), y=best.y + aside * math.sin(best.yaw))
 
 
 def neutral_yaw(x: float, y: float, handling: Handling) -> float:

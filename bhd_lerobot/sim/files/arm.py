@@ -49,7 +49,7 @@ _SPEED = 2.0  # [rad/s] of a joint of which nothing is known: small servos and l
 _NEAR = 0.003  # [m] that the arm stays away from itself and the table
 _LIKELY = 0.01  # share of the postures around home that tasks may ask for
 _POSTURES = 4000  # that are drawn to find out what an arm reaches
-_HELD_SHARE = 0.25  # of the payload, with which a joint has to arrive
+_HELD_SHARE = 0.4  # of the payload, with which a joint has to arrive
 _AHEAD = 0.05  # [m] nearer to the base's axis than this the tool is before it in no direction
 # What the workspace of a UR5 is made for, which others have to scale [m]: its reach on the table, that to the farther
 # corners of the part where things stand, the widest thing that its gripper grasps, and what a pick lifts things by.
@@ -389,7 +389,7 @@ class _Arm(RobotFile):
         speed = each_of(velocity, self.dof, "robot.velocity")
         fingers = (opening,) if grip else ()
 
-        def both(of_joints: Sequence[float], per_metre: float) -> tuple[float, ...]:
+        def both(of_joints: Any, per_metre: float) -> tuple[float, ...]:
             return (*map(float, of_joints), *(per_metre * one for one in fingers))
 
         return Limits(
@@ -440,7 +440,7 @@ class _Arm(RobotFile):
         usual = Handling()
         lowest = below + chain.min_distance + 0.005
         travel = lowest + scale * (usual.travel - usual.lowest)
-        lift = _LIFT + 0.015
+        lift, k = _LIFT + 0.015, workspace.reach / _LIKE_UR5
         handling = Handling(
             scale=scale,
             finger=usual.finger * min(1.0, scale / 0.5),
@@ -449,7 +449,8 @@ class _Arm(RobotFile):
             travel=travel,
             lift=lift,
             neutral=float(np.arctan2(tool[1, 1], tool[0, 1]) - np.arctan2(tool[1, 3], tool[0, 3])),
-            hand_over=tuple(one * workspace.reach / _LIKE_UR5 for one in usual.hand_over),
+            fixed=self._fixed_finger(),
+            hand_over=(0.4 * k, -0.4 * k, 0.35 * k),
         )
         # The rectangle of a UR5's table, as large as the arm points down at all heights in its farther corners.
         reach = 0.0
@@ -457,13 +458,31 @@ class _Arm(RobotFile):
             heights = (lowest, travel, lowest + 0.6 * 0.12 * scale + lift)
             found = [kinematics.solve(_down(away, z), home).code == ResultCode.SUCCEEDED for z in heights]
             reach = away if all(found) else reach
-        k = (reach or workspace.reach) / _CORNER_UR5
+        k = float(reach or workspace.reach) / _CORNER_UR5
         return replace(
             workspace,
             table=((0.35 * k, -0.30 * k), (0.65 * k, 0.30 * k)),
-            reach=1.1 * reach or workspace.reach,
+            reach=float(1.1 * reach or workspace.reach),
             handling=handling,
         )
+
+    def _fixed_finger(self) -> float | None:
+        """Return where the finger that does not move is, along the tool's y axis [m]: the closed jaw lies on it."""
+        assert self.grip is not None
+        grip, model, data = self.grip[0], self.model, mujoco.MjData(self.model)
+        if len(grip.joints) > 1:
+            return None
+        self._set(data, None)
+        data.qpos[model.joint(grip.joints[0]).qposadr[0]] = grip.closed[0]
+        mujoco.mj_kinematics(model, data)
+        tool, jaw = data.site("tool"), int(model.joint(grip.joints[0]).bodyid[0])
+        across, faces = tool.xmat.reshape(3, 3)[:, 1], []
+        for geom in range(model.ngeom):
+            if model.geom_bodyid[geom] == jaw and model.geom_contype[geom]:
+                turn = data.geom_xmat[geom].reshape(3, 3)
+                middle = data.geom_xpos[geom] + turn @ model.geom_aabb[geom, :3] - tool.xpos
+                faces.append(float(across @ middle + np.abs(across @ turn) @ model.geom_aabb[geom, 3:]))
+        return max(faces, default=0.0)
 
     def _choose_home(self, kinematics: ArmKinematics, workspace: Workspace) -> Array:
         """Return the file's home, unless nothing that tasks ask for is near to it, then one over the table's middle."""
