@@ -10,7 +10,7 @@ import inspect
 import re
 import textwrap
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,7 @@ Besides these options each has LeRobot's own `teleop.id` and `teleop.calibration
 """
 
 # Groups of classes whose options are listed already: what they are options of, and the page and anchor.
+_MANY = 15  # options that are not listed twice
 Listed = dict[frozenset[type], tuple[str, str]]
 
 
@@ -88,7 +89,13 @@ def pages() -> dict[Path, str]:
         listed[frozenset(groups[name].values())] = name, f"{name}.md"
     for name, text in texts.items():
         for chosen, one in groups[name].items():
-            text += [f"## `{name}.type={chosen}`\n", *_options(one, f"{name}.", f"{name}.md", listed)]
+            own = [option for option, _, _ in options_of(one)]
+            text.append(f"## `{name}.type={chosen}`\n")
+            if same := _with_some_of(one, groups[name], chosen):
+                own = [option for option in own if option not in dict(_defaults(groups[name][same]))]
+                text.append(f"The options of `{name}.type={same}`{', and:' if own else '.'}\n")
+            if own:
+                text.extend(_options(one, f"{name}.", f"{name}.md", listed, own))
     texts["record"] = ["# `bhd-record`\n", *_options(RecordConfig, "", "record.md", listed)]
     texts["replay"] = ["# `bhd-replay`\n", *_options(ReplayConfig, "", "replay.md", listed)]
     names = [name for name, _, _ in options_of(EnvironmentEvalConfig) if name != "env"]
@@ -120,6 +127,23 @@ def pages() -> dict[Path, str]:
         # A page of one command has no headings of the second level of its own.
         written[FOLDER / "options" / f"{name}.md"] = page if "\n## " in page else page.replace("\n### ", "\n## ")
     return written
+
+
+def _defaults(one: Any) -> list[tuple[str, str]]:
+    """Return the options of a class and their defaults, as text."""
+    names = [name for name, _, _ in options_of(one)]
+    return [(option.name, str(option.default)) for option in dataclasses.fields(one) if option.name in names]
+
+
+def _with_some_of(one: Any, others: Mapping[str, type], chosen: str) -> str | None:
+    """Return the type that has many of a class's options and no others, the last of those that are alike."""
+    found, own = None, _defaults(one)
+    for name, other in others.items():
+        theirs = _defaults(other)
+        alike = len(theirs) == len(own)
+        if name != chosen and len(theirs) > _MANY and set(theirs) <= set(own) and not (alike and name < chosen):
+            found = name
+    return found
 
 
 def _index() -> str:

@@ -14,14 +14,15 @@ _OWN: dict[str, Callable[[], Body] | str] = {
     "arm": ur5,  # stands for the arms that are files
     "so101": "bhd_lerobot.sim.files.arm:so101",
 }
-_OF_FILES = ("arm", "so101")  # types whose bodies take seconds to be made
+OF_FILES = ("arm", "so101")
+"""Types whose bodies take seconds to be made."""
 BODIES: Registry[Callable[[], Body]] = Registry("body", _OWN)
 """What makes the body of a robot with the options that it has by default, by the robot's type."""
 
 
 def parts_of_type(robot_type: str) -> Set[type]:
     """Return the parts that robots of a type have by default."""
-    return {Arm, GripperSpec} if robot_type in _OF_FILES else BODIES[robot_type]().parts.keys()
+    return {Arm, GripperSpec} if robot_type in OF_FILES else BODIES[robot_type]().parts.keys()
 
 
 _unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
@@ -34,7 +35,8 @@ def body_with(part: type) -> Body:
 
 def body_of(robot_type: str | None) -> Body | None:
     """Return the body of a robot as a dataset names it; None if it names none, or there is no such robot."""
-    if robot_type is None or robot_type == "arm":  # one of a file: it stands for all of them, and is none
+    # A file's joints are known where the file is; and others record an SO-101 in degrees under that name.
+    if robot_type is None or robot_type in OF_FILES:
         return None
     if robot_type not in BODIES and robot_type not in _unknown:
         load_plugins()

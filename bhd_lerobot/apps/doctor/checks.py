@@ -25,7 +25,7 @@ from bhd_lerobot.realtime.privileges import (
 )
 from bhd_lerobot.versions import DISTRIBUTION, required_versions
 
-ROBOTS = ("arm", "so101", "turtlebot3", "ur5")
+ROBOTS = ("turtlebot3", "ur5")
 TELEOPERATORS = ("bhd_brain", "bhd_keyboard_arm", "bhd_keyboard_base")
 
 # Of the period, for the latest wake-up. What is lost to waiting is lost to the tick: beyond a half, one of a quarter of

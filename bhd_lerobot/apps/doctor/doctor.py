@@ -47,9 +47,9 @@ def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
 
 def robot_rates() -> dict[str, int]:
     """Return the default control rate of each robot [Hz]."""
-    from bhd_lerobot.bodies.registry import BODIES
+    from bhd_lerobot.bodies.registry import BODIES, OF_FILES
 
-    return {name: body().control_hz for name, body in BODIES.items()}
+    return {name: BODIES[name]().control_hz for name in BODIES if name not in OF_FILES}
 
 
 def _check_options(rate: int, seconds: float) -> None:
