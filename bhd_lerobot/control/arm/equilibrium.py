@@ -32,15 +32,13 @@ _VELOCITY, _ACCELERATION = int(Limit.VELOCITY), int(Limit.ACCELERATION)
 @kernel()
 def head_for_setpoint(state: Any, spring: Any, limits: Any) -> bool:
     """Head for what was requested; return False if that is no pose: another process writes the queue."""
-    square = 0.0
+    square, is_finite = 0.0, True
     for k in range(8):
         value = state.requested[k]
-        if not math.isfinite(value) or (3 <= k < 7 and abs(value) > _MOST_NORM):
-            state.limits |= _NON_FINITE
-            return False
+        is_finite = is_finite and math.isfinite(value)
         if 3 <= k < 7:
             square += value * value
-    if not _LEAST_NORM < math.sqrt(square) < _MOST_NORM:
+    if not (is_finite and _LEAST_NORM < math.sqrt(square) < _MOST_NORM):
         state.limits |= _NON_FINITE
         return False
     if not spring.is_active:

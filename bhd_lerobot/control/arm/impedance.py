@@ -89,15 +89,11 @@ class ImpedanceController(Controller):
         """Write what a tick goes by."""
         row, arm, dof = self.arm_limits[0], self.arm, self._dof
         limits = arm.limits
-        row["dof"], row["width"], row["hz"], row["frame_ticks"] = dof, self.joints, control_hz, frame_ticks
-        for name, values in (
-            ("lower", limits.lower),
-            ("upper", limits.upper),
-            ("fastest", limits.velocity),
-            ("hardest", limits.acceleration),
-            ("effort", limits.effort),
-        ):
-            put(row, name, values)
+        row["dof"], row["hz"], row["frame_ticks"] = dof, control_hz, frame_ticks
+        for name, field in (("fastest", "velocity"), ("hardest", "acceleration")):
+            put(row, name, getattr(limits, field))
+        for name in ("lower", "upper", "effort"):
+            put(row, name, getattr(limits, name))
         # Positions beyond what the arm can ever reach are refused; nearer ones are for the spring to find out.
         row["most_reach"] = arm.chain.reach
         put(row, "most_speed", _MOST_JOINT_SPEED * np.asarray(limits.velocity[:dof]))
