@@ -55,7 +55,7 @@ class ImpedanceController(Controller):
 
     Raises:
         ConfigError: the arm does not take torques or has no brakes, or there are too few ticks for the estimate of
-            contacts.
+            contacts or for a frame, or `max_force` is not above 0.
     """
 
     width = WIDTH
@@ -69,6 +69,8 @@ class ImpedanceController(Controller):
             raise ConfigError(f"The arm {body.name!r} has no brakes (Arm.brake_damping); impedance needs them.")
         if control_hz < OBSERVER_GAIN:
             raise ConfigError(f"control_hz is {control_hz}; impedance needs at least {OBSERVER_GAIN:g} ticks a second.")
+        if not (max_force > 0.0 and frame_ticks > 0):
+            raise ConfigError(f"max_force is {max_force} and frame_ticks is {frame_ticks}; both must be above 0.")
         self.arm, self._forward = arm, ForwardKinematics(arm.chain)
         self.joints, self._dof = len(arm.limits.names), len(arm.chain.joints)
         self.springs, self.arm_limits = new_springs(n), np.zeros(1, ARM_LIMITS)

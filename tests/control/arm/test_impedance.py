@@ -298,3 +298,9 @@ def test_a_position_servo_is_refused() -> None:
 def test_too_few_ticks_for_the_estimate_of_contacts_are_refused() -> None:
     with pytest.raises(ConfigError, match="control_hz is 49"):
         ImpedanceController(ARM, 1, 49, 1)
+
+
+@pytest.mark.parametrize(("frame_ticks", "max_force"), [(0, 150.0), (20, 0.0), (20, -1.0), (20, np.nan)])
+def test_a_frame_without_ticks_and_a_force_that_limits_nothing_are_refused(frame_ticks: int, max_force: float) -> None:
+    with pytest.raises(ConfigError, match="must be above 0"):
+        ImpedanceController(ARM, 1, HZ, frame_ticks, max_force)
