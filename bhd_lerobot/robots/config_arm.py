@@ -9,7 +9,7 @@ import numpy as np
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
-from bhd_lerobot.bodies.body import OBSTACLE, Body, Capsule
+from bhd_lerobot.bodies.body import OBSTACLE, Arm, Body, Capsule
 from bhd_lerobot.bodies.so101 import SO101
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
@@ -119,7 +119,7 @@ class ModelArmConfig(ArmConfig):
 
         if self.control == "impedance":
             raise ConfigError("robot.control is 'impedance'; this arm has position servos: use --robot.control=servo.")
-        return arm_body(
+        body = arm_body(
             self.file,
             load=self.payload,
             obstacles=self.capsules,
@@ -127,6 +127,11 @@ class ModelArmConfig(ArmConfig):
             camera_width=self.camera_width,
             camera_height=self.camera_height,
         )
+        if self.clock == "realtime" and body.need(Arm).gripper is None:
+            raise ConfigError(
+                "robot.clock is 'realtime', and the arm has no gripper; such an arm runs in lockstep: leave it out."
+            )
+        return body
 
 
 @RobotConfig.register_subclass("so101")
@@ -201,7 +206,7 @@ class FileArmConfig(ModelArmConfig):
             tool_offset=tuple(self.tool_offset),
             gripper=GripperFile(**vars(self.gripper)),
             home=tuple(self.home),
-            ranges=tuple((name, *values) for name, values in self.ranges.items()),
+            ranges=tuple((name, low, high) for name, (low, high) in self.ranges.items()),
             velocity=tuple(self.velocity),
             acceleration=tuple(self.acceleration),
             effort=tuple(self.effort),
