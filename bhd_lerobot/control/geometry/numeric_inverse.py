@@ -178,6 +178,12 @@ def find_posture(  # noqa: PLR0917
 
 
 @kernel()
+def squared(value: float) -> float:
+    """Return the square of a number."""
+    return value * value
+
+
+@kernel()
 def misfit(  # noqa: PLR0917
     q: Array, near: Array, target: Array, weights: tuple[float, float, float], tool: Array, arm: Any, geometry: Any
 ) -> float:
@@ -188,11 +194,11 @@ def misfit(  # noqa: PLR0917
         for j in range(4):
             tool[i, j] = last[i, 0] * own[0, j] + last[i, 1] * own[1, j] + last[i, 2] * own[2, j]
         tool[i, 3] += last[i, 3]
-        total += (target[i, 3] - tool[i, 3]) ** 2
+        total += squared(target[i, 3] - tool[i, 3])
         for j in range(3):
-            total += (weights[1] if j == 2 else weights[0]) * (target[i, j] - tool[i, j]) ** 2
+            total += (weights[1] if j == 2 else weights[0]) * squared(target[i, j] - tool[i, j])
     for k in range(dof):
-        total += weights[2] * (near[k] - q[k]) ** 2
+        total += weights[2] * squared(near[k] - q[k])
     return total
 
 
