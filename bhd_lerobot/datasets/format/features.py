@@ -60,7 +60,7 @@ SCALARS: dict[str, tuple[str, str]] = {
     WATCHDOG: (
         "int64",
         "watchdogs that were triggered: 1 command too old, 2 arm blocked, 4 brain silent, 8 recorder silent (before "
-        "version 0.4), 16 plant silent, 32 too many missed ticks, 64 guard, 128 force; sum",
+        "version 0.4), 16 plant silent, 32 too many missed ticks, 64 guard, 128 force, 256 speed; sum",
     ),
     MODE: (
         "int64",
