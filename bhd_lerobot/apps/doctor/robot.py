@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
@@ -52,25 +53,17 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
 
 
 def _joints(arm: Arm) -> Table:
-    table, limits = Table(title="joints", title_justify="left"), arm.limits
-    for heading in (
-        "",
-        "range [rad, m]",
-        "home",
-        "speed",
-        "acceleration",
-        "effort",
-        "stiffness",
-        "damping",
-    ):
-        table.add_column(heading, overflow="fold")
+    limits = arm.limits
+    table = Table(title="joints, in rad, m, s, N and N m", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    for heading in ("", "range", "home", "speed", "acc.", "effort", "stiffness", "damping"):
+        table.add_column(heading, overflow="fold", no_wrap=True)
     for number, name in enumerate(limits.names):
         table.add_row(
-            name,
-            f"{limits.lower[number]:.3f} … {limits.upper[number]:.3f}",
+            name.removesuffix(".pos"),
+            f"{limits.lower[number]:.2f} … {limits.upper[number]:.2f}",
             *(f"{values[number]:.3g}" for values in (arm.home, limits.velocity, limits.acceleration, limits.effort)),
             f"{arm.servo_stiffness[number]:.4g}",
-            f"{arm.servo_damping[number]:.3g}",
+            f"{arm.servo_damping[number] + 0.0:.3g}",
         )
     return table
 
@@ -95,7 +88,7 @@ def _facts(body: Body, arm: Arm) -> dict[str, str]:
         "reach": f"{chain.reach:.3f} m stretched out; on the table, pointing down, {space.reach:.3f} m",
         "workspace": f"tool within {low} … {high} m; objects within {left} … {right} m",
         "collisions": f"{len(chain.capsules)} capsules, {len(chain.disjoint)} pairs, {chain.min_distance} m apart",
-        "pairs left out": ", ".join(without) or "none but those of neighbours",
+        "pairs left out": f"{len(without)}: {', '.join(without)}" if without else "none but those of neighbours",
         "rates": f"physics at {body.least_physics_hz} Hz or more, control at {body.least_control_hz} Hz or more",
     }
 
