@@ -155,17 +155,16 @@ def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str
         assert rig.mode == Mode.TRACKING
         controller = rig.cerebellum.controller
         with pytest.MonkeyPatch.context() as patch, np.errstate(invalid="ignore"):  # infinity less infinity
-            kernel = {"base": "drive", "twist": "drive", "arm": "move_arm"}.get(name)
-            owner, name_of_run = (tick_module, kernel) if kernel else (controller, "run")
-            run, calls = getattr(owner, name_of_run), count()
+            kernel = {"base": "drive", "twist": "drive", "arm": "move_arm", "torques": "move_spring"}[name]
+            run, calls = getattr(tick_module, kernel), count()
 
             def broken(*arguments: Any, run: Any = run, controller: Any = controller, calls: Any = calls) -> Any:
                 result = run(*arguments)
-                if next(calls) % 2 == 0 or len(arguments) == 1:  # of robots that are ticked one by one the first
+                if next(calls) % 2 == 0 or len(controller.states) == 1:  # robots are ticked one by one: the first
                     BREAK[how](getattr(controller, what)[:1])
                 return result
 
-            patch.setattr(owner, name_of_run, broken)
+            patch.setattr(tick_module, kernel, broken)
             for _ in range(20):
                 rig.tick()
         if rig.mode == Mode.TRACKING:

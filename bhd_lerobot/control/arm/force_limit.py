@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.geometry.chain import find_jacobian, find_torques, solve
-from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.errors import ConfigError
 
@@ -52,6 +51,8 @@ def put_force_limit(row: Any, body: Body, control_hz: int, largest: float, *, wr
     Raises:
         ConfigError: the largest force is not positive.
     """
+    from bhd_lerobot.control.geometry.dynamics import ArmDynamics  # Pinocchio, which every tick does without
+
     if not largest > 0.0:
         raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
     period = max(1, round(_PERIOD_S * control_hz))
