@@ -35,7 +35,7 @@ class ServeConfig(ServiceConfig):
     """A simulated robot as a ROS 2 robot, on the wall clock. Ctrl-C ends it.
 
     Attributes:
-        robot: the robot; its type is ``turtlebot3`` or ``ur5``.
+        robot: the robot, one that this package simulates.
         network: where other nodes are.
         namespace: of the robot's node; topics keep their names, which begin with a slash.
         state_hz: how often ``/cerebellum/state`` is published [Hz].
