@@ -31,7 +31,7 @@ from bhd_lerobot.sim.world import World
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _LEFT_OUT = ("read", "write", "set_mode", "step", "tick")  # methods that frames in machine code do not call
 _NO_RING: NDArray[np.float64] = np.zeros((0, 1, 1))
-_SHARES = 2  # of the simulations for each thread: what one waits for is done while others go on
+_SHARES = 4  # of the simulations for each thread: what one waits for is done while others go on
 _OUTPUTS = 16  # fields that may be read after a frame
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.float64]
