@@ -215,7 +215,10 @@ def vandalise(simulation: Any, rng: np.random.Generator) -> None:
         queues["tail"], queues["head"] = rng.integers(-(2**40), 2**40, (2, len(queues)))
     if spoiled < 2:
         chosen = rng.random(simulation.n) < 0.3
-        values = (controller.command, controller.actuators)[spoiled]
+        own = (controller.command, controller.actuators)
+        if controller.springs is not None:  # which takes neither for its reference
+            own = (controller.springs["place"], controller.springs["opening"])
+        values = own[spoiled]
         values[chosen] = rng.choice([np.nan, np.inf, -1e300, 3.0, 0.0], values[chosen].shape)
 
 
