@@ -155,6 +155,8 @@ def _sampled(path: CubicSpline, timing: PathTiming, limits: PathLimits, hz: int)
     """Return the joints at ticks; the law becomes as much slower as its limits need between its nodes."""
     slower = 1.0
     for _ in range(10):
+        if timing.duration * slower > MAX_DURATION_S:
+            return None
         ticks = int(np.ceil(timing.duration * slower * hz))
         times = np.minimum(np.arange(1, ticks + 1) / hz / slower, timing.duration)
         position, velocity, acceleration, _ = follow(path, timing.share, times)

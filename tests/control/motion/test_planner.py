@@ -13,6 +13,7 @@ from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
 from bhd_lerobot.control.motion.trajectory import State
 from bhd_lerobot.sim.chain import chain_from_mjcf
+from bhd_lerobot.sim.files.arm import so101
 from tests.cases import each_case
 from tests.control.geometry.arm_models import serial
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
@@ -313,3 +314,21 @@ def test_goals_of_any_arm_are_planned(joints: int) -> None:
             off = tool[:, :3, 3] - first
             beside = off - np.outer(off @ way, way) / (way @ way)
             assert np.linalg.norm(beside, axis=1).max() < 1e-4
+
+
+def test_a_line_whose_faster_law_would_stand_still_follows_the_even_one() -> None:
+    """Found with an SO-101: at one node the linear program's speed was 0, and the way took years."""
+    start = (-0.1297636396302487, 0.5497728776842761, -0.43384947770747767, 1.4548729267920004, -1.370359933373184)
+    turn, place = (
+        (-0.9459775055687898, -0.32423226082216233),
+        (0.28863530547293637, 0.01975498451291824, 0.143239839614),
+    )
+    pose = np.eye(4)
+    pose[:2, :2], pose[2, 2], pose[:3, 3] = [turn, (turn[1], -turn[0])], -1.0, place
+    x, y, z, *quaternion = pose_vectors(pose).tolist()
+    command = BrainCommand("a", target_pose=Pose((x, y, z), tuple(quaternion)), motion="line", max_velocity=0.25)
+    command = dataclasses.replace(command, max_acceleration=1.0)
+    rest = np.zeros(6)
+    answer = GoalPlanner(so101(), HZ).plan(command, np.array([*start, 0.05]), rest, rest)
+    assert isinstance(answer, Plan), answer
+    assert answer.trajectory.ticks < 10 * HZ
