@@ -35,7 +35,8 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
     """Print what is understood of an arm, and write a picture of it.
 
     Raises:
-        ConfigError: the robot is no arm of this package, or its file has to be explained.
+        ConfigError: the robot is no arm of this package, its file has to be explained, or the picture's place or format
+            is not valid.
     """
     made: Any = config.robot
     if not hasattr(made, "body") or (body := made.body()).arm is None:
@@ -107,5 +108,9 @@ def _draw(body: Body, picture: Path) -> None:
     try:
         picture.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(camera.render(0, "overview")).save(picture)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"picture is {str(picture)!r}, which cannot be written: {error}. Name a .png file."
+        ) from error
     finally:
         camera.close()

@@ -161,6 +161,8 @@ class RobotFile:
         keys = {self.model.key(number).name: number for number in range(self.model.nkey)}
         if self.file.home:
             home = np.array(self.file.home)
+            if not np.isfinite(home).all():
+                raise ConfigError(f"robot.home is {list(self.file.home)}; it needs finite numbers [rad].")
             if home.shape != (self.dof,):
                 raise ConfigError(
                     f"robot.home has {len(home)} numbers; the arm has {self.dof} joints: {_listed(self.names)}."
@@ -243,7 +245,7 @@ class RobotFile:
                 movers[one] = moved
         by_actuator = {model.actuator(one).name: one for one in movers}
         if name:
-            known = [*by_actuator, *by_tendon, *by_joint]
+            known = [*dict.fromkeys((*by_actuator, *by_tendon, *by_joint))]
             if name not in known:
                 raise ConfigError(unknown_name("gripper (robot.gripper.name)", name, [*known, "none"]))
             if name in by_actuator:

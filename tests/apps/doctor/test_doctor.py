@@ -447,3 +447,10 @@ def test_wrong_options_are_refused(arguments: list[str], message: str, capsys: p
     assert main(["--realtime", *arguments], fake) == 2
     assert message in capsys.readouterr().err
     assert fake.requested == []
+
+
+@pytest.mark.parametrize("name", ["robot.foo", "folder"])
+def test_a_picture_of_a_robot_that_cannot_be_written_is_named(name: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "folder").mkdir()
+    assert main(["--robot.type=so101", f"--picture={tmp_path / name}"]) == 2
+    assert re.search(r"picture is .*, which cannot be written", " ".join(capsys.readouterr().err.split()))

@@ -174,6 +174,7 @@ def test_the_opening_is_read_and_commanded_in_metres(
         (TEXT.replace(' forcerange="-2.94 2.94"', ""), {}, "largest torque is not known.*--robot.effort"),
         (BARE, {}, "shoulder_pan' has no actuator.*--robot.effort"),
         (TEXT, {"effort": (1.0, 2.0)}, "robot.effort is .* or 5: one for each joint"),
+        (TEXT, {"home": (float("nan"),) * 5}, r"robot.home is \[nan, .*finite numbers"),
         (TEXT, {"home": (0.0, 0.0)}, "robot.home has 2 numbers; the arm has 5 joints"),
         (TEXT, {"home": (0.0, 2.0, 0.0, 0.0, 0.0)}, "shoulder_lift is at 2.000 rad at home; its range is -1.745 to"),
         (TEXT, {"gripper": GripperFile(name="jaws")}, "Did you mean|gripper.*robot.gripper.name"),
