@@ -6,7 +6,8 @@ it from a `Body`, so that a simulated and a real robot are limited by the same f
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -128,6 +129,12 @@ class Limits:
                 f"command_timeout_s is {self.command_timeout_s}; it must be positive and finite. "
                 "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
             )
+
+    def and_then(self, others: "Limits") -> "Limits":
+        """Return limits of these commands and of others after them; the shorter of the time-outs counts."""
+        joined = {one.name: (*getattr(self, one.name), *getattr(others, one.name)) for one in fields(self)
+                  if one.name != "command_timeout_s"}  # fmt: skip
+        return Limits(**joined, command_timeout_s=min(self.command_timeout_s, others.command_timeout_s))
 
     @property
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -614,8 +621,9 @@ class Body:
         mjcf: MJCF document of the robot alone, without floor or scene; empty for a robot that is not simulated, whose
             forces and torques are then not known from its motion either.
         root: name of the root body, which carries a free joint if the robot moves.
-        drive: the wheels and the base that they move; it has these or an arm.
-        arm: the arm with its gripper.
+        drive: the wheels and the base that they move.
+        arm: the arm with its gripper; of a body with a drive, too, it is mounted on the base, and its chain begins in
+            the root body's frame, on the floor between the wheels.
         lidar: the range finder.
         cameras: the cameras, by name.
         physics_hz: default physics rate [Hz].
@@ -637,24 +645,23 @@ class Body:
     least_control_hz: int = 1
 
     def __post_init__(self) -> None:
-        if (self.drive is None) == (self.arm is None):
-            has = "neither a drive nor an arm" if self.arm is None else "both a drive and an arm"
-            raise ConfigError(f"The body {self.name!r} has {has}; it needs one of them.")
+        if self.drive is None and self.arm is None:
+            raise ConfigError(f"The body {self.name!r} has neither a drive nor an arm; it needs one of them.")
+        if self.drive is not None and self.arm is not None and self.arm.actuation != "position":
+            raise ConfigError(f"The arm of {self.name!r} is on a base and takes torques; it needs position servos.")
 
-    @property
+    @cached_property
     def limits(self) -> Limits:
-        """Limits of the commands that it takes."""
-        part = self.drive or self.arm
-        assert part is not None
-        return part.limits
+        """Limits of the commands that it takes: the arm's, then the drive's."""
+        parts = [part.limits for part in (self.arm, self.drive) if part is not None]
+        return parts[0] if len(parts) == 1 else parts[0].and_then(parts[1])
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """What is read of it, in order: the wheels, the arm's joints, and the gripper's opening."""
-        wheels = self.drive.joints if self.drive is not None else ()
-        if self.arm is None:
-            return wheels
-        return (*wheels, *self.arm.chain.joints, *(("gripper",) if self.arm.gripper else ()))
+        """What is read of it, in order: the arm's joints, the gripper's opening, and the wheels."""
+        arm = self.arm
+        of_arm = () if arm is None else (*arm.chain.joints, *(("gripper",) if arm.gripper else ()))
+        return (*of_arm, *(self.drive.joints if self.drive is not None else ()))
 
     @property
     def parts(self) -> Mapping[type, Any]:

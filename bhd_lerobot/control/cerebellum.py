@@ -24,7 +24,7 @@ from bhd_lerobot.control.messages import (
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 from bhd_lerobot.control.record import JOINTS, command_age_ns, new_states, put
-from bhd_lerobot.control.tick import drop_all, judge_all, tick_arms, tick_bases, tick_springs
+from bhd_lerobot.control.tick import drop_all, judge_all, tick_arms, tick_bases, tick_mobile_arms, tick_springs
 from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
@@ -100,7 +100,7 @@ class Cerebellum:
         self._torque = states["torque"][:, : controller.joints]
         self._wrench = states["wrench"][:, : controller.contact_wrench.shape[1]]
         self._has_effort = None if controller.arm_limits is None else controller.arm_limits["has_effort"]
-        if controller.arm_limits is None:
+        if controller.monitors is not None:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
             if sensors < needed:  # compiled code would read beyond them
                 raise ConfigError(f"The controller of {body.name!r} takes {needed} sensors; the plant reads {sensors}.")
@@ -122,15 +122,11 @@ class Cerebellum:
     def _bind(self) -> None:
         states, queues, words = self.states, self.fifo.queues, self.estop.words
         own, records, sensors_ns = self.controller, (states, queues, words), self.reading.sensors_ns
-        self._run_arms = None
+        kind = tick_bases if own.springs is None else tick_springs
         if own.arms is not None:
-            self._run_arms = tick_arms.bind(
-                *records, own.arms, self.numbers, own.arm_limits, own.geometries, sensors_ns
-            )
-        elif own.springs is not None:
-            self._run = tick_springs.bind(*records, own.springs, self.numbers, own.arm_limits, sensors_ns)
-        else:
-            self._run = tick_bases.bind(*records, own.monitors, self.numbers, self.reading.sensors, sensors_ns)
+            kind = tick_arms if own.monitors is None else tick_mobile_arms
+        parts = own.monitors, own.arms, own.springs, self.numbers, own.arm_limits, own.geometries
+        self._run = kind.bind(*records, *parts, self.reading.sensors, sensors_ns)
         self._judge = judge_all.bind(states, self.numbers)
         self._drop_all = drop_all.bind(states, queues, self._dropped)
 
@@ -191,12 +187,10 @@ class Cerebellum:
     def _tick(self, now_ns: int) -> None:
         self.now_ns = now_ns
         self._read()
-        if self._run_arms is None:
-            self._run(now_ns)
-        elif not self._run_arms(self.controller.rows, now_ns, False):
+        goes_on = False
+        while not self._run(self.controller.rows, now_ns, goes_on):
             self.serve()
-            while not self._run_arms(self.controller.rows, now_ns, True):
-                self.serve()
+            goes_on = True
         if np.count_nonzero(self._mode_is_new):
             self._mode_is_new[:] = False
             self.plant.set_mode(self.mode)
@@ -391,6 +385,8 @@ class Cerebellum:
             self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         kept = ("setpoints_taken", "command", "actuators") if self.body.arm is not None else ("setpoints_taken",)
         values = [self.states[name][ids] for name in kept]  # servos that take positions stay where they are
+        for value in values[1:]:
+            value[:, int(self.numbers["arm_values"][0]) :] = 0.0  # wheels stand
         self.states[ids] = new_states(1)
         self.fifo.forget(ids)
         for name, value in zip(kept, values, strict=True):

@@ -118,7 +118,8 @@ def keep_clear(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64
         turn_up = min(turn_up, speed / max(lever, _NEVER))
         turn_down = min(turn_down, speed / max(-lever, _NEVER))
     # Turning comes first: it is what avoids an obstacle. What it leaves is for driving.
-    yaw_rate = clamp(state.command[1], -turn_down, turn_up)
+    first = limits.arm_values
+    yaw_rate = clamp(state.command[first + 1], -turn_down, turn_up)
     for number in range(monitor.count):
         ahead, lever, speed = approach(state, monitor, number, cos, sin)
         speed = max(speed - lever * yaw_rate, 0.0)
@@ -129,9 +130,9 @@ def keep_clear(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64
         # No harder than a stop: what appears nearer than that is not avoided.
         most = max(turn_up if k else up, state.before[k] - limits.stop[k])
         least = min(-turn_down if k else -down, state.before[k] + limits.stop[k])
-        limited = max(min(state.command[k], most), least)
-        if limited != state.command[k]:
-            state.command[k], state.limits = limited, state.limits | _CLEARANCE
+        limited = max(min(state.command[first + k], most), least)
+        if limited != state.command[first + k]:
+            state.command[first + k], state.limits = limited, state.limits | _CLEARANCE
             state.rate[k] = 0.0  # the next change starts anew: such a large one could not end in time
 
 
@@ -141,8 +142,8 @@ def see(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stam
     x, y, yaw, age = state.odometry[0], state.odometry[1], state.odometry[2], 0.0
     if limits.has_stamps:
         age = (state.stamp_ns - stamp_ns) / NANOSECONDS
-        forward = (state.velocity[0] + state.velocity[1]) * limits.half_radius * age
-        turned = (state.velocity[1] - state.velocity[0]) * limits.turn * age
+        left, right = state.velocity[limits.arm_values], state.velocity[limits.arm_values + 1]
+        forward, turned = (left + right) * limits.half_radius * age, (right - left) * limits.turn * age
         x -= forward * math.cos(yaw - turned / 2)
         y -= forward * math.sin(yaw - turned / 2)
         yaw -= turned
@@ -178,10 +179,10 @@ def see(state: Any, limits: Any, monitor: Any, ranges: NDArray[np.float64], stam
         is_unknown = monitor.is_hidden[beam]
         if is_unknown or monitor.range_min < ranges[beam] < most:
             ahead = ranges[beam] * monitor.directions[beam, 0] + monitor.ahead
-            left = ranges[beam] * monitor.directions[beam, 1]
+            to_left = ranges[beam] * monitor.directions[beam, 1]
             monitor.points[kept, 0], monitor.points[kept, 1] = (
-                x + ahead * cos - left * sin,
-                y + ahead * sin + left * cos,
+                x + ahead * cos - to_left * sin,
+                y + ahead * sin + to_left * cos,
             )
             monitor.is_too_near[kept] = is_unknown
             kept += 1

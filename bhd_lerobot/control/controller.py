@@ -19,6 +19,7 @@ class Controller(ABC):
 
     Args:
         n: number of robots.
+        other: a controller of another part of the same robots, which has their records.
 
     Attributes:
         states: the records of the robots, shape (n,).
@@ -28,7 +29,7 @@ class Controller(ABC):
         arm_limits: the record of the arms' limits, shape (1,); None of robots without.
         geometries: what the arms are kept clear with, see `bhd_lerobot.control.arm.clearance`.
         monitors: of bases, the records of their collision monitors, shape (n,); a single one without beams if there
-            are none.
+            are none; None of arms alone.
         width: number of values in a command.
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
@@ -50,12 +51,15 @@ class Controller(ABC):
     protective_stop: NDArray[np.int64]
     contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
-    monitors: NDArray
-    geometries: NDArray
+    monitors: Any = None
+    geometries: Any = None
 
-    def __init__(self, n: int) -> None:
-        self.states, self.numbers = new_states(n), np.zeros(1, LIMITS)
-        self.numbers["gyro"] = -1
+    def __init__(self, n: int, other: "Controller | None" = None) -> None:
+        if other is None:
+            self.states, self.numbers = new_states(n), np.zeros(1, LIMITS)
+            self.numbers["gyro"] = -1
+        else:
+            self.states, self.numbers = other.states, other.numbers
         self.arms: Any = None
         self.springs: Any = None
         self.arm_limits: Any = None
@@ -69,9 +73,9 @@ class Controller(ABC):
         return
 
     @property
-    def rows(self) -> NDArray[np.float64]:
-        """The trajectories that arms play, shape (T, 3, width)."""
-        raise NotImplementedError
+    def rows(self) -> Any:
+        """The trajectories that arms play, shape (T, 3, width); None of other robots."""
+        return None
 
     @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:

@@ -31,7 +31,7 @@ _BLOCKED, _IMPLAUSIBLE = int(Watchdog.BLOCKED), int(Watchdog.PLANT)
 
 @kernel()
 def drive(state: Any, limits: Any, monitor: Any, sensors: Array, sensors_ns: int) -> None:
-    """Advance a base by one tick.
+    """Advance a base by one tick, once it has been told its modes and setpoint.
 
     Args:
         monitor: what keeps it from driving into what its scans show; a record without beams if nothing does.
@@ -39,20 +39,8 @@ def drive(state: Any, limits: Any, monitor: Any, sensors: Array, sensors_ns: int
         sensors_ns: when they were measured [ns].
     """
     integrate(state, limits)
-    if state.entered:
-        # What is to stop gets no faster meanwhile: an acceleration ends at once, the brake comes gradually.
-        for k in range(2):
-            state.target[k] = 0.0
-            if state.rate[k] * state.command[k] > 0.0:
-                state.rate[k] = 0.0
-        state.brakes_hard = state.mode >= _ESTOP
-        if not state.brakes_hard:
-            state.stopped_for = 0
-        state.entered = 0
-    if state.has_setpoint:
-        for k in range(2):
-            state.target[k] = state.requested[k]
-        state.brakes_hard = state.has_setpoint = False
+    if state.by_goal:  # of the arm on it
+        state.target[0] = state.target[1] = 0.0
     limit_command(state, limits)
     if monitor.beams:
         keep_clear(state, limits, monitor, sensors, sensors_ns)
@@ -62,9 +50,28 @@ def drive(state: Any, limits: Any, monitor: Any, sensors: Array, sensors_ns: int
 
 
 @kernel()
-def is_base_at_rest(state: Any) -> bool:
+def tell_drive(state: Any, limits: Any) -> None:
+    """Brake for the modes that were entered, then head for a new setpoint; what is told stays noted."""
+    if state.entered:
+        # What is to stop gets no faster meanwhile: an acceleration ends at once, the brake comes gradually.
+        for k in range(2):
+            state.target[k] = 0.0
+            if state.rate[k] * state.command[limits.arm_values + k] > 0.0:
+                state.rate[k] = 0.0
+        state.brakes_hard = state.mode >= _ESTOP
+        if not state.brakes_hard:
+            state.stopped_for = 0
+    if state.has_setpoint:
+        for k in range(2):
+            state.target[k] = state.requested[limits.arm_values + k]
+        state.brakes_hard = False
+
+
+@kernel()
+def is_base_at_rest(state: Any, limits: Any) -> bool:
     """Return whether a base is commanded to be at rest."""
-    return abs(state.command[0]) < _REST and abs(state.command[1]) < _REST
+    first = limits.arm_values
+    return abs(state.command[first]) < _REST and abs(state.command[first + 1]) < _REST
 
 
 @kernel()
@@ -89,7 +96,8 @@ def odometry_after(state: Any, limits: Any, left: float, right: float) -> tuple[
 @kernel()
 def integrate(state: Any, limits: Any) -> None:
     """Add the motion since the last tick to the odometry."""
-    left, right = np.floor(state.position[0] * limits.counts), np.floor(state.position[1] * limits.counts)
+    first = limits.arm_values
+    left, right = np.floor(state.position[first] * limits.counts), np.floor(state.position[first + 1] * limits.counts)
     state.odometry[0], state.odometry[1], state.odometry[2] = odometry_after(state, limits, left, right)
     state.encoder[0], state.encoder[1] = left, right
 
@@ -124,13 +132,14 @@ def limit_command(state: Any, limits: Any) -> None:
     if not (math.isfinite(state.target[0]) and math.isfinite(state.target[1])):
         state.target[0] = state.target[1] = 0.0
         state.limits |= _NON_FINITE
+    first = limits.arm_values
     yaw_rate = clamp(state.target[1], -limits.velocity[1], limits.velocity[1])
     room = min(limits.velocity[0], wheel_room(limits, yaw_rate))
     for k in range(2):
         target = yaw_rate if k else clamp(state.target[0], -room, room)
         if target != state.target[k]:
             state.limits |= _VELOCITY
-        before, last = state.command[k], state.rate[k]
+        before, last = state.command[first + k], state.rate[k]
         state.before[k] = before
         jerk, step = limits.jerk[k], target - before
         way = abs(step) / jerk
@@ -139,50 +148,50 @@ def limit_command(state: Any, limits: Any) -> None:
         if state.brakes_hard:
             if abs(step) > limits.stop[k]:
                 state.limits |= _ACCELERATION
-                state.command[k] = before + clamp(step, -limits.stop[k], limits.stop[k])
+                state.command[first + k] = before + clamp(step, -limits.stop[k], limits.stop[k])
             else:
-                state.command[k] = target
-            state.rate[k] = state.command[k] - before
+                state.command[first + k] = target
+            state.rate[k] = state.command[first + k] - before
             continue
         change = math.copysign(min(largest_change(way) * jerk, limits.acceleration[k]), step)
         change = clamp(change, last - jerk, last + jerk)
-        state.command[k] = before + change
+        state.command[first + k] = before + change
         if abs(step - change) <= _ARRIVED:  # sums miss it by their rounding
-            state.command[k] = target
+            state.command[first + k] = target
         state.rate[k] = 0.0 if way <= _ARRIVED / jerk and abs(last) <= jerk else change
     # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions change at
     # different rates.
-    room = wheel_room(limits, state.command[1])
-    if abs(state.command[0]) > room:
-        state.command[0] = clamp(state.command[0], -room, room)
+    room = wheel_room(limits, state.command[first + 1])
+    if abs(state.command[first]) > room:
+        state.command[first] = clamp(state.command[first], -room, room)
         state.limits |= _VELOCITY
         for k in range(2):
-            state.rate[k] = state.command[k] - state.before[k]
+            state.rate[k] = state.command[first + k] - state.before[k]
 
 
 @kernel()
 def turn_wheels(state: Any, limits: Any) -> None:
     """Go from the command to wheel speeds; note whether a servo gives its largest torque."""
-    straight, turn = state.command[0] * limits.per_speed, state.command[1] * limits.per_yaw
+    first = limits.arm_values
+    straight, turn = state.command[first] * limits.per_speed, state.command[first + 1] * limits.per_yaw
     for k in range(2):
         speed = straight + turn if k else straight - turn
         # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
-        if abs(speed - state.velocity[k]) > limits.largest_error:
+        if abs(speed - state.velocity[first + k]) > limits.largest_error:
             state.limits |= _EFFORT
         state.asked[k] += speed
-        state.actuators[k] = state.command[k] if limits.takes_twist else speed
+        state.actuators[first + k] = state.command[first + k] if limits.takes_twist else speed
 
 
 @kernel()
 def check_wheels(state: Any, limits: Any, sensors: Array) -> None:
     """Compare now and then how the wheels turned with what was commanded, and with a gyroscope."""
-    state.protective_stop = 0
     if limits.gyro >= 0:
         state.turned += sensors[limits.gyro]
     stamp_ns = state.stamp_ns if limits.has_stamps else state.ticks  # readings without stamps are those of the tick
     if state.ticks < state.look_at[0] or stamp_ns == state.look_at[2]:
         return  # what has not been read again says nothing
-    passed = state.ticks - state.look_at[1]
+    passed, first = state.ticks - state.look_at[1], limits.arm_values
     seconds = passed * limits.period_s
     for k in range(2):
         # A wheel that does not turn as it is commanded to: it is blocked, or its encoder lies.
@@ -194,14 +203,14 @@ def check_wheels(state: Any, limits: Any, sensors: Array) -> None:
         for j in range(1, limits.late):
             is_same = state.late[k, j] * least > 0.0
             least = math.copysign(min(abs(state.late[k, j]), abs(least)), least) if is_same else 0.0
-        done = (state.position[k] - state.start[k]) / seconds
+        done = (state.position[first + k] - state.start[k]) / seconds
         is_slow = abs(least) > _LEAST_SPEED and (done if least > 0.0 else -done) < 0.5 * abs(least)
         state.looks[k] = state.looks[k] + 1 if is_slow else 0
     if max(state.looks[0], state.looks[1]) >= _LOOKS:
         state.protective_stop, state.looks[0], state.looks[1] = _BLOCKED, 0, 0
     if limits.gyro >= 0:
         # Wheels and gyroscope that do not agree about how far the base turned: one of them lies, or slips.
-        yaw = (state.position[1] - state.start[1]) - (state.position[0] - state.start[0])
+        yaw = (state.position[first + 1] - state.start[1]) - (state.position[first] - state.start[0])
         yaw, turned = yaw * limits.turn, state.turned * limits.period_s
         apart, largest = abs(yaw - turned), max(abs(yaw), abs(turned))
         is_apart = apart > _LEAST_TURN * seconds and apart > 0.5 * largest
@@ -210,27 +219,30 @@ def check_wheels(state: Any, limits: Any, sensors: Array) -> None:
             state.protective_stop, state.looks[2] = _IMPLAUSIBLE, 0
     if state.protective_stop:
         state.stopped_for = state.protective_stop
-        state.stood = (
-            abs(state.position[0] - state.first[0]) < _STANDS and abs(state.position[1] - state.first[1]) < _STANDS
-        )
+        state.stood = True
         for k in range(2):
-            turn = state.command[1] * limits.per_yaw
-            state.stopped_at[k] = state.command[0] * limits.per_speed + (turn if k else -turn)
-            state.stopped_at[2 + k] = state.velocity[k]
+            state.stood = state.stood and abs(state.position[first + k] - state.first[k]) < _STANDS
+            turn = state.command[first + 1] * limits.per_yaw
+            state.stopped_at[k] = state.command[first] * limits.per_speed + (turn if k else -turn)
+            state.stopped_at[2 + k] = state.velocity[first + k]
     state.turned = 0.0
     state.look_at[0], state.look_at[1], state.look_at[2] = state.ticks + limits.period_ticks, state.ticks, stamp_ns
     for k in range(2):
-        state.asked[k], state.start[k] = 0.0, state.position[k]
+        state.asked[k], state.start[k] = 0.0, state.position[first + k]
 
 
 @kernel()
 def drive_back(state: Any, limits: Any) -> None:
     """Make the command again what the wheels have."""
+    first = limits.arm_values
+    left, right = state.written[first], state.written[first + 1]
     if limits.takes_twist:
-        state.command[0], state.command[1] = state.written[0], state.written[1]
+        state.command[first], state.command[first + 1] = left, right
     else:
-        state.command[0] = (state.written[0] + state.written[1]) * limits.half_radius
-        state.command[1] = (state.written[1] - state.written[0]) * limits.turn
+        state.command[first], state.command[first + 1] = (
+            (left + right) * limits.half_radius,
+            (right - left) * limits.turn,
+        )
     state.rate[0] = state.rate[1] = 0.0
 
 
@@ -249,6 +261,8 @@ class BaseController(Controller):
         gyro: which of the reading's sensors is the yaw rate of a gyroscope [rad/s]; None if there is none.
         takes: what the plant takes, see `Plant.takes`.
         latency_s: time from a command until the readings show it [s].
+        arm: the controller of the arm that each of them carries: it has the records, and its values are before the
+            drive's.
 
     Raises:
         ConfigError: the wheels cannot turn the base as fast as its velocity limit allows, or the latency is too long.
@@ -266,12 +280,14 @@ class BaseController(Controller):
         gyro: int | None = None,
         takes: str = "actuators",
         latency_s: float = 0.0,
+        arm: Controller | None = None,
     ) -> None:
-        super().__init__(n)
+        super().__init__(n, arm)
         self.monitors = np.zeros(1, MONITOR) if monitors is None else monitors
         self.drive, limits, states, numbers = drive, drive.limits, self.states, self.numbers[0]
-        self.command: Array = states["command"][:, :2]
-        self.actuators: Array = states["actuators"][:, :2]
+        first = 0 if arm is None else arm.width
+        self.command: Array = states["command"][:, first : first + 2]
+        self.actuators: Array = states["actuators"][:, first : first + 2]
         self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
         self.contact_wrench = np.zeros((n, 0))
         per_yaw = drive.wheel_separation / 2 / drive.wheel_radius
@@ -288,7 +304,7 @@ class BaseController(Controller):
             most = (MOST_LOOKS - 1) * period / control_hz
             raise ConfigError(f"The plant's latency_s is {latency_s:g}; a base is controlled with at most {most:g} s.")
         numbers["is_drive"], numbers["takes_twist"] = True, takes == "twist"
-        numbers["joints"] = numbers["width"] = 2
+        numbers["joints"] = numbers["width"] = first + 2
         numbers["hz"], numbers["period_s"] = control_hz, 1.0 / control_hz
         numbers["velocity"], numbers["jerk"] = limits.velocity, np.asarray(limits.jerk) / control_hz**2
         numbers["acceleration"] = np.asarray(limits.acceleration) / control_hz

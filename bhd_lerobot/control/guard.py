@@ -1,12 +1,12 @@
 """The last check before the wire: what is really written to the actuators, whatever computed it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.body import Arm, Body, Drive
 from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.errors import ConfigError
 
@@ -54,23 +54,31 @@ class WireLimits:
             takes: see `Plant.takes`.
 
         Raises:
-            ConfigError: neither a base nor an arm, or an arm that is to take twists.
+            ConfigError: an arm that is to take twists.
         """
-        if body.drive is not None:
-            drive, limits = body.drive, body.drive.limits
-            stop = np.maximum(limits.acceleration, limits.stop_deceleration)
-            sideways = stop[1] * drive.wheel_separation / 2  # [m/s^2] of a wheel that turns the base
-            if takes == "twist":
-                most = np.minimum(limits.velocity, (drive.max_wheel_speed * drive.wheel_radius, np.inf))
-                change = np.array((max(stop[0], sideways), stop[1])) / control_hz
-            else:
-                most = np.full(2, drive.max_wheel_speed)
-                change = np.full(2, (stop[0] + sideways) / drive.wheel_radius / control_hz)
-            largest = most * (1 + 1e-9)
-            return cls(-largest, largest, change * _TOLERANCE, np.full(2, np.inf))
-        if takes == "twist":
+        if takes == "twist" and (body.drive is None or body.arm is not None):
             raise ConfigError(f"The plant takes twists (Plant.takes), and the body {body.name!r} is no base.")
-        arm = body.need(Arm)
+        parts = [] if body.arm is None else [cls._of_arm(body.arm, control_hz)]
+        if body.drive is not None:
+            parts.append(cls._of_drive(body.drive, control_hz, takes))
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+
+    @classmethod
+    def _of_drive(cls, drive: Drive, control_hz: int, takes: str) -> Self:
+        limits = drive.limits
+        stop = np.maximum(limits.acceleration, limits.stop_deceleration)
+        sideways = stop[1] * drive.wheel_separation / 2  # [m/s^2] of a wheel that turns the base
+        if takes == "twist":
+            most = np.minimum(limits.velocity, (drive.max_wheel_speed * drive.wheel_radius, np.inf))
+            change = np.array((max(stop[0], sideways), stop[1])) / control_hz
+        else:
+            most = np.full(2, drive.max_wheel_speed)
+            change = np.full(2, (stop[0] + sideways) / drive.wheel_radius / control_hz)
+        largest = most * (1 + 1e-9)
+        return cls(-largest, largest, change * _TOLERANCE, np.full(2, np.inf))
+
+    @classmethod
+    def _of_arm(cls, arm: Arm, control_hz: int) -> Self:
         reference = arm.limits
         lead = np.asarray(arm.lead_s)
         hardest = np.maximum(reference.acceleration, reference.stop_deceleration)

@@ -57,6 +57,14 @@ class PlantReading:
         self.sensors = np.zeros((n, sensors))
         self.sensors_ns = np.zeros(n, np.int64)
 
+    def of_joints(self, first: int, joints: int) -> "PlantReading":
+        """Return the reading of some neighbouring joints, live, without sensors."""
+        part = PlantReading.__new__(PlantReading)
+        for name in ("position", "velocity", "effort"):
+            setattr(part, name, getattr(self, name)[:, first : first + joints])
+        part.has_effort, part.stamp_ns, part.safety = self.has_effort, self.stamp_ns, self.safety
+        return part
+
     def __setattr__(self, name: str, value: Any) -> None:
         """Set `has_effort` or `stamp_ns`; others hold these arrays, too, and a plant writes into them."""
         if name not in ("has_effort", "stamp_ns") and vars(self).get(name, value) is not value:
@@ -99,8 +107,8 @@ class Plant(Protocol):
         """Take commands.
 
         Args:
-            ctrl: joint positions [rad], or torques [N m], and the opening [m]; of a base wheel speeds [rad/s], or where
-                `takes` is ``"twist"`` the forward speed [m/s] and the yaw rate [rad/s]; shape (n, joints).
+            ctrl: joint positions [rad], or torques [N m], and the opening [m]; then of a base wheel speeds [rad/s],
+                or where `takes` is ``"twist"`` the forward speed [m/s] and the yaw rate [rad/s]; shape (n, joints).
 
         The first follows an `enable` and is where the robot was read to be; wheels stand. A robot that gets none for
         too long has to stop by itself.

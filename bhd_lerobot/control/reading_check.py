@@ -127,13 +127,14 @@ class ReadingCheck:
         self._names, self._states, self._limits = body.joints, states, limits[0]
         limits["oldest_ns"], limits["ahead_ns"], limits["period_s"] = _SLACK_PERIODS * period, period, 1.0 / control_hz
         limits["joints"] = len(body.joints)
-        speeds = [body.drive.max_wheel_speed] * 2 if body.drive is not None else []
+        speeds: list[float] = []
         if body.arm is not None:
             dof = len(body.arm.chain.joints)
-            speeds += [*body.arm.limits.velocity[:dof], np.inf][: len(body.joints)]
+            speeds += [*body.arm.limits.velocity[:dof], *([np.inf] if body.arm.gripper else [])]
             if body.arm.actuation == "torque":
                 limits["is_torque"], limits["frozen_ticks"] = True, round(_FROZEN_S * control_hz)
                 put(limits[0], "least_torque", _FROZEN_SHARE * np.asarray(body.arm.limits.effort[:dof]))
+        speeds += [body.drive.max_wheel_speed] * 2 if body.drive is not None else []
         fastest = _FASTER * np.array(speeds) / NANOSECONDS  # [rad/ns]
         for name, values in (("fastest", 1.0), ("step", period), ("slack", _SLACK_PERIODS * period)):
             put(limits[0], name, fastest * values)

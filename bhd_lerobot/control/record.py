@@ -154,6 +154,7 @@ LIMITS = record(
         ("bend", *_vector),
         # Of a drive: commands, for each tick; wheels; encoders; looks at the wheels' progress.
         ("is_drive", _b),
+        ("arm_values", _i),  # of a command, before the drive's, and as many joints; 0 of a base alone
         ("takes_twist", _b),
         ("velocity", _f, (2,)),
         ("acceleration", _f, (2,)),

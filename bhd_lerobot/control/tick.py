@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.arm.equilibrium import is_spring_at_rest
 from bhd_lerobot.control.arm.spring import move_spring, tell_spring
 from bhd_lerobot.control.arm.step import Stage, has_to_be_told, is_arm_at_rest, move_arm
-from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest
+from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest, tell_drive
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
@@ -40,7 +40,7 @@ Trajectories = NDArray[np.float64]
 
 
 @kernel()
-def tick(  # noqa: PLR0917
+def tick(  # noqa: PLR0912, PLR0917
     state: Any,
     queue: Any,
     estop: Counts,
@@ -64,33 +64,41 @@ def tick(  # noqa: PLR0917
         state: the robot's record.
         queue: its commands.
         estop: the word of its emergency stop, see `EstopWord`.
-        monitor: the collision monitor of a base; one without beams if there is none; None of an arm.
+        monitor: the collision monitor of its drive; one without beams if there is none; None of a robot that does not
+            drive, as are `sensors`.
         arm: its arm with position servos; None of other robots, as are the following.
         spring: its impedance.
         limits: the numbers of its body.
         arm_limits: the numbers of its arm.
         geometry: what its arm is kept clear with.
         rows: the trajectories that arms play.
-        sensors: further values that the plant of a base measures.
+        sensors: further values that its plant measures.
         sensors_ns: when the oldest of them was measured [ns].
         now_ns: the time that the tick is for [ns].
 
     Returns:
         False if the tick waits for `Controller.serve`, and is to be continued by the same call.
     """
-    if monitor is not None:  # numba leaves out what is for the other kind of robot
-        begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
-        drive(state, limits, monitor, sensors, sensors_ns)
-        end_tick(state, limits)
+    if arm is None:  # noqa: SIM102 (numba leaves out what is for other robots where None alone is asked for)
+        if monitor is not None:
+            begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
+            tell_drive(state, limits)
+            state.entered, state.has_setpoint = 0, False
+            drive(state, limits, monitor, sensors, sensors_ns)
+            end_tick(state, limits)
     if arm is not None:
         if arm.stage == _NONE:
             if state.mode == _STOPPING:
                 state.is_at_rest = is_arm_at_rest(state, arm, arm_limits)
             begin_tick(state, queue, estop, limits, sensors_ns, now_ns)
             arm.stage = _BEGUN
+            if monitor is not None and state.entered == 0:
+                tell_drive(state, limits)
             if has_to_be_told(state, arm, arm_limits):
                 return False
         if arm.stage < _ENDED:
+            if monitor is not None and arm.stage == _BEGUN:
+                drive(state, limits, monitor, sensors, sensors_ns)
             if not move_arm(state, arm, arm_limits, geometry, rows, limits.has_stamps):
                 return False
             end_tick(state, limits)
@@ -114,6 +122,7 @@ def begin_tick(  # noqa: PLR0917
     state: Any, queue: Any, estop: Counts, limits: Any, sensors_ns: int, now_ns: int
 ) -> None:
     """Do what comes before the controller: judge the reading, supervise, take what is due."""
+    state.protective_stop = 0
     supervise(state, queue, estop, limits, sensors_ns, now_ns)
     take_command(state, queue, estop, limits, now_ns)
 
@@ -131,8 +140,7 @@ def end_tick(state: Any, limits: Any) -> None:
             set_mode(state, _FAULT)
         if limits.is_drive:
             drive_back(state, limits)
-        else:
-            state.goes_back = True
+        state.goes_back = limits.arm_values > 0
 
 
 @kernel()
@@ -162,8 +170,16 @@ def supervise(  # noqa: PLR0917
         # What a brain left behind that fell silent moves nothing later.
         state.refusals[_STALE] += drop(state, queue, _LEAST, _MOST)
         set_mode(state, _STOPPING)
-    if state.mode == _STOPPING and (is_base_at_rest(state) if limits.is_drive else state.is_at_rest):
+    if state.mode == _STOPPING and is_robot_at_rest(state, limits):
         set_mode(state, _SAFE_OFF if state.is_deactivating else _HOLD)
+
+
+@kernel()
+def is_robot_at_rest(state: Any, limits: Any) -> bool:
+    """Return whether a robot is commanded to be at rest; of its arm that was found when the tick began."""
+    if limits.arm_values > 0 and not state.is_at_rest:
+        return False
+    return not limits.is_drive or is_base_at_rest(state, limits)
 
 
 @kernel()
@@ -215,8 +231,8 @@ def refusal(state: Any, estop: Counts) -> int:
 def is_number(queue: Any, entry: int, limits: Any) -> bool:
     """Return whether a command of an arm is finite: what another process wrote was not checked when it was sent."""
     is_finite = True
-    for k in range(limits.width):
-        is_finite = is_finite and (limits.is_drive or math.isfinite(queue.values[entry, k]))
+    for k in range(limits.arm_values):  # a drive stops for what is not, see `limit_command`
+        is_finite = is_finite and math.isfinite(queue.values[entry, k])
     return is_finite
 
 
@@ -289,42 +305,66 @@ def follow_controller(state: Any) -> None:
             set_mode(state, _HOLD)
 
 
-@kernel("void(state[::1], queue[::1], i8[:,:], monitor[::1], limits[::1], f8[:,:], i8[:], i8)")
-def tick_bases(  # noqa: PLR0917
+@kernel()
+def tick_robot(  # noqa: PLR0917
+    sim: int,
     states: Any,
     queues: Any,
     estop: Counts,
     monitors: Any,
-    limits: Any,
-    sensors: Numbers,
-    sensors_ns: Counts,
-    now_ns: int,
-) -> None:
-    """Run one tick of n bases; a monitor without beams may be one for all."""
-    for sim in range(len(states)):
-        state, queue, word, monitor = states[sim], queues[sim], estop[:, sim], monitors[sim % len(monitors)]
-        seen, seen_ns, own = sensors[sim], sensors_ns[sim], limits[0]
-        tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
-
-
-@kernel(
-    "b1(state[::1], queue[::1], i8[:,:], arm[::1], limits[::1], arm_limits[::1], geometry[::1], i8[:], f8[:,:,:], i8, "
-    "b1)"
-)
-def tick_arms(  # noqa: PLR0917
-    states: Any,
-    queues: Any,
-    estop: Counts,
     arms: Any,
+    springs: Any,
     limits: Any,
     arm_limits: Any,
     geometries: Any,
+    sensors: Numbers,
     sensors_ns: Counts,
-    rows: Trajectories,
+    rows: Any,
+    now_ns: int,
+) -> bool:
+    """Run one tick of one of n robots, see `tick`; what they do not have is None.
+
+    Args:
+        sim: its number.
+        monitors: those of their drives; one without beams may be one for all.
+    """
+    state, queue, word, own = states[sim], queues[sim], estop[:, sim], limits[0]
+    seen, seen_ns, is_over = sensors[sim], sensors_ns[sim], True
+    if arms is None:
+        if monitors is not None:
+            monitor = monitors[sim % len(monitors)]
+            tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
+        if springs is not None:
+            tick(state, queue, word, None, None, springs[sim], own, arm_limits[0], None, None, None, seen_ns, now_ns)
+    if arms is not None:
+        arm, its = arms[sim], arm_limits[0]
+        shapes = geometries[arm.geometry % len(geometries)]
+        if monitors is None:
+            is_over = tick(state, queue, word, None, arm, None, own, its, shapes, rows, None, seen_ns, now_ns)
+        if monitors is not None:
+            monitor = monitors[sim % len(monitors)]
+            is_over = tick(state, queue, word, monitor, arm, None, own, its, shapes, rows, seen, seen_ns, now_ns)
+    return is_over
+
+
+@kernel()
+def tick_all(  # noqa: PLR0917
+    states: Any,
+    queues: Any,
+    estop: Counts,
+    monitors: Any,
+    arms: Any,
+    springs: Any,
+    limits: Any,
+    arm_limits: Any,
+    geometries: Any,
+    sensors: Numbers,
+    sensors_ns: Counts,
+    rows: Any,
     now_ns: int,
     goes_on: bool,
 ) -> bool:
-    """Run one tick of n arms.
+    """Run one tick of n robots, see `tick_robot`.
 
     Args:
         goes_on: continue the ticks that have waited for the controller.
@@ -334,35 +374,43 @@ def tick_arms(  # noqa: PLR0917
     """
     is_over = True
     for sim in range(len(states)):
-        state, queue, word, arm = states[sim], queues[sim], estop[:, sim], arms[sim]
-        if goes_on and arm.stage == _NONE:
-            continue
-        if not goes_on:
-            arm.stage = _NONE
-        geometry, own, its = geometries[arm.geometry % len(geometries)], limits[0], arm_limits[0]
-        if not tick(state, queue, word, None, arm, None, own, its, geometry, rows, None, sensors_ns[sim], now_ns):
-            is_over = False
+        if arms is not None:
+            if goes_on and arms[sim].stage == _NONE:
+                continue
+            if not goes_on:
+                arms[sim].stage = _NONE
+        is_over &= tick_robot(
+            sim,
+            states,
+            queues,
+            estop,
+            monitors,
+            arms,
+            springs,
+            limits,
+            arm_limits,
+            geometries,
+            sensors,
+            sensors_ns,
+            rows,
+            now_ns,
+        )
     return is_over
 
 
-@kernel(
-    "void(state[::1], queue[::1], i8[:,:], spring[::1], limits[::1], arm_limits[::1], i8[:], i8)", work=_SPRING_WORK
+_RECORDS = "state[::1], queue[::1], i8[:,:]"
+_SENSED = "f8[:,:], i8[:]"
+tick_bases = tick_all.of(
+    "tick_bases", f"b1({_RECORDS}, monitor[::1], none, none, limits[::1], none, none, {_SENSED}, none, i8, b1)"
 )
-def tick_springs(  # noqa: PLR0917
-    states: Any,
-    queues: Any,
-    estop: Counts,
-    springs: Any,
-    limits: Any,
-    arm_limits: Any,
-    sensors_ns: Counts,
-    now_ns: int,
-) -> None:
-    """Run one tick of n arms with torque motors."""
-    for sim in range(len(states)):
-        state, queue, word, spring = states[sim], queues[sim], estop[:, sim], springs[sim]
-        own, its, seen_ns = limits[0], arm_limits[0], sensors_ns[sim]
-        tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
+_ARM = f"arm[::1], none, limits[::1], arm_limits[::1], geometry[::1], {_SENSED}, f8[:,:,:], i8, b1"
+tick_arms = tick_all.of("tick_arms", f"b1({_RECORDS}, none, {_ARM})")
+tick_mobile_arms = tick_all.of("tick_mobile_arms", f"b1({_RECORDS}, monitor[::1], {_ARM})")
+tick_springs = tick_all.of(
+    "tick_springs",
+    f"b1({_RECORDS}, none, none, spring[::1], limits[::1], arm_limits[::1], none, {_SENSED}, none, i8, b1)",
+    work=_SPRING_WORK,
+)
 
 
 @kernel("void(state[::1], limits[::1], b1[:])")

@@ -23,7 +23,7 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.kernels import is_worth_compiling, kernel, record
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.record import JOINTS
-from bhd_lerobot.control.tick import tick, tick_springs
+from bhd_lerobot.control.tick import tick_robot, tick_springs
 from bhd_lerobot.sim.engine import mujoco
 from bhd_lerobot.sim.plant import Brakes, run_brake, set_brake
 from bhd_lerobot.sim.world import World
@@ -52,7 +52,9 @@ LAYOUT = record(
         ("gripper", np.int64),  # which of the joints it is; -1 if there is none
         ("per_joint", np.float64, (2,)),  # by how much it opens with each [m/m or m/rad]
         ("offset", np.float64),  # the opening where they are at 0 [m]
-        # Places of the readings that count touches: of anything, of the table, of itself, and of the gripper's.
+        # Places of the readings that count touches: of a base, -1 if there is none; of an arm, -1 if there is none, of
+        # the table, of itself, and of the gripper's.
+        ("touch_base", np.int64),
         ("touch", np.int64),
         ("touch_table", np.int64),
         ("touch_self", np.int64),
@@ -167,13 +169,14 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
         data: the address of the data that they run in, whose fields the arrays after `row_bytes` are.
         rows: the address of the first simulation's state; `row_bytes` from one to the next.
         all_warnings: number of warnings of each simulation, as `Batch.warning`.
-        touches: becomes True where the scene was touched, shape (kinds, n): anything; or the table, objects with a
-            link of the arm, the arm itself.
+        touches: becomes True where something was touched, shape (kinds, n): by an arm the table, objects with one of
+            its links, itself; then by a base the scene.
         efforts: mean efforts of the last tick, shape (n, nv).
         numbers: the tick that is next for each simulation, shape (n,).
         first_tick: number of the first tick.
         spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
-        arms: records of arms with position servos; None of bases, which have none of what follows.
+        monitors: records of the collision monitors of bases; None of robots that do not drive.
+        arms: records of arms with position servos; None of others, as is what follows of those without an arm.
         springs: records of the impedances of arms with torque motors; None of others, as is the following.
         brakes: for how many ticks the arms' brakes are closed, shape (n,).
         trajectories: what arms play.
@@ -191,30 +194,38 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
         for number in range(numbers[sim], first_tick + ticks):
             numbers[sim] = number
             now_ns = number * NANOSECONDS // layout.ticks_hz
-            queue, word, own, seen_ns = queues[sim], estop[:, sim], limits[0], sensors_ns[sim]
-            if monitors is not None:
-                read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-                monitor, seen = monitors[sim % len(monitors)], sensors[sim]
-                tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
-                for k in range(joints):
-                    ctrl[layout.ctrl[k]] = state.written[k]
+            is_begun = False
             if arms is not None:
-                arm, its = arms[sim], arm_limits[0]
-                if arm.stage == 0:
-                    read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-                shapes = geometries[arm.geometry % len(geometries)]
-                if not tick(state, queue, word, None, arm, None, own, its, shapes, trajectories, None, seen_ns, now_ns):
-                    break
-            if springs is not None:
+                is_begun = arms[sim].stage != 0
+            if not is_begun:
                 read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-                spring, its = springs[sim], arm_limits[0]
-                tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
-                closing = ctrl[layout.brake : layout.brake + its.dof]
+            if not tick_robot(
+                sim,
+                states,
+                queues,
+                estop,
+                monitors,
+                arms,
+                springs,
+                limits,
+                arm_limits,
+                geometries,
+                sensors,
+                sensors_ns,
+                trajectories,
+                now_ns,
+            ):
+                break
+            if springs is not None:
+                closing = ctrl[layout.brake : layout.brake + arm_limits[0].dof]
                 if state.mode_is_new:
                     set_brake(brakes, sim, state.mode)
                     state.mode_is_new = False
-                speeds = qvel[layout.qvel[0] : layout.qvel[0] + its.dof]
+                speeds = qvel[layout.qvel[0] : layout.qvel[0] + arm_limits[0].dof]
                 run_brake(brakes, closing, speeds, sim, layout.friction, layout.closing_ticks)
+            if ring is None:
+                for k in range(joints):
+                    ctrl[layout.ctrl[k]] = state.written[k]
             if ring is not None:
                 passed = number - first_tick
                 slot = written + passed
@@ -227,7 +238,9 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
             numbers[sim] = number + 1
             for step in range(layout.substeps):
                 _step(models[sim], data)
-                if sensordata[layout.touch] != 0.0:
+                if layout.touch_base >= 0 and sensordata[layout.touch_base] != 0.0:
+                    touches[len(touches) - 1, sim] = True
+                if layout.touch >= 0 and sensordata[layout.touch] != 0.0:
                     note_touches(touches, sim, sensordata, layout)
                 for k in range(joints):
                     dof = layout.qvel[k]
@@ -266,6 +279,10 @@ run_arm_frames = run_frames.of(
     "run_arm_frames",
     f"void({_WHERE}, none, {_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], f8[:,:,:], {_LATE})",
 )
+run_mobile_arm_frames = run_frames.of(
+    "run_mobile_arm_frames",
+    f"void({_WHERE}, monitor[::1], {_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], f8[:,:,:], {_LATE})",
+)
 run_spring_frames = run_frames.of(
     "run_spring_frames",
     f"void({_WHERE}, none, {_WHAT}, none, spring[::1], i8[:], arm_limits[::1], none, none, {_LATE})",
@@ -295,10 +312,7 @@ def read_joints(  # noqa: PLR0917
 
 @kernel()
 def note_touches(touches: NDArray[np.bool_], sim: int, sensordata: Numbers, layout: Any) -> None:
-    """Note what a simulation touches now; the counts are whole numbers, and their sums exact."""
-    if len(touches) == 1:
-        touches[0, sim] = True
-        return
+    """Note what an arm touches now; the counts are whole numbers, and their sums exact."""
     grip = 0.0
     for k in range(layout.touch_grip[1]):
         grip += sensordata[layout.touch_grip[0] + k]
@@ -355,15 +369,17 @@ class Frames:
         row, efforts = self._layout[0], world.servos
         row["ticks_hz"], row["substeps"] = cerebellum.control_hz, world.physics_hz // cerebellum.control_hz
         row["qpos_beside"], row["gripper"], row["joints"] = -1, -1, cerebellum.controller.joints
-        servos = self._place_arm(row) if world.body.arm is not None else self._place_drive(row)
+        row["touch"] = row["touch_base"] = -1
+        servos = {} if world.body.arm is None else self._place_arm(row)
+        servos |= {} if world.body.drive is None else self._place_drive(row)
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
         row["most_force"] = row["most_torque"] = np.inf
         # Others' efforts are averaged in Python.
-        self._is_possible = efforts.are_all(servos)
+        self._is_possible = efforts.are_all(list(servos.values()))
         if self._is_possible:
-            for name, values in efforts.numbers(servos).items():
-                row[name][: len(servos)] = values
+            for name, values in efforts.numbers(list(servos.values())).items():
+                row[name][list(servos)] = values
         self._models: list[mujoco.MjModel | None] = [None] * world.n
         self._seen: list[bytes] = []  # the fields that they were made with, and of each simulation
         self._rows: list[bytes | None] = [None] * world.n
@@ -376,43 +392,45 @@ class Frames:
         controller, self._brakes = cerebellum.controller, brakes
         self._kernel = run_base_frames
         if controller.arms is not None:
-            self._kernel = run_arm_frames
+            self._kernel = run_arm_frames if controller.monitors is None else run_mobile_arm_frames
         elif controller.springs is not None:
             self._kernel = run_spring_frames
             if brakes is not None:
                 row["brake"], row["closing_ticks"] = brakes.first, brakes.closing_ticks
                 row["friction"][: len(brakes.friction)] = brakes.friction
 
-    def _place_drive(self, row: Any) -> list[int]:
-        """Write where the wheels and the touches are; return the servos."""
+    def _place_drive(self, row: Any) -> dict[int, int]:
+        """Write where the wheels and their touches are; return the servos by the joints' places in the record."""
         model, drive = self._world.model, self._world.body.need(Drive)
-        self._place_joints(row, drive.joints)
-        servos = [model.actuator(name).id for name in drive.actuators]
-        row["ctrl"][: len(servos)] = servos
-        row["touch"] = model.sensor(drive.touch_sensor).adr[0]
-        return servos
+        row["touch_base"] = model.sensor(drive.touch_sensor).adr[0]
+        return self._place_joints(row, row["joints"] - len(drive.joints), drive.joints, drive.actuators)
 
-    def _place_arm(self, row: Any) -> list[int]:
-        """Write where joints, fingers and touches are; return the joints' servos."""
+    def _place_arm(self, row: Any) -> dict[int, int]:
+        """Write where joints, fingers and their touches are; return the joints' servos, likewise."""
         model, arm = self._world.model, self._world.body.need(Arm)
         dof, gripper = len(arm.chain.joints), arm.gripper
-        self._place_joints(row, (*arm.chain.joints, *(gripper.joints[:1] if gripper else ())))
+        joints = (*arm.chain.joints, *(gripper.joints[:1] if gripper else ()))
+        servos = self._place_joints(row, 0, joints, arm.actuators)
         if gripper is not None:
             row["gripper"], row["offset"] = dof, gripper.offset
             row["per_joint"][: len(gripper.joints)] = gripper.per_joint
             for name in gripper.joints[1:]:
                 row["qpos_beside"], row["qvel_beside"] = model.joint(name).qposadr[0], model.joint(name).dofadr[0]
-        servos = [model.actuator(name).id for name in arm.actuators]
-        row["ctrl"][: len(servos)] = servos
         for kind, name in (("touch", "any"), ("touch_table", "table"), ("touch_self", "self")):
             row[kind] = model.sensor(f"touch_{name}").adr[0]
         row["touch_grip"] = model.sensor("touch_object_0").adr[0], MAX_OBJECTS
-        return servos[:dof] if gripper and gripper.tendon else servos
+        if gripper and gripper.tendon:
+            del servos[dof]
+        return servos
 
-    def _place_joints(self, row: Any, names: Sequence[str]) -> None:
-        joints = [self._world.model.joint(name) for name in names]
-        row["qpos"][: len(joints)] = [joint.qposadr[0] for joint in joints]
-        row["qvel"][: len(joints)] = [joint.dofadr[0] for joint in joints]
+    def _place_joints(self, row: Any, first: int, names: Sequence[str], actuators: Sequence[str]) -> dict[int, int]:
+        """Write where joints and their servos are; return the servos by the joints' places in the record."""
+        model, places = self._world.model, slice(first, first + len(names))
+        joints, servos = [model.joint(name) for name in names], [model.actuator(name).id for name in actuators]
+        row["qpos"][places] = [joint.qposadr[0] for joint in joints]
+        row["qvel"][places] = [joint.dofadr[0] for joint in joints]
+        row["ctrl"][places] = servos
+        return dict(enumerate(servos, first))
 
     def run(self, ids: NDArray[np.intp] | None, first_tick: int, ticks: int) -> bool:
         """Let some ticks go by.
@@ -508,11 +526,11 @@ class Frames:
     def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """What all threads run with, before and after the layout."""
         own, late = self._cerebellum, self._late
-        controller, reading, is_base = own.controller, own.reading, own.controller.arm_limits is None
-        records = own.states, own.fifo.queues, own.estop.words, controller.monitors if is_base else None
+        controller, reading = own.controller, own.reading
+        records = own.states, own.fifo.queues, own.estop.words, controller.monitors
         sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
         arms: tuple[Any, ...] = (*[None] * 9, 0)
-        if not is_base:
+        if controller.arm_limits is not None:
             if controller.arms is not None:
                 arms = controller.arms, None, None, controller.arm_limits, controller.geometries, controller.rows
             elif self._brakes is not None:

@@ -1,11 +1,12 @@
 """The joints of a world, as the cerebellum sees them."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Drive
+from bhd_lerobot.bodies.body import Arm, GripperSpec
 from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import SimulationError
@@ -29,12 +30,59 @@ _Array = NDArray[np.float64]
 _Views = tuple[_Array, _Array, _Array]
 
 
+class _Part:
+    """The joints of an arm with its gripper, or the wheels, of all simulations: neighbours in the model.
+
+    Attributes:
+        width: how many joints, the gripper as one.
+        ctrl: the servos' commands, live, shape (n, width).
+    """
+
+    def __init__(
+        self, world: World, joints: Sequence[str], actuators: Sequence[str], gripper: GripperSpec | None
+    ) -> None:
+        positions, velocities = world.joint_slice(joints)
+        efforts, self._joints = world.efforts, len(joints)
+        self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
+        self._effort = efforts[:, velocities]
+        self._fingers: list[tuple[_Array, _Array, float]] = []
+        if gripper is not None:
+            places = world.joint_places(gripper.joints)
+            self._fingers = [
+                (world.qpos[:, at], world.qvel[:, dof], one)
+                for at, dof, one in zip(*places, gripper.per_joint, strict=True)
+            ]
+            self._offset = gripper.offset
+            self._grip = efforts[:, places[1][0]]  # the force of their one actuator acts on each of them
+        servos = [world.model.actuator(name).id for name in actuators]
+        if servos != list(range(servos[0], servos[0] + len(servos))):
+            raise SimulationError(f"Actuators {list(actuators)} are not neighbours in the model.")
+        self.width = len(servos)
+        self.ctrl = world.ctrl[:, servos[0] : servos[-1] + 1]
+
+    def read(self, position: _Array, velocity: _Array, effort: _Array) -> None:
+        """Write what is read of them, each of shape (n, width)."""
+        dof = self._joints
+        if not self._fingers:
+            position[:], velocity[:], effort[:] = self._position, self._velocity, self._effort
+            return
+        position[:, :dof], velocity[:, :dof], effort[:, :dof] = self._position, self._velocity, self._effort
+        first, speed, per_joint = self._fingers[0]
+        effort[:, dof] = self._grip / per_joint
+        opening, rate = first * per_joint, speed * per_joint
+        for first, speed, per_joint in self._fingers[1:]:
+            opening += first * per_joint
+            rate += speed * per_joint
+        position[:, dof] = opening + self._offset
+        velocity[:, dof] = rate
+
+
 class SimulatedPlant:
     """Reads the joints of all simulations and writes their servos' commands.
 
-    It has the calls of the cerebellum's plant. A base's joints are its wheels, and their servos take speeds [rad/s].
-    An arm's are those of its chain [rad], whose servos take angles [rad] or torques [N m], and its gripper, whose
-    position, speed and command are those of the opening, the sum of its two fingers [m].
+    It has the calls of the cerebellum's plant. An arm's joints are those of its chain [rad], whose servos take angles
+    [rad] or torques [N m], and its gripper, whose position, speed and command are those of the opening, the sum of its
+    two fingers [m]. A base's are its wheels, and their servos take speeds [rad/s].
 
     Attributes:
         brakes: of arms with torque motors; None of others.
@@ -48,32 +96,16 @@ class SimulatedPlant:
 
     def __init__(self, world: World) -> None:
         self.n = world.n
-        body, efforts = world.body, world.efforts
-        self._fingers: list[tuple[_Array, _Array, float]] = []
+        body = world.body
+        self._parts: list[_Part] = []
+        if body.arm is not None:
+            self._parts.append(_Part(world, body.arm.chain.joints, body.arm.actuators, body.arm.gripper))
+        if body.drive is not None:
+            self._parts.append(_Part(world, body.drive.joints, body.drive.actuators, None))
         arm = body.arm
-        if arm is not None:
-            joints, names = arm.chain.joints, arm.actuators
-            if (gripper := arm.gripper) is not None:
-                places = world.joint_places(gripper.joints)
-                self._fingers = [
-                    (world.qpos[:, at], world.qvel[:, dof], one)
-                    for at, dof, one in zip(*places, gripper.per_joint, strict=True)
-                ]
-                self._offset = gripper.offset
-                self._grip = efforts[:, places[1][0]]  # the force of their one actuator acts on each of them
-        else:
-            drive = body.need(Drive)
-            joints, names = drive.joints, drive.actuators
-        positions, velocities = world.joint_slice(joints)
-        self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
-        self._effort = efforts[:, velocities]
-        actuators = [world.model.actuator(name).id for name in names]
-        if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
-            raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
-        self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
         self.brakes = Brakes(world, arm) if arm is not None and arm.brake_damping else None
         # The views into the readings that are used, with the readings, which must live as long as their numbers count.
-        self._views: dict[int, tuple[JointReading, _Views]] = {}
+        self._views: dict[int, tuple[JointReading, list[_Views]]] = {}
 
     def read(self, out: JointReading) -> None:
         """Write the joints' positions, velocities and efforts, each of shape (n, joints), into `out`.
@@ -86,28 +118,23 @@ class SimulatedPlant:
                 self._views.clear()
             entry = self._views[id(out)] = out, self._bind(out)
             out.has_effort = True
-        position, velocity, effort = entry[1]
-        position[:] = self._position
-        velocity[:] = self._velocity
-        effort[:] = self._effort
-        if self._fingers:
-            first, speed, per_joint = self._fingers[0]
-            out.effort[:, -1] = self._grip / per_joint
-            opening, rate = first * per_joint, speed * per_joint
-            for first, speed, per_joint in self._fingers[1:]:
-                opening += first * per_joint
-                rate += speed * per_joint
-            out.position[:, -1] = opening + self._offset
-            out.velocity[:, -1] = rate
+        for part, views in zip(self._parts, entry[1], strict=True):
+            part.read(*views)
 
-    def _bind(self, out: JointReading) -> "_Views":
+    def _bind(self, out: JointReading) -> "list[_Views]":
         """Make the views into a reading once, not at every tick."""
-        end = -1 if self._fingers else None
-        return out.position[:, :end], out.velocity[:, :end], out.effort[:, :end]
+        views, first = [], 0
+        for part in self._parts:
+            columns = slice(first, first := first + part.width)
+            views.append((out.position[:, columns], out.velocity[:, columns], out.effort[:, columns]))
+        return views
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""
-        self._ctrl[:] = ctrl
+        first = 0
+        for part in self._parts:
+            part.ctrl[:] = ctrl[:, first : first + part.width]
+            first += part.width
         if self.brakes is not None:
             self.brakes.run()
 

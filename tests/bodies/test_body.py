@@ -83,12 +83,17 @@ def test_a_robot_has_a_drive_or_an_arm_and_names_the_part_that_it_lacks() -> Non
     for body, part, words in ((base, Arm, "no arm"), (arm, Drive, "no drive"), (arm, LidarSpec, "no lidar")):
         with pytest.raises(ConfigError, match=f"{body.name}.* has {words}"):
             body.need(part)
-    for change, words in (
-        ({"arm": arm.arm}, "both a drive and an arm"),
-        ({"drive": None}, "neither a drive nor an arm"),
+    both = replace(base, arm=arm.arm)
+    assert both.joints == (*arm.joints, *base.joints)
+    assert both.limits.names == (*arm.limits.names, *base.limits.names)
+    assert both.limits.bounds == tuple(a + b for a, b in zip(arm.limits.bounds, base.limits.bounds, strict=True))
+    assert both.limits.command_timeout_s == min(arm.limits.command_timeout_s, base.limits.command_timeout_s)
+    for make, words in (
+        (lambda: replace(base, drive=None), "neither a drive nor an arm"),
+        (lambda: replace(base, arm=ur5(actuation="torque").arm), "on a base and takes torques"),
     ):
         with pytest.raises(ConfigError, match=words):
-            replace(base, **change)
+            make()
 
 
 @each_case("timeout", [0, 0.0, -0.5, math.inf, math.nan])

@@ -16,6 +16,7 @@ import pytest
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
+from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.drive import BaseController, read_odometry
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
@@ -39,7 +40,7 @@ TIMES = (0, 1, 10**6, 10**9, -(10**9), 2**62, -(2**62), 2**63 - 1, -(2**63))
 FIXED = {"limits", "arm_limits", "geometry"}  # numbers of a body
 WHOLE = {  # the smallest and the largest; others are from 0 to 3
     "mode": (0, 8),
-    "joints": (2, 8),
+    "arm_values": (0, 7),
     "width": (2, 8),
     "dof": (1, 8),
     "frame_ticks": (1, 4),
@@ -76,6 +77,8 @@ def records(name: str, rng: np.random.Generator) -> Any:
             made[field] = rng.choice(TIMES[: None if name == "queue" or field == "stamp_ns" else 5], shape)
         else:
             made[field] = rng.integers(*WHOLE.get(field, (0, 3)), shape)
+    if name == "limits":
+        made["joints"] = made["arm_values"] + 2
     if name == "queue":
         made["tail"] = rng.choice(TIMES, n)
         with np.errstate(over="ignore"):
@@ -85,6 +88,8 @@ def records(name: str, rng: np.random.Generator) -> Any:
 
 def drawn(kind: str, rng: np.random.Generator) -> Any:
     """Return an argument of a type in numba's words, large enough for two robots with up to six values."""
+    if kind == "none":
+        return None
     name, _, dimensions = kind.partition("[")
     if name in kernels.RECORDS:
         return records(name, rng)
@@ -120,10 +125,14 @@ def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None
     rng = np.random.default_rng(0)
     for _ in range(10 if name == "find_posture" else 100):  # which takes many steps
         plain = [drawn(kind, rng) for kind in kinds]
+        if name == "tick_mobile_arms":  # a tick that has begun has judged its reading
+            plain[4]["stage"][plain[4]["stage"] == Stage.BEGUN] = Stage.NONE
         compiled = [value.copy() if isinstance(value, np.ndarray) else value for value in plain]
         with np.errstate(all="ignore"):
             assert one(*map(kernels.as_objects, plain)) == one.compiled(*compiled)
         for k, (mine, other) in enumerate(zip(plain, compiled, strict=True)):
+            if mine is None:
+                continue
             assert_same(np.asarray(mine), np.asarray(other), f"argument {k}")
 
 

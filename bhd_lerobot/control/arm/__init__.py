@@ -8,6 +8,7 @@ __all__ = [
     "force_limit",
     "held",
     "impedance",
+    "mobile",
     "relief",
     "setpoints",
     "spring",

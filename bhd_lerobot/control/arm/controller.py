@@ -84,10 +84,12 @@ class ArmController(Controller):
     ) -> None:
         super().__init__(n)
         self._cause, self._body = "", body
-        arm, limits = body.need(Arm), body.limits
+        arm = body.need(Arm)
+        limits = arm.limits
         self.arm, self.width = arm, len(limits.names)
         self.joints, self._dof = self.width, len(arm.chain.joints)
         width, dof = self.width, self._dof
+        self.numbers["arm_values"] = width
         self.arms, self.arm_limits = new_arms(n), np.zeros(1, ARM_LIMITS)
         self.geometries = new_geometries(arm.chain, n)
         self._limits = self.arm_limits[0]
@@ -120,7 +122,7 @@ class ArmController(Controller):
         # that is wrong moves an arm no farther.
         self._aim, self._top = np.zeros((2, n, dof))
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
-        self._bend = 0.9 * WireLimits.of(body, control_hz).bend
+        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:width]
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (
             f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
@@ -180,7 +182,7 @@ class ArmController(Controller):
         """Advance the references by a tick, outside of a cerebellum."""
         for sim in range(len(self.states)):
             state, arm = self._state_of[sim], self._arm_of[sim]
-            arm.stage = Stage.NONE
+            arm.stage, state.protective_stop = Stage.NONE, 0
             while not move_arm(state, arm, self._limits_of, self._geometry_of[arm.geometry], self.rows, False):
                 self.serve(sim)
             arm.stage = Stage.NONE

@@ -73,6 +73,7 @@ class ImpedanceController(Controller):
             raise ConfigError(f"max_force is {max_force} and frame_ticks is {frame_ticks}; both must be above 0.")
         self.arm, self._forward = arm, ForwardKinematics(arm.chain)
         self.joints, self._dof = len(arm.limits.names), len(arm.chain.joints)
+        self.numbers["arm_values"] = WIDTH
         self.springs, self.arm_limits = new_springs(n), np.zeros(1, ARM_LIMITS)
         self._put_limits(body, control_hz, frame_ticks, max_force)
         states, springs = self.states, self.springs

@@ -101,7 +101,6 @@ def move_arm(state: Any, arm: Any, limits: Any, geometry: Any, rows: Array, has_
         if arm.is_stopped and not rests_quietly(state, arm, limits):
             return False
     if arm.stage == _STOPPED:
-        state.protective_stop = 0
         lead_servos(state, arm, limits)
         arm.stage = _HINDERED
         presses = limits.feels and feel(state, arm, limits, geometry)
