@@ -11,5 +11,6 @@ __all__ = [
     "tabletop",
     "truth",
     "turtlebot3",
+    "turtlebot3_manipulation",
     "ur5",
 ]

@@ -191,6 +191,11 @@ class TableScene:
     variation: Variation = field(default_factory=Variation)
     report_seed: int = 0
 
+    @property
+    def stand_m(self) -> float:
+        """Height of what the objects stand on, in the frame that they are placed in [m]."""
+        return 0.0
+
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:
             raise ConfigError(f"The scene has {len(self.objects)} objects; a table holds at most {MAX_OBJECTS}.")

@@ -1,13 +1,16 @@
-"""The model that a world simulates: a base among obstacles that each simulation places, or an arm on a table."""
+"""The model that a world simulates: a base among obstacles that each simulation places, or an arm on a table.
+
+An arm on a base has the obstacles, and objects to take from them.
+"""
 
 import math
 from collections.abc import Sequence
 
-from bhd_lerobot.bodies.body import Body, Drive, Shape
+from bhd_lerobot.bodies.body import Arm, Body, Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
-from bhd_lerobot.sim.table_stage import add_table_stage, set_home
+from bhd_lerobot.sim.table_stage import add_mobile_arm, add_options, add_table_stage, set_home
 
 # Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
@@ -33,10 +36,12 @@ def build_model(
         raise ConfigError(f"The MJCF of body {body.name!r} is not valid: {error}") from error
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    if body.arm is not None:
-        add_table_stage(spec, body.root, body.arm, fixtures)
+    if body.drive is not None:
+        _add_arena_stage(spec, body, body.drive.touch_sensor, pool_size)
+        if body.arm is not None:
+            add_mobile_arm(spec, body.root, body.arm)
     else:
-        _add_arena_stage(spec, body, body.need(Drive).touch_sensor, pool_size)
+        add_table_stage(spec, body.root, body.need(Arm), fixtures)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -53,12 +58,7 @@ def build_model(
 
 def _add_arena_stage(spec: mujoco.MjSpec, body: Body, touch_sensor: str, pool_size: int) -> None:
     """Add what stands around a base, and the sensor of its touches."""
-    # Elliptic cones with a stiffer friction direction: with the defaults a wheel creeps through its contact by several
-    # per cent, which would be an odometry error that no real tyre has.
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
-    # The mid phase walks a bounding-volume tree that is compiled once; obstacles move between episodes.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    add_options(spec)
     _add_stage(spec)
     _add_pool(spec, pool_size)
     # Behind and above, as far as a room's walls are still seen; it moves with the robot and does not turn.

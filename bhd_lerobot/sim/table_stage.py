@@ -1,6 +1,7 @@
 """What stands around an arm: table, room, lights, cameras, and the objects that each simulation makes its own.
 
-World frame and base frame are one; the table's top is the plane z = 0.
+World frame and base frame are one; the table's top is the plane z = 0. An arm on a base has an arena instead, with the
+same objects, servos and sensors of touches: see scene.py.
 """
 
 import math
@@ -14,7 +15,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, SCENE_CAMERA, CameraView
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 
-TABLE_BIT, ARM_BIT, OBJECT_BIT = 1, 2, 4  # contact bits; those of the arm are in its MJCF
+TABLE_BIT, ARM_BIT, OBJECT_BIT, GROUND_BIT = 1, 2, 4, 8  # contact bits; those of the arm are in its MJCF
 HANDLE_PARTS = 3
 # Absent objects float, without weight, far above the table and far from each other, where they are dropped at once from
 # the search for contacts. Below it they would touch it: a plane is solid all the way down.
@@ -31,25 +32,47 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
     Fixtures stand on the table and do not give way; sensor ``force_fixture_<k>`` is the force that the k-th puts on the
     arm, in the base frame [N].
     """
-    _add_servos(spec, root, arm)
-    _add_options(spec)
+    _add_servos(spec, arm, carries=[body.name for body in spec.bodies if body.name not in ("world", root)])
+    add_options(spec)
     _add_room(spec)
     _add_table(spec)
     _add_lights(spec)
     for name, view in (("scene", SCENE_CAMERA), ("overview", _OVERVIEW)):
         axes = _towards(view.position, view.target)
         spec.worldbody.add_camera(name=name, pos=view.position, xyaxes=axes, fovy=view.fovy)
-    for number in range(MAX_OBJECTS):
-        _add_object(spec, number, arm.gripper)
-    _add_target(spec)
-    _add_touch_sensors(spec, root, arm.gripper.body if arm.gripper else root)
+    _add_handled(spec, arm.gripper)
+    _add_touch_sensors(spec, arm, root, root, "table")
     for number, shape in enumerate(fixtures):
         _add_fixture(spec, root, number, shape)
-    spec.add_key(name="home")  # `set_home` fills it in
 
 
-def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
-    """Add one actuator for each joint and the gripper's, with the arm's gains and limits."""
+def add_mobile_arm(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
+    """Add the actuators of an arm on a base, what it handles, and its sensors of touches, to the stage of the base.
+
+    The base carries the arm's weight, which a compensation would take off it: the servos are let down by it.
+    """
+    _add_servos(spec, arm, carries=())
+    _add_handled(spec, arm.gripper)
+    # On the body that the sensors know as the scene, for the arm alone: wheels roll on the other floor.
+    spec.body("scene").add_geom(
+        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=GROUND_BIT, conaffinity=0, group=3
+    )
+    _add_touch_sensors(spec, arm, spec.joint(arm.chain.joints[0]).parent.name, root, "scene")
+
+
+def _add_handled(spec: mujoco.MjSpec, gripper: GripperSpec | None) -> None:
+    """Add the objects, the marker of a wanted pose, and the keyframe that `set_home` fills in."""
+    for number in range(MAX_OBJECTS):
+        _add_object(spec, number, gripper)
+    _add_target(spec)
+    spec.add_key(name="home")
+
+
+def _add_servos(spec: mujoco.MjSpec, arm: Arm, carries: Sequence[str]) -> None:
+    """Add one actuator for each joint and the gripper's, with the arm's gains and limits.
+
+    Position servos carry the weight of the bodies named.
+    """
     positions = arm.actuation == "position"
     rows = zip(arm.actuators, arm.servo_stiffness, arm.servo_damping, arm.limits.effort, strict=True)
     for number, (name, stiffness, damping, effort) in enumerate(rows):
@@ -79,14 +102,18 @@ def _add_servos(spec: mujoco.MjSpec, root: str, arm: Arm) -> None:
         brake.set_to_damper(kv=damping)
     # The robot's own controller carries its own weight, with torque that counts against the limits.
     for body in spec.bodies:
-        if positions and body.name not in ("world", root):
+        if positions and body.name in carries:
             body.gravcomp = 1.0
             for joint in body.joints:
                 joint.actgravcomp = True
 
 
-def _add_options(spec: mujoco.MjSpec) -> None:
-    """Choose solver settings: what is gripped must not creep, and a step should cost little."""
+def add_options(spec: mujoco.MjSpec) -> None:
+    """Choose solver settings: what is gripped and the wheels must not creep, and a step should cost little.
+
+    With the defaults a wheel creeps through its contact by several per cent, which would be an odometry error that no
+    real tyre has. The mid phase walks a bounding-volume tree that is compiled once; obstacles move between episodes.
+    """
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
@@ -210,12 +237,19 @@ def _add_target(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_touch_sensors(spec: mujoco.MjSpec, root: str, gripper: str) -> None:
-    """Count contacts: of the whole arm with anything, the table and itself, and of the gripper with each object."""
+def _add_touch_sensors(spec: mujoco.MjSpec, arm: Arm, first: str, root: str, scene: str) -> None:
+    """Count contacts: of the arm with anything and what it must not touch, of the robot with itself, of the gripper.
+
+    Args:
+        first: the body that the arm begins with; all behind it is the arm.
+        root: the body that the robot begins with.
+        scene: the body that the arm must not touch.
+    """
     tree, one = mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_BODY
+    gripper = arm.gripper.body if arm.gripper else first
     pairs = [
-        ("touch_any", root, None, None),
-        ("touch_table", root, one, "table"),
+        ("touch_any", first, None, None),
+        ("touch_table", first, one, scene),
         ("touch_self", root, tree, root),
         *((f"touch_object_{number}", gripper, one, f"object_{number}") for number in range(MAX_OBJECTS)),
     ]

@@ -1,4 +1,4 @@
-"""An arm's table in n simulations, each with objects, light and friction of its own."""
+"""What arms handle in n simulations, on their tables or in their arenas: objects, light and friction of each."""
 
 import math
 from collections.abc import Sequence
@@ -38,6 +38,9 @@ class _Form(NamedTuple):
 class Tabletop:
     """Lays the tables of a world's simulations, and states what lies where and what touches what.
 
+    An arm on a base has stands in its arena in place of a table, which `World.place` puts there: objects are placed in
+    the world frame then, and poses are those in the robot's frame, wherever it is.
+
     Flags and the tool's pose are of the last physics step's beginning, like every reading of a sensor; `World.forward`
     brings them up to date.
 
@@ -73,9 +76,11 @@ class Tabletop:
         self._free_values = np.add.outer(self._free, np.arange(7)).reshape(-1)
         self._target = model.body("target").id
         self._on_arm = [model.camera(name).id for name in world.body.cameras if name != "scene"]
-        self._scene, self._light = model.camera("scene").id, model.light("main").id
-        self._top = model.geom(TABLE_TOP).id
-        self._wood = model.mat_rgba[model.geom_matid[self._top], :3].copy()
+        self._is_mobile = world.body.drive is not None
+        if not self._is_mobile:
+            self._scene, self._light = model.camera("scene").id, model.light("main").id
+            self._top = model.geom(TABLE_TOP).id
+            self._wood = model.mat_rgba[model.geom_matid[self._top], :3].copy()
         self._tool = world.site("tool")
         self._any = world.sensor("touch_any")[:, 0]
         self._table = world.sensor("touch_table")[:, 0]
@@ -87,12 +92,13 @@ class Tabletop:
 
     # --- scenes ------------------------------------------------------------------------------------------------------
 
-    def place(self, scenes: Sequence[TableScene], ids: Ids = None) -> None:
+    def place(self, scenes: Sequence[TableScene], ids: Ids = None, poses: NDArray[np.float64] | None = None) -> None:
         """Start simulations anew: everything as the scene says, at rest, the servos holding the arm's posture.
 
         Args:
             scenes: one for each simulation named.
             ids: the simulations, all if None.
+            poses: of bases, see `World.reset`.
 
         Raises:
             SimulationError: the number of scenes does not fit, or a posture does not fit the arm.
@@ -106,7 +112,7 @@ class Tabletop:
                 raise SimulationError(
                     f"The posture of scene {scene.name!r} is {scene.posture}; it needs {len(self.arm.home)} numbers."
                 )
-        world.reset(ids)
+        world.reset(ids, poses)
         for sim, scene in zip(ids, scenes, strict=True):
             self._surroundings(sim, scene)
             for number, thing in enumerate(scene.objects):
@@ -124,13 +130,20 @@ class Tabletop:
             for number, thing in enumerate(scene.objects):
                 turn = thing.yaw / 2
                 at = self._free[number]
-                world.qpos[sim, at : at + 3] = (thing.x, thing.y, thing.height / 2)
+                world.qpos[sim, at : at + 3] = (thing.x, thing.y, scene.stand_m + thing.height / 2)
                 world.qpos[sim, at + 3 : at + 7] = (math.cos(turn), 0.0, 0.0, math.sin(turn))
         world.hold(ids)
 
     def _surroundings(self, sim: int, scene: TableScene) -> None:
-        """Set light, camera, the table's colour, pads and marker."""
+        """Set light, camera, the table's colour, pads and marker; of an arm on a base the last two."""
         field, model, variation = self._field, self.world.model, scene.variation
+        field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]
+        field["geom_friction"][sim, self._pads, 0] *= variation.finger_friction
+        pose = (*PARKED[0], *_UPRIGHT) if scene.target_pose is None else scene.target_pose
+        field["body_pos"][sim, self._target] = pose[:3]
+        field["body_quat"][sim, self._target] = pose[3:]
+        if self._is_mobile:
+            return
         field["light_diffuse"][sim] = model.light_diffuse * variation.light
         field["light_ambient"][sim] = model.light_ambient * variation.light
         field["light_dir"][sim] = model.light_dir
@@ -143,11 +156,6 @@ class Tabletop:
         for camera, turn in turns.items():
             field["cam_quat"][sim, camera] = _turned(model.cam_quat[camera], turn)
         field["geom_rgba"][sim, self._top, :3] = np.clip(self._wood + variation.surface, 0.0, 1.0)
-        field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]
-        field["geom_friction"][sim, self._pads, 0] *= variation.finger_friction
-        pose = (*PARKED[0], *_UPRIGHT) if scene.target_pose is None else scene.target_pose
-        field["body_pos"][sim, self._target] = pose[:3]
-        field["body_quat"][sim, self._target] = pose[3:]
 
     def _object(self, sim: int, number: int, thing: TableObject) -> None:
         """Set shape, appearance, inertia and weight of an object."""
@@ -229,14 +237,26 @@ class Tabletop:
 
         Shape (n, MAX_OBJECTS, 7). An absent object is at the origin, upright.
         """
-        poses = self.world.qpos[:, self._free_values].reshape(self.world.n, MAX_OBJECTS, 7)
+        poses = self._in_base(self.world.qpos[:, self._free_values].reshape(self.world.n, MAX_OBJECTS, 7))
         poses[self._field["body_gravcomp"][:, self._bodies] > _HEAVY] = (0.0, 0.0, 0.0, *_UPRIGHT)
         return poses
 
     @property
     def tool_pose(self) -> NDArray[np.float64]:
         """Position [m] and quaternion w, x, y, z of the tool in the base frame, shape (n, 7), a copy."""
-        return np.concatenate([self._tool.position, self._tool.quaternion], axis=1)
+        return self._in_base(np.concatenate([self._tool.position, self._tool.quaternion], axis=1)[:, None])[:, 0]
+
+    def _in_base(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return poses of the world frame, shape (n, k, 7), in the base frames: a base turns, and its arm with it."""
+        if not self._is_mobile:
+            return poses
+        base = self.world.base_pose
+        cos, sin = np.cos(base[:, None, 2]), np.sin(base[:, None, 2])
+        dx, dy = poses[:, :, 0] - base[:, None, 0], poses[:, :, 1] - base[:, None, 1]
+        c, s = np.cos(base[:, None, 2] / 2), np.sin(base[:, None, 2] / 2)
+        w, x, y, z = poses[:, :, 3:].transpose(2, 0, 1)
+        places = cos * dx + sin * dy, cos * dy - sin * dx, poses[:, :, 2]
+        return np.stack([*places, c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w], axis=2)
 
     @property
     def is_touching_more(self) -> bool:

@@ -121,8 +121,8 @@ class World:
         n: number of simulations.
         physics_hz: physics steps a second [Hz]; the body's default if None.
         threads: threads that step the simulations; as many as there are processors, and at most n, if None.
-        pool_size: number of obstacles that one simulation of a base can have at the most; an arm has a table instead,
-            which `Tabletop` lays.
+        pool_size: number of obstacles that one simulation of a base can have at the most; an arm without a base has a
+            table instead, which `Tabletop` lays.
         fixtures: what stands immovable on an arm's table, in every simulation; none for a base. Sensor
             ``force_fixture_<k>`` is the force that the k-th puts on the arm, in the base frame [N].
     """
@@ -139,8 +139,8 @@ class World:
     ) -> None:
         if n < 1:
             raise SimulationError(f"A world needs at least one simulation, got n = {n}.")
-        if fixtures and body.arm is None:
-            raise SimulationError(f"Fixtures stand on an arm's table; {body.name!r} has no arm.")
+        if fixtures and (body.arm is None or body.drive is not None):
+            raise SimulationError(f"Fixtures stand on an arm's table; {body.name!r} has none.")
         self.body = body
         self.n = n
         self.physics_hz = physics_hz or body.physics_hz
@@ -174,7 +174,7 @@ class World:
     # --- state -------------------------------------------------------------------------------------------------------
 
     def reset(self, ids: Ids = None, poses: NDArray[np.float64] | None = None) -> None:
-        """Put simulations back to the model's initial state, at rest: an arm at home, with nothing on its table.
+        """Put simulations back to the model's initial state, at rest: an arm at home, with nothing to handle.
 
         Args:
             ids: the simulations, all if None.
@@ -182,16 +182,15 @@ class World:
                 if None.
 
         Raises:
-            SimulationError: the poses do not fit, or the body is an arm and there are poses.
+            SimulationError: the poses do not fit, or the body is no base and there are poses.
         """
         ids = self.selected(ids)
-        if self.body.arm is not None:
-            if poses is not None:
-                self._need_base("Start poses")
-            self._reset_arm(ids)
-            return
-        self._batch.reset(ids, stage=0)
+        has_arm = self.body.arm is not None
+        if "body_gravcomp" in self.fields:  # what is taken off the table is without weight, or it would fall for ever
+            self.fields["body_gravcomp"][ids] = self._model_value("body_gravcomp")
+        self._batch.reset(ids, stage=0, **({"keyframe": 0} if has_arm else {}))
         if poses is not None:
+            self._need_base("Start poses")
             poses = np.asarray(poses, dtype=np.float64)
             if poses.shape != (len(ids), 3) or not np.isfinite(poses).all():
                 raise SimulationError(
@@ -200,13 +199,10 @@ class World:
             self.qpos[ids, 0:2] = poses[:, 0:2]
             self.qpos[ids, 3] = np.cos(poses[:, 2] / 2)
             self.qpos[ids, 6] = np.sin(poses[:, 2] / 2)
-        self.forward(ids)
-
-    def _reset_arm(self, ids: NDArray[np.intp]) -> None:
-        if "body_gravcomp" in self.fields:  # what is taken off the table is without weight, or it would fall for ever
-            self.fields["body_gravcomp"][ids] = self._model_value("body_gravcomp")
-        self._batch.reset(ids, keyframe=0, stage=0)
-        self.hold(ids)
+        if has_arm:
+            self.hold(ids)
+        else:
+            self.forward(ids)
 
     def hold(self, ids: Ids = None) -> None:
         """Command an arm's servos to hold its present posture, and compute what derives from the state.
@@ -220,15 +216,17 @@ class World:
         if (arm := self.body.arm) is None:
             raise SimulationError(f"hold() is for arms; {self.body.name!r} has none.")
         joints = len(arm.chain.joints)
-        self.ctrl[ids, :joints] = self.qpos[ids, :joints] if arm.actuation == "position" else 0.0
+        first = self.model.actuator(arm.actuators[0]).id
+        servos, (places, dofs) = slice(first, first + joints), self.joint_slice(arm.chain.joints)
+        self.ctrl[ids, servos] = self.qpos[ids, places] if arm.actuation == "position" else 0.0
         if arm.gripper is not None:
             fingers = zip(self.joint_places(arm.gripper.joints)[0], arm.gripper.per_joint, strict=True)
             openings = [self.qpos[ids, place] * one for place, one in fingers]
-            self.ctrl[ids, joints] = sum(openings[1:], openings[0]) + arm.gripper.offset
+            self.ctrl[ids, first + joints] = sum(openings[1:], openings[0]) + arm.gripper.offset
         if arm.actuation == "torque":
             bias = self.derived("qfrc_bias")
             self.forward(ids)
-            self.ctrl[ids, :joints] = bias[ids, :joints]
+            self.ctrl[ids, servos] = bias[ids, dofs]
         self.forward(ids)
 
     def step(self, k: int = 1, ids: Ids = None, *, each: Callable[[], None] | None = None) -> None:

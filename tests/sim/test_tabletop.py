@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.camera import Camera
@@ -374,3 +377,76 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
 def test_what_does_not_fit_a_body_or_its_scene_is_refused(call: Callable[[World], object], message: str) -> None:
     with pytest.raises(SimulationError, match=message):
         call(World(BODY))
+
+
+# --- an arm on a base ------------------------------------------------------------------------------------------------
+
+MOBILE = turtlebot3_manipulation()
+TOUCHES = (MOBILE.drive.touch_sensor, "touch_any", "touch_table", "touch_self")
+
+
+@pytest.mark.law
+def test_poses_of_an_arm_on_a_base_are_those_in_the_frame_of_the_robot() -> None:
+    world = World(MOBILE, 3)
+    table, home = Tabletop(world), MOBILE.arm.home
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 0.7), (-0.5, 0.3, 3.0)])
+    cup = TableObject("cup", "red", 0.02, 0.02, 0.06, 0.4, 0.9, yaw=0.3)
+    table.place([TableScene("one", (cup,), home)] * 3, None, poses)
+    np.testing.assert_allclose(world.base_pose, poses, atol=1e-12)
+    for sim, (x, y, yaw) in enumerate(poses):
+        base = Rotation.from_euler("z", yaw)
+        expected = base.inv().apply((0.4 - x, 0.9 - y, 0.03))
+        np.testing.assert_allclose(table.object_poses[sim, 0, :3], expected, atol=1e-12)
+        turn = Rotation.from_quat(table.object_poses[sim, 0, 3:], scalar_first=True)
+        assert (turn.inv() * base.inv() * Rotation.from_euler("z", 0.3)).magnitude() < 1e-9
+    tool = ForwardKinematics(MOBILE.arm.chain).tool(np.array(home[:4]))
+    np.testing.assert_allclose(table.tool_pose[:, :3], np.tile(tool[:3, 3], (3, 1)), atol=1e-9)
+    world.step(250)
+    np.testing.assert_allclose(table.tool_pose[:, :3], np.tile(tool[:3, 3], (3, 1)), atol=0.005)  # the servos sag
+    np.testing.assert_allclose(world.base_pose, poses, atol=0.001)
+
+
+@pytest.mark.parametrize(
+    ("posture", "shape", "touched"),
+    [
+        (MOBILE.arm.home, None, ()),
+        (MOBILE.arm.home, Shape("box", 0.10, 0.0, 0.0, 0.05, 0.3, 0.1), ("touch",)),
+        (
+            (0.0, 0.734, -0.262, -0.472, 0.02),
+            Shape("box", 0.35, 0.0, 0.0, 0.1, 0.1, 0.5),
+            ("touch", "touch_any", "touch_table"),
+        ),
+        ((0.0, 1.465, -0.942, 0.30, 0.02), None, ("touch", "touch_any", "touch_table")),
+        ((0.0, 0.0, 1.38, 1.4, 0.02), None, ("touch_any", "touch_self")),
+    ],
+    ids=["free", "base", "scene", "floor", "itself"],
+)
+def test_touches_of_an_arm_on_a_base(posture: tuple[float, ...], shape: Shape | None, touched: tuple[str, ...]) -> None:
+    world = World(MOBILE, 1)
+    table = Tabletop(world)
+    world.place([[shape] if shape else []])
+    table.place([TableScene("", (), posture)], None, np.zeros((1, 3)))
+    assert tuple(name for name in TOUCHES if world.sensor(name)[0, 0] > 0) == touched
+    assert not table.arm_on_object.any()
+
+
+def test_what_stands_in_the_arena_carries_an_object_until_the_gripper_touches_it() -> None:
+    world = World(MOBILE, 1)
+    table = Tabletop(world)
+    world.place([[Shape("box", 0.4, 0.0, 0.0, 0.2, 0.2, 0.15)]])
+
+    class Stand(TableScene):
+        stand_m = 0.15
+
+    cup = TableObject("cup", "red", 0.02, 0.02, 0.06, 0.25, 0.0, mass=0.05)
+    table.place([Stand("", (cup,), MOBILE.arm.home)], None, np.zeros((1, 3)))
+    world.step(500)
+    np.testing.assert_allclose(table.object_poses[0, 0, :3], (0.25, 0.0, 0.18), atol=5e-4)
+    assert not table.finger_on_object.any()
+    assert not table.is_touching_more
+    table.place([Stand("", (replace(cup, x=0.15, height=0.4),), MOBILE.arm.home)], None, np.zeros((1, 3)))
+    world.qpos[0, world.joint_slice(MOBILE.arm.chain.joints)[0]] = (0.0, -0.2, 0.35, -0.1)
+    world.forward()
+    assert table.finger_on_object[0, 0]
+    assert not table.arm_on_table[0]
+    assert not table.arm_on_object[0]
