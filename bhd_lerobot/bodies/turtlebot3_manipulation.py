@@ -152,7 +152,7 @@ def turtlebot3_manipulation(
             servo_gain=0.15,
             encoder_ticks=4096,
             radius=0.238,  # the rear corners of the hull
-            height=0.38,
+            height=0.45,
             # The hull; camera and, at home, the open fingers; and the wheels.
             outline=((-0.197, 0.069, 0.133), (0.069, 0.0865, 0.042), (-0.033, 0.033, 0.153)),
         ),
@@ -197,7 +197,8 @@ def turtlebot3_manipulation(
             servo_damping=(3.0, 3.0, 2.4, 1.6, 40.0),
             actuators=(*JOINTS, "gripper"),
             actuation="position",
-            home=(0.0, -1.05, 0.35, 0.70, MAX_OPENING),
+            # The tool points ahead, over the scanner, and all of the arm is over the base.
+            home=(0.0, -0.79, -0.19, 0.98, MAX_OPENING),
             workspace=Workspace(
                 tool=((0.10, -0.15, 0.05), (0.26, 0.15, 0.35)),
                 around_home=(0.8, 1.0, 0.9, 1.2),

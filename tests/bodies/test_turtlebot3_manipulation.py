@@ -103,10 +103,11 @@ def test_the_inertias_are_those_of_the_model(model: mujoco.MjModel, kinematics: 
 def test_home_lies_within_the_outline_of_the_base(model: mujoco.MjModel, kinematics: ArmKinematics) -> None:
     data = posed(model, np.array(ARM.home[:4]), 0.0)
     for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist():
-        # The corners of its bounding box, which is larger than a capsule or an ellipsoid.
-        turn, middle = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom]
-        half = np.abs(turn) @ middle[3:]
-        x, y, _ = data.geom_xpos[geom] + turn @ middle[:3]
+        turn, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+        half = np.abs(turn) @ model.geom_aabb[geom, 3:]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            half = np.abs(turn[:, 2]) * size[1] + size[0]
+        x, y, _ = data.geom_xpos[geom]
         assert x - half[0] >= DRIVE.outline[0][0] - 1e-6
         assert any(
             x + half[0] <= front + 1e-6 and abs(y) + half[1] <= width + 1e-6 for _, front, width in DRIVE.outline
