@@ -5,6 +5,7 @@ __all__ = [
     "arm_file",
     "body",
     "differential_base",
+    "fetch_scene",
     "registry",
     "scenes",
     "so101",

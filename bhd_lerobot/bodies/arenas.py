@@ -160,7 +160,7 @@ def random_arena(seed: int, robot_radius: float = BURGER_RADIUS) -> Arena:
         half_x, half_y = rng.uniform(1.8, 3.0, size=2)
         obstacles: list[Shape] = []
         x, y = _axes((-half_x, half_x, -half_y, half_y))
-        clearance = _clearance(_outer_walls(half_x, half_y), x, y)
+        clearance = _clearance(outer_walls(half_x, half_y), x, y)
         free = clearance > room
         builders = (_cylinders, _boxes, _walls, _corridor, _dead_end)
         # Each arena has its own mixture: some are forests of posts, some mazes.
@@ -205,11 +205,12 @@ def _random_pose(
 def _closed(
     name: str, half_x: float, half_y: float, obstacles: list[Shape], start: tuple[float, float, float]
 ) -> Arena:
-    shapes = tuple(_outer_walls(half_x, half_y) + obstacles)
+    shapes = tuple(outer_walls(half_x, half_y) + obstacles)
     return Arena(name, shapes, (-half_x, half_x, -half_y, half_y), start)
 
 
-def _outer_walls(half_x: float, half_y: float) -> list[Shape]:
+def outer_walls(half_x: float, half_y: float) -> list[Shape]:
+    """Return the walls around a rectangular room of twice these lengths [m]."""
     return [
         Shape("box", half_x + WALL, 0.0, 0.0, WALL, half_y + 2 * WALL),
         Shape("box", -half_x - WALL, 0.0, 0.0, WALL, half_y + 2 * WALL),
