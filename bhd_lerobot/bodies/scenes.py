@@ -32,7 +32,7 @@ def scene_from_json(text: str) -> Any:
         variation = Variation(**tuples(scene.pop("variation")))
         if "arena" in scene:
             arena, pick, place = (scene.pop(name) for name in ("arena", "pick", "place"))
-            parts = {"arena": _arena(arena), "pick": Stand(**pick), "place": Stand(**place)}
+            parts: dict[str, Any] = {"arena": _arena(arena), "pick": Stand(**pick), "place": Stand(**place)}
             return FetchScene(objects=objects, variation=variation, **parts, **tuples(scene))
         return TableScene(objects=objects, variation=variation, **tuples(scene))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
