@@ -36,6 +36,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("realtime", "options", "bodies.body", "control", "datasets.format", "robots.host"),
+    "robots.device": ("options", "bodies.body", "control", "control.geometry", "robots.external"),
     "robots": ("realtime", "tasks", "bodies", "sim.*", "control.*", "robots.host", "ros2.live.network"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),

@@ -27,6 +27,7 @@ WALL_CLOCK = (
     "recording/test_live_record.py",
     "recording/test_person.py",
     "recording/test_reset.py",
+    "robots/device/",
     "robots/external/",
     "robots/host/",
     "robots/viewer/",

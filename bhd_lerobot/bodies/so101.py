@@ -28,3 +28,7 @@ SO101 = ArmFile(
     velocity=(2.4,),
     payload=0.25,
 )
+
+# LeRobot's calibration reads 0 where the jaw is closed, and 100 at the other end of its range [cad].
+JAW_READINGS = [[0.0, 0.0], [100 * (0.85 + 0.1745) / (1.745 + 0.1745), 0.073]]
+"""Two readings of LeRobot's ``gripper``, and the openings that they mean [m]."""

@@ -12,6 +12,7 @@ __all__ = [
     "config_turtlebot3",
     "config_ur5",
     "conformance",
+    "device",
     "external",
     "host",
     "latency",

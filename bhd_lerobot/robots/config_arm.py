@@ -3,14 +3,14 @@
 from abc import abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
 from bhd_lerobot.bodies.body import OBSTACLE, Arm, Body, Capsule
-from bhd_lerobot.bodies.so101 import SO101
+from bhd_lerobot.bodies.so101 import JAW_READINGS, SO101
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
@@ -138,6 +138,8 @@ class ModelArmConfig(ArmConfig):
 @dataclass(kw_only=True)
 class SO101Config(ModelArmConfig):
     """Configuration of the robot type ``so101``: the options of an arm."""
+
+    usual_units: ClassVar[dict[str, Any]] = {"gripper": JAW_READINGS}
 
     @property
     def file(self) -> ArmFile:

@@ -363,7 +363,8 @@ def describe(config: Any) -> dict[str, Any]:
     """Return everything about a robot that shapes its data, as plain values; of an absolute path its name."""
     if not hasattr(config, "clock"):
         return _described(config)
-    left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", "ros2", *config.not_recorded]
+    left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", "ros2", "device", "units"]
+    left_out += config.not_recorded
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
     left_out += [name for name in LEFT_OUT_IF_OFF if not getattr(config, name, None)]

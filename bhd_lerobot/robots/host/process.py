@@ -75,7 +75,8 @@ class LiveSpec:
             host=f"{kind.__module__}:{kind.__qualname__}",
             plant=config.plant,
             # Those that a simulation or a plant reads, and that need no class of LeRobot.
-            values={key: value for key, value in vars(config).items() if isinstance(value, kinds)},
+            values={key: value for key, value in vars(config).items() if isinstance(value, kinds)}
+            | getattr(config, "plant_values", dict)(),
             rates=host.rates,
             body=host.body,
             block=block,

@@ -98,8 +98,8 @@ class LiveHost(Host):
 
     @property
     def notes(self) -> list[str]:
-        """What the system refused the real-time process, and the remedy."""
-        return [
+        """What the system refused the real-time process, and the remedy; what a device does not tell."""
+        return [*map(escape, getattr(self.config, "notes", ()))] + [
             f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
             for grant in self.link.grants
             if not grant["granted"]
